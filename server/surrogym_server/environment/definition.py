@@ -227,12 +227,12 @@ class EnvironmentDefinition:
 
     @cached
     def lag_columns(self) -> Tensor:
-        """Indices ``lags`` as a tensor on the device."""
+        """Indices of the coordinates that repeat a past value, as a tensor on the device."""
         return torch.tensor(self.lags, device=self.device)
 
     @cached
     def moving_columns(self) -> Tensor:
-        """Indices ``moving`` as a tensor on the device."""
+        """Indices of the coordinates that the dynamics move, as a tensor on the device."""
         return torch.tensor(self.moving, device=self.device)
 
     @cached_property

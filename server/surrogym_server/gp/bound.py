@@ -28,7 +28,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy  # its parts are loaded on first use
+import scipy  # SciPy loads its parts on first use, so a server that needs none starts sooner
 import torch
 from torch import Tensor
 
@@ -41,10 +41,10 @@ from surrogym_server.gp.sparse import condition_sparse, pivots
 from surrogym_server.gp.subsets import SOME, spread
 
 SEARCHES = ((2_000, 40), (None, 15))  # most points (None for all) and iterations of each search, one after the other
-NOISY = 1e-4  # least noise variance, as a share of the output's variance, beside which inducing errors are small
+NOISY = 1e-4  # noise variance, as a share of the output's variance, above which errors of inducing points are small
 PRECISE = 1e-4  # error of points predicted from the others that counts as exact, in the output's standard deviations
 HARDLY = 0.3  # an input may be left out if its effect on the mean is below this share of the noise deviation
-TRIES = 6  # most searches for inputs that can be left out
+TRIES = 6  # greatest number of searches for inputs that can be left out
 JITTER = 1e-9  # added to the diagonal of K_uu, as a share of the points' mean prior variance
 
 
@@ -244,13 +244,13 @@ class Bound(Parameters):
         inner.flat[:: m + 1] += JITTER * prior / n
         if (lower := _factor(inner)) is None:
             return 1e10, np.zeros_like(theta)
-        v = _solve_lower(lower, k)  # V
+        v = _solve_lower(lower, k)  # V of the module's equations
         square = v @ v.T
         s = square.copy()
         s.flat[:: m + 1] += noise
         if (root := _factor(s)) is None:
             return 1e10, np.zeros_like(theta)
-        weights = scipy.linalg.cho_solve((root, True), v @ self.y, check_finite=False)  # a
+        weights = scipy.linalg.cho_solve((root, True), v @ self.y, check_finite=False)  # a of the module's equations
         inverse = scipy.linalg.cho_solve((root, True), np.eye(m), check_finite=False)
         alpha = (self.y - weights @ v) / noise
         left = prior - float(square.trace())
@@ -258,13 +258,13 @@ class Bound(Parameters):
         z = self.standardised(theta)
         value = 0.5 * (logs + self.y @ alpha + left / noise + z @ z) + self._constant
 
-        back = scipy.linalg.solve_triangular(lower, np.eye(m), lower=True, trans=1, check_finite=False)  # L^-T
+        back = scipy.linalg.solve_triangular(lower, np.eye(m), lower=True, trans=1, check_finite=False)  # back = L^-T
         outer = (back @ (np.eye(m) / noise - inverse)) @ v
         outer += np.outer(back @ weights, alpha)
         within = np.outer(weights, weights) + s / noise - 2 * np.eye(m) + noise * inverse
         within = -0.5 * back @ within @ back.T
         outer[:, self.inducing_rows] += within
-        each = -0.5 / noise + JITTER * float(within.trace()) / n  # of the diagonal of K_ff
+        each = -0.5 / noise + JITTER * float(within.trace()) / n  # gradient over each entry of the diagonal of K_ff
         gradient = self._gradient(theta, covariances, outer, each)
         freedom = n - m + noise * float(inverse.trace())
         gradient[-1] = 0.5 * (noise * float(alpha @ alpha) - freedom + left / noise)

@@ -21,9 +21,10 @@ from surrogym_server.gp.subsets import FEW, SOME, spread
 
 NOISY = 1e-2  # noise variance at which the noisy search starts, as a share of the output's variance
 MANY_POINTS = 24  # a warm fit to more points tries the default start in one of four fits only
-REFINEMENTS = ((1_000, 20), (2_000, 10))  # points and iterations of each further search; each starts near its optimum
-HARD, HARD_ITERATIONS = 1_000, 20  # number of points, and of iterations, of a search on the points with most error
-SHORTER = 0.5  # the second start's length scales are shorter than the first's by this much in the logarithm
+# Greatest number of points, and of iterations, of each refining search; each starts near the optimum.
+REFINEMENTS = ((1_000, 20), (2_000, 10))
+HARD, HARD_ITERATIONS = 1_000, 20  # numbers of points and iterations of a search on the points predicted worst
+SHORTER = 0.5  # a fit's second start has length scales shorter by this much in the logarithm
 
 
 @dataclass(frozen=True)

@@ -42,7 +42,7 @@ Array = NDArray[np.float64]
 class Growing:
     """Result of a fit of F with rates: the process G and the rates of its inputs."""
 
-    fitted: Fitted  # fit of G; its score is that of F, and its theta ends with the rates
+    fitted: Fitted  # fit of the process G (see the module); `score` is that of F, and `theta` ends with the rates
     rates: tuple[float, ...]  # (d,) rate of each input
 
 

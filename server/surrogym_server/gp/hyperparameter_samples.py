@@ -20,7 +20,7 @@ from surrogym_server.gp.search import Evidence, blas, minimum
 
 BURN_IN, THINNING = 30, 10  # number of updates before the first sample, and between two samples
 SHORTER = (0.0, 1.0, 2.0)  # each start has length scales shorter by this much in the logarithm than the fitted ones
-NARROWEST = 1e-6  # in radians; if the interval of angles becomes narrower, theta stays unchanged
+NARROWEST = 1e-6  # an update is given up if its interval of angles is narrower than this, in radians
 
 Array = NDArray[np.float64]
 

@@ -25,8 +25,8 @@ class Joint:
 
     hyper: Hyperparameters
     x: Tensor  # (m, d)
-    whitened: Tensor  # (n, m) L^-1 k(X, x)
-    observed: Tensor  # (p, m) the vectors r of p points that are assumed observed
+    whitened: Tensor  # (n, m) L^-1 k(X, x), with L the Cholesky factor of the process
+    observed: Tensor  # (p, m) the vector r (see the module) of each of p points that are assumed observed
     variance: Tensor  # (m,) latent variance at the points
     noise: float
 

@@ -27,7 +27,7 @@ from surrogym_server.gp.kernel import covariance
 from surrogym_server.gp.posterior import Posterior
 from surrogym_server.tensors import cached
 
-FREQUENCIES = 256  # S
+FREQUENCIES = 256  # number S of frequencies of the random Fourier features
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Pathwise:
         return (torch.cat([self._prior(x), k], 1) * weights).sum(1)
 
     def _noise(self, at_samples: Tensor) -> Tensor:
-        """Scale standard normal ``at_samples`` (N, n) to the noise of the n points, (N, n)."""
+        """Return noise of the n points, (N, n), made from standard normal ``at_samples`` (N, n)."""
         posterior = self.posterior
         if posterior.sparse is not None:
             return at_samples @ self._sparse_noise

@@ -123,7 +123,7 @@ class Pool:
 
 
 def pools(parts: Sequence[Part], most: int) -> list[Pool]:
-    """Group parts that are more likely one function than separate ones. Runs on the CPU.
+    """Group outputs (parts) that are more likely one function than separate ones. Runs on the CPU.
 
     Parts with the least leave-one-out error come first, and others join them. Only a part that probably reads at most
     ``most`` inputs may be first.

@@ -24,9 +24,9 @@ BLOCK = 16_384  # number of rows predicted at once, which bounds the memory
 class LeftOut:
     """Accuracy of a process in predicting each of its points from all others."""
 
-    error: float  # root mean square, in units of y
+    error: float  # root mean square error, in units of y
     within_one: float  # share of the points within one predictive standard deviation
-    within_two: float  # share of the points within two
+    within_two: float  # share of the points within two predictive standard deviations
     log_density: float  # mean log predictive density
 
     @classmethod
@@ -40,7 +40,7 @@ class LeftOut:
 
 @dataclass(frozen=True)
 class Sparse:
-    """What a process with inducing points keeps of the many points that it was fitted to."""
+    """Summary of the many points to which a process with inducing points was fitted."""
 
     points: int  # number of points that the process was fitted to
     unexplained: float  # standard deviation that the inducing points leave (root mean square), over the prior's
@@ -164,7 +164,7 @@ def factorise(k: Tensor) -> tuple[Tensor, float]:
         relative *= 10
     raise NumericalFailure(
         f"the covariance of {len(k)} points is singular, even with {MAX_JITTER:g} of its mean added to the diagonal; "
-        "look for infinite or far outlying values in the samples"
+        "look for far outlying values in the samples"
     )
 
 

@@ -11,7 +11,7 @@ from functools import cache
 from typing import Protocol
 
 import numpy as np
-import scipy  # its parts are loaded on first use: a server that fits nothing starts without them
+import scipy  # SciPy loads its parts on first use, so a server that fits nothing starts sooner
 from threadpoolctl import ThreadpoolController
 from torch import Tensor
 
@@ -82,7 +82,8 @@ class Evidence(Parameters):
         self.twice = np.where(self.rows == self.columns, 1.0, 2.0)  # how often a pair occurs in a symmetric matrix
         mirrored = [] if reflection is None else [x * reflection.signs]
         differences = [other.numpy()[self.columns] - x.numpy()[self.rows] for other in (x, *mirrored)]
-        self.squared = np.ascontiguousarray(np.concatenate(differences).T ** 2)  # (d, P) or (d, 2 P)
+        # Squared differences of the pairs, (d, P), or with those of the mirror images (d, 2 P).
+        self.squared = np.ascontiguousarray(np.concatenate(differences).T ** 2)
         self.parity = 0 if reflection is None else reflection.parity
         self.linear = self._pairs(Polynomial.of(1.0, 0.0, reflection, x)(x, x))
         self.quadratic = self._pairs(Polynomial.of(0.0, 1.0, reflection, x)(x, x))

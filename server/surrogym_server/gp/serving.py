@@ -52,11 +52,11 @@ class _Process:
     """One output's part of the matrix products, with n points and D = 2 d + 1 entries of z."""
 
     span: slice  # columns of A that belong to the output
-    inputs: Tensor  # columns of x
+    inputs: Tensor  # columns of x that the process reads
     inverse_lengthscale: Tensor  # (d,)
     scaled: Tensor  # (n, d) points in length scales, and their mirror images if there is a reflection: (2 n, d)
-    factor: Tensor  # (n, n) lower, L / sigma_f^2
-    polynomial: Tensor | None  # (D, n) R / sigma_f^2
+    factor: Tensor  # (n, n) lower Cholesky factor, L / sigma_f^2
+    polynomial: Tensor | None  # (D, n) coefficients R of the polynomial covariances, over sigma_f^2
     prior: Tensor  # (D,) coefficients of z^2 in the prior variance, without the mirror image's term
     signal_variance: float
     parity: int  # 1 or -1; 0 without a reflection
@@ -102,9 +102,9 @@ class _Process:
 class Serving:
     """Outputs over shared inputs x (m, width), in the form in which they are predicted: O columns of means."""
 
-    exponents: Tensor  # A (D, S), with S the number of points of all processes
-    weights: Tensor  # W (S, O), multiplied by the outputs' scales
-    polynomials: Tensor  # Q (D, O), scales and centres included
+    exponents: Tensor  # A (D, S), coefficients of the exponents; S points of all processes
+    weights: Tensor  # W (S, O), weights of the points in the means, multiplied by the outputs' scales
+    polynomials: Tensor  # Q (D, O), coefficients of the polynomial parts of the means, in the outputs' units
     processes: dict[int, _Process]  # process of each output column; constant outputs have none
 
     @classmethod

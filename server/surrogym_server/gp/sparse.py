@@ -32,7 +32,7 @@ from surrogym_server.gp.posterior import BLOCK, LeftOut, Posterior, Sparse, cond
 MAX_EXACT = 2_000  # a process with more points uses inducing points
 INDUCING = 1_000  # greatest number of inducing points, unless the caller gives another
 NOISES = (1.0, 1e2)  # noise variances to try, as multiples of the fitted one
-SHARE = 1e-12  # lower limit of 1 - h_i, the weight of all other points in the prediction at point i
+SHARE = 1e-12  # lower limit of the share of all other points in the prediction at a point
 # No further inducing point is chosen below this unexplained variance, as a share of the prior's variance and of the
 # noise variance.
 EXPLAINED, BELOW_NOISE = 1e-10, 1e-3
@@ -104,8 +104,8 @@ def condition_sparse(hyper: Hyperparameters, x: Tensor, y: Tensor, most: int | N
 
 
 def pivots(hyper: Hyperparameters, x: Tensor, most: int) -> Tensor:
-    """Return indices (m,) of at most ``most`` of the points x (n, d), each the one that those before it explain
-    least."""
+    """Return indices (m,) of at most ``most`` of the points x (n, d), in the order of choice: each is the point
+    that the earlier ones explain least."""
     return _pivots(hyper, x, most)[0]
 
 

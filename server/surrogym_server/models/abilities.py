@@ -109,9 +109,9 @@ class UncertainHyperparameters(ABC):
 class LeaveOneOutErrors:
     """Errors of one output when each sample in turn is predicted from all others."""
 
-    error: float  # root mean square, in the output's unit
+    error: float  # root mean square error, in the output's unit
     within_one: float  # share of the samples within one predictive standard deviation; ideally 0.68
-    within_two: float  # share of the samples within two; ideally 0.95
+    within_two: float  # share of the samples within two predictive standard deviations; ideally 0.95
 
 
 class LeaveOneOut(ABC):
@@ -213,7 +213,7 @@ class PathOutlook(ABC):
 
 @dataclass(frozen=True)
 class PredictedSteps:
-    """Steps of predicted paths, such as (b, T) of them.
+    """Steps of predicted paths, such as b paths of T steps.
 
     Attributes:
         q: coordinates before each step, (..., C).

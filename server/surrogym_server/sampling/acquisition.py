@@ -77,8 +77,8 @@ class Acquisition(ABC):
     """Criterion that rates queries. Its laws are in this module's docstring."""
 
     adaptive: ClassVar[bool] = True  # if False, the whole budget is queried before the first fit
-    reads_reference: ClassVar[bool] = False  # whether it uses ``variance_reduction``
-    reads_probability: ClassVar[bool] = False  # whether it uses ``log_probability``
+    reads_reference: ClassVar[bool] = False  # whether the acquisition uses ``variance_reduction``
+    reads_probability: ClassVar[bool] = False  # whether the acquisition uses ``log_probability``
 
     def check(self, definition: EnvironmentDefinition) -> None:  # noqa: B027  most take every environment
         """Check that the settings fit the environment. Called once, when a surrogate is registered, before any real

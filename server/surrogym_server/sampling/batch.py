@@ -42,7 +42,7 @@ def choose(
     """
     definition, points = model.definition, candidates.points
     acquisition = definition.design.acquisition
-    # Read only where an acquisition needs it, because covariances with the reference take most of the time.
+    # Use the reference points only if the acquisition needs them, because their covariances take most of the time.
     reads = acquisition_of(acquisition).reads_reference
     reference = candidates.reference if reads else candidates.reference[:0]
     outlook = outlook_of(model, points, reference, unanswered)

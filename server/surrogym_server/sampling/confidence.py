@@ -29,12 +29,12 @@ class OutputConfidence:
     confidence_index: float  # mean certainty over the Monte Carlo set (eq. 8)
     confidence_index_paper: float  # the paper's index, with a tolerance of 1 in the output's unit
     coverage: float  # share of the Monte Carlo set where the standard deviation is below the tolerance
-    leave_one_out_error: float | None  # root mean square, in the output's unit; None if the model does not offer it
+    leave_one_out_error: float | None  # root mean square error, in the output's unit; None if the model has none
     leave_one_out_within_one: float | None  # share of the samples within one predictive standard deviation
     leave_one_out_within_two: float | None  # share of the samples within two predictive standard deviations
     noise: float = 0.0  # standard deviation of a single step's noise that real steps confirm, in the output's unit
     sensor_noise: float = 0.0  # standard deviation of one measurement, if most of the noise is the sensor's
-    past: float = 0.0  # share of the squared errors that earlier steps explain: a dead time or a hidden state
+    past: float = 0.0  # share of the squared errors that earlier steps explain, as with a dead time or hidden state
     region: Region | None = None  # part of the sampling range with most of the model uncertainty
     prequential: PrequentialScores | None = None  # scores of predictions of samples before the model learned from them
 

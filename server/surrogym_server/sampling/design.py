@@ -50,7 +50,7 @@ class Decision:
     """Result of a round: a model, its judgement, and the next queries. O outputs."""
 
     model: DynamicsModel
-    confidences: tuple[OutputConfidence, ...]  # (O,) one for each output
+    confidences: tuple[OutputConfidence, ...]  # (O,) confidence of each output
     tolerances: tuple[float, ...]  # (O,) tolerances of the confidences: declared or default, widened by confirmed noise
     state: DesignState  # what the next round needs
     verdict: Verdict

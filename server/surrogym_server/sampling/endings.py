@@ -55,7 +55,7 @@ def edge_in_doubt(model: DynamicsModel, q: Tensor, q_next: Tensor) -> Tensor:
 
 
 def _edges(model: DynamicsModel, points: Points, q_next: Tensor) -> Tensor | None:
-    """Return which candidates are those with the most doubtful side of an edge of the reward, (m,) bool; None if no
+    """Return at which candidates it is most doubtful on which side of a reward edge a step ends, (m,) bool; None if no
     edge is in doubt."""
     for doubt in _edge_doubts(model, points.q, q_next):
         if float(doubt.mean()) > DOUBT:

@@ -23,11 +23,11 @@ from surrogym_server.models.abilities import LearnedNoise, LeaveOneOut, offers
 from surrogym_server.models.port import DynamicsModel
 
 ENOUGH = 3  # least degrees of freedom of the repeats with which noise can be confirmed
-STAGES = (1, ENOUGH, 6, 9)  # degrees of freedom of the repeats at which they are tested
+STAGES = (1, ENOUGH, 6, 9)  # degrees of freedom at which repeats are tested, one after the other
 LEVEL = 0.01  # significance level of each test
 NEGLIGIBLE = 0.5  # true noise below this share of the tolerance is confirmed with probability ``LEVEL`` at most
 AT_MOST = 3.0  # learned noise above this multiple of the repeats' noise is misfit of the model
-SLACK = 1.25  # greatest credible ratio of a leave-one-out error to the noise, as the samples may be few
+SLACK = 1.25  # a leave-one-out error up to this multiple of the noise may be chance, because samples are few
 
 
 @dataclass(frozen=True)

@@ -121,7 +121,7 @@ def _sensor_noise(at: AtSamples, follows: Tensor, slope: Tensor) -> SensorNoise 
 
 def _among(follows: Tensor, rows: Tensor) -> Tensor:
     """Restrict ``follows``, the index of the sample before each sample, to the samples ``rows``, and renumber it."""
-    places = torch.full((len(follows) + 1,), -1)  # the last entry answers -1, which stands for no step before
+    places = torch.full((len(follows) + 1,), -1)  # the last entry is the result for -1, which means no step before
     places[rows] = torch.arange(len(rows))
     return places[follows[rows]]
 

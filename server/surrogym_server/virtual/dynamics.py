@@ -16,8 +16,8 @@ from surrogym_server.models.guard import require_shapes
 from surrogym_server.models.port import DynamicsModel, Transition
 from surrogym_shared.kinds import Weighting
 
-WEIGHT_FLOOR = 1e-12  # added to a reward's variance, as a share of the samples' reward variance, so weights stay finite
-LEAST_VARIANCE = 1e-290  # lower limit of this sum, because the samples' reward variance may be 0
+WEIGHT_FLOOR = 1e-12  # added to a particle's reward variance, as a share of the samples', so that weights stay finite
+LEAST_VARIANCE = 1e-290  # lower limit of a particle's reward variance, which may otherwise be 0
 
 
 @dataclass(frozen=True)

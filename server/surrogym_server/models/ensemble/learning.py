@@ -16,7 +16,7 @@ from surrogym_server.models.ensemble.networks import Networks
 from surrogym_server.models.ensemble.training import Training, cross_entropy, squared_error, train, train_with_noise
 
 MIN_POINTS = 2  # least number of samples to learn from
-CONSTANT = 1e-9  # an output whose standard deviation is below this share of its own size never varied
+CONSTANT = 1e-9  # an output whose standard deviation is below this share of its mean counts as constant
 REWARD_SEED, END_SEED = 1, 2  # added to the seed, so that reward and termination networks start with other weights
 
 

@@ -57,7 +57,7 @@ class NetworkEnsembleModel(SteppedInBlocks, LearnedNoise):
     rows = 8_192
 
     definition: EnvironmentDefinition
-    transitions: Regression  # M outputs
+    transitions: Regression  # networks of the M transition outputs
     reward: Regression | None  # None if the reward is declared
     ending: Networks | float | None  # logits of termination, or its only label; None if termination is declared
     terminal_reward: float

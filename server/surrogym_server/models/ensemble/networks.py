@@ -20,12 +20,12 @@ LEAST_NOISE, MOST_NOISE = 0.003, 10.0  # bounds of the noise, as shares of an ou
 class Networks:
     """Weights of K networks, the members."""
 
-    skip: Tensor  # S (K, s, p)
-    first: Tensor  # W_1 (K, d, h)
-    first_bias: Tensor  # c_1 (K, 1, h)
-    second: Tensor  # W_2 (K, h, h)
-    second_bias: Tensor  # c_2 (K, 1, h)
-    last: Tensor  # W_3 (K, h, p)
+    skip: Tensor  # weights of the linear part, S (K, s, p)
+    first: Tensor  # weights of the first hidden layer, W_1 (K, d, h)
+    first_bias: Tensor  # biases of the first hidden layer, c_1 (K, 1, h)
+    second: Tensor  # weights of the second hidden layer, W_2 (K, h, h)
+    second_bias: Tensor  # biases of the second hidden layer, c_2 (K, 1, h)
+    last: Tensor  # weights of the last layer, W_3 (K, h, p)
 
     @property
     def members(self) -> int:

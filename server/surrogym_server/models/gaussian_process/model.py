@@ -73,7 +73,7 @@ class GaussianProcessModel(
     """Model with one process for each output, and regions in which an episode ends or the reward jumps."""
 
     definition: EnvironmentDefinition
-    transitions: tuple[OutputModel, ...]  # M, in the order of definition.outputs
+    transitions: tuple[OutputModel, ...]  # the M transition outputs, in the order of definition.outputs
     reward: OutputModel
     terminal_reward: float  # reward that terminating steps pay in addition to the reward process
     samples: int

@@ -16,9 +16,9 @@ from surrogym_server.models.gaussian_process.learning.rates import inputs_of
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 
 ODDS = -1.0  # prior log odds of leaving out one input
-WIN = 2.0  # log odds for each sample by which fewer inputs must win; with less, some made predictions too sure
+WIN = 2.0  # log odds per sample by which fewer inputs must be likelier; with less, some predictions were too sure
 LESS = 0.5  # greatest leave-one-out error with fewer inputs, as a share of the error with all inputs
-FEWEST = 20  # least number of samples; with fewer, some wrong choices of inputs reached such odds
+FEWEST = 20  # least number of samples to leave out an input; with fewer, some wrong choices won
 
 
 def without_inputs(

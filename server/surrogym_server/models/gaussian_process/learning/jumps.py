@@ -25,9 +25,9 @@ from surrogym_server.models.gaussian_process.prediction.regions import Jump, Reg
 EDGE = "reward edge"
 MAX_JUMPS = 3
 SPLITS = 3  # number of gaps of the sorted rewards at which a split is tried, the widest first
-GAP = 0.2  # least width of such a gap, as a share of the range of the rewards
-MARGIN = 2.0  # log odds for each sample by which a jump must win; smooth bumps reached 1.5, jumps began at 2.9
-WORTH = 5.0  # log odds by which one more jump must win
+GAP = 0.2  # least width of a gap of the sorted rewards at which a split is tried, as a share of their range
+MARGIN = 2.0  # log odds per sample by which a jump must be likelier; smooth bumps reached 1.5, jumps began at 2.9
+WORTH = 5.0  # log odds by which one more jump must be likelier
 SIZE = 3.0  # prior standard deviation of a jump, in standard deviations of the reward
 FLOOR = 1e-4  # noise assumed for rewards that are all equal, in standard deviations of the reward
 

@@ -33,7 +33,7 @@ WIDER = " past limits"  # suffix of an output's name in the keys of warm starts:
 HELD = " held"  # suffix of an output's name in the keys of warm starts: fits with samples at the output's own limit
 SHORT = 0.01  # accepted shortfall of a prediction at a limit, in standard deviations of the targets
 ROUNDS = 3  # number of fits, each with the inequalities that the previous process violates
-WORSE = 10.0  # greatest growth of the misfit in a round; it is generous, because few samples measure it roughly
+WORSE = 10.0  # greatest factor by which a round may increase the misfit, which few samples measure only roughly
 MOST = 200  # greatest number of samples that become observations in one round
 
 

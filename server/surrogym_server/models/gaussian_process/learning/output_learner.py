@@ -19,10 +19,10 @@ from surrogym_server.models.gaussian_process.prediction.warp import PEAK_NOISE
 from surrogym_server.models.gaussian_process.settings import Settings
 from surrogym_server.models.port import Warm
 
-# Prior log odds of feature maps. LEAD: a map that reads the lead (the change of the leading coordinate) fits no better
-# where nothing was cut, and alone is right where something was. ALONE: few samples look like noise over the lead alone.
-# PARITY: data from one side alone are no evidence for symmetry. PLACE: a reward paid in one place seldom depends on the
-# action.
+# Prior log odds of a feature map that reads the lead (the next value of a leading coordinate), that reads nothing else,
+# that has a parity, and that does not read the action. A map with the lead is also right where a limit cut a step off.
+# Without other inputs few samples look like noise. Data from one side are no evidence for symmetry. A reward that is
+# paid in one place seldom depends on the action.
 LEAD_ODDS, ALONE_ODDS, PARITY_ODDS, PLACE_ODDS = 3.0, -6.0, -3.0, 3.0
 CONSTANT = 1e-9  # an output whose standard deviation is below this share of its mean's size counts as constant
 SMALLEST = 1e-100  # smallest standard deviation of an output that varies; squares of a smaller one underflow

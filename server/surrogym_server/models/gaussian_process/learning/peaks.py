@@ -25,15 +25,16 @@ from surrogym_server.models.gaussian_process.prediction.output_model import Outp
 from surrogym_server.models.gaussian_process.prediction.warp import Warp
 
 FAINT = 0.1  # quantile of the rewards above the base whose height is compared with the greatest height
-# Decades between the two heights from which a peak is considered; squares in one dimension spread as far at 6 %.
+# A peak is considered if the greatest height and the FAINT quantile are this many decades apart. Squares in one
+# dimension reach this spread at 6 %.
 SPREAD = 3.0
-DECADES = 10.0  # decades from which only a peak explains the spread: neither noise nor rounding reaches this far
+DECADES = 10.0  # such a spread, in decades, is always a peak: neither noise nor rounding reaches it
 REFITS = 3  # greatest number of further fits, each with samples that contradict the previous one
-BELOW = 10.0  # assumed logarithm of rewards at the base: this many nats below the others, if these can't predict it
+BELOW = 10.0  # if few samples have a reward, the logarithm of the others is assumed this many nats below theirs
 FEWEST = 3  # least number of samples with a reward that can predict the others
 EPS = 4 * torch.finfo(torch.float64).eps  # a reward within this share of the base equals the base
 RESOLUTION = 1e-3  # resolution at which explanations of the samples are compared, as a share of the largest reward
-GAIN = 3.0  # nats by which structure in the logarithms must win where the spread alone does not decide
+GAIN = 3.0  # log odds for a process of the logarithms over no structure, below which it is not used
 
 
 def hides(reward: Tensor) -> bool:

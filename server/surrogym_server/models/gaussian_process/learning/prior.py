@@ -31,7 +31,7 @@ class Known:
     """Predictions of a prior at n samples."""
 
     change: Tensor  # (n, M) change of each transition output
-    reward: Tensor  # (n,) without the terminal reward
+    reward: Tensor  # (n,) reward without the terminal reward
     terminal: float  # terminal reward
 
     @classmethod

@@ -16,7 +16,7 @@ from surrogym_server.models.gaussian_process.model import GaussianProcessModel
 from surrogym_server.models.gaussian_process.prediction.regions import TERMINATION, Classifier, Form, Region, likely
 
 HANDICAP = 3.0  # log odds against the classifier, whose hyperparameters were fitted to the left-out labels as well
-FAINT = 0.05  # a form whose weight is below this share of the best one's is discarded
+FAINT = 0.05  # a form of the region is discarded if its weight is below this share of the best form's weight
 
 
 def learn_termination(learner: OutputLearner, samples: Samples, prior: GaussianProcessModel | None = None) -> Region:

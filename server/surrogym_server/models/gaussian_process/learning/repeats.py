@@ -15,7 +15,7 @@ from surrogym_server.models.gaussian_process.learning.output_learner import Outp
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 
 ROLES = 4  # greatest number of inputs of a shared function
-MOST = subsets.FEW  # greatest number of samples of an output with those of others; only the others' are thinned out
+MOST = subsets.FEW  # greatest number of own and shared samples of an output; beyond it, shared ones are left out
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ class Drawn:
     """Where the weights of one output's sampled functions are among the W weights of all outputs."""
 
     column: int
-    span: slice  # weights of this output
+    span: slice  # where the weights of this output are
     inputs: Tensor  # columns of x that the output reads
     scale: float
     pathwise: Pathwise

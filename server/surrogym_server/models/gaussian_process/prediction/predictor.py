@@ -30,7 +30,7 @@ class Predictor:
     """Predictor of the transition and reward of one environment."""
 
     definition: EnvironmentDefinition
-    transitions: tuple[OutputModel, ...]  # M, in the order of definition.outputs
+    transitions: tuple[OutputModel, ...]  # the M transition outputs, in the order of definition.outputs
     reward: OutputModel
     jumps: tuple[Jump, ...]  # jumps of the reward, added to its process
     prior: Predictor | None = None  # its mean is added to those outputs that have a ``size_with_prior``

@@ -21,7 +21,7 @@ from surrogym_server.models.gaussian_process.prediction.output_model import Outp
 from surrogym_server.tensors import cached, to_device
 
 TERMINATION = "termination"  # name of the region where episodes end
-Side = Literal["above", "below", "beyond"]  # t > level, -t > level, |t| > level
+Side = Literal["above", "below", "beyond"]  # of a threshold on t: t > level, -t > level, |t| > level
 SIDES: tuple[Side, ...] = ("above", "below", "beyond")
 
 
@@ -79,7 +79,7 @@ class Thresholds:
 
     definition: EnvironmentDefinition
     rules: tuple[tuple[Cut, ...], ...]
-    complement: bool = False  # whether the region is instead where no rule holds
+    complement: bool = False  # if true, the region consists of the states for which no rule holds
 
     def probability(self, q: Tensor) -> Tensor:
         """Return the probability that q (m, C) lies inside, (m,), if each level is uniform within its gap."""
@@ -160,7 +160,7 @@ class Region:
     def probability(self, q: Tensor) -> Tensor:
         """Return the probability that q (m, C) lies inside, (m,)."""
         mixed = torch.stack([weight * form.probability(q) for weight, form in self.forms]).sum(0)
-        return mixed.clamp(0, 1)  # rounding could exceed 1
+        return mixed.clamp(0, 1)  # because of rounding, the weighted sum may exceed 1
 
     @property
     def description(self) -> dict[str, Any]:

@@ -27,7 +27,7 @@ from surrogym_server.models.abilities import ArraySteps, ArrayTransition, Compil
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 from surrogym_server.models.port import Transition
 
-MODELS = 8  # number of models
+MODELS = 8  # number of models with different hyperparameters, from which functions are sampled
 MOST_POINTS = 128  # a process with more points has certain enough hyperparameters, which are not sampled
 NEGLIGIBLE = 0.01**2  # noise variance, as a share of the output's variance, below which misfit does no harm
 AT_MOST = 3.0**2  # greatest credible ratio of learned noise variance to that of repeated steps, which may be few

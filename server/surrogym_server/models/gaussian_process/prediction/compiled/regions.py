@@ -135,7 +135,7 @@ def probability(numbers: Floats, places: Ints, at: int, observe: int, q: Floats,
         for b in range(len(total)):
             total[b] += weight * inside[b]
     for b in range(len(total)):
-        total[b] = min(total[b], 1.0)  # rounding could exceed 1
+        total[b] = min(total[b], 1.0)  # because of rounding, the weighted sum may exceed 1
     return total
 
 

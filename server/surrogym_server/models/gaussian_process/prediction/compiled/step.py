@@ -382,7 +382,7 @@ class StepsOfModel(ArraySteps):
     definition: EnvironmentDefinition
     tables: Tables
     outputs: int
-    has_regions: bool  # whether an ending or a jump of the reward is learned
+    has_regions: bool  # whether the model has a learned termination or learned jumps of the reward
     points: int  # number of points of all processes, mirror images included
     prior: StepsOfModel | None  # steps of the prior, whose mean is added to the columns of ``uses``
     uses: Floats  # (columns,) 1 for a column to which the prior is added, 0 for the others
