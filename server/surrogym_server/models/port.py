@@ -159,7 +159,9 @@ def require_sums(terminal_reward: float, samples: int) -> None:
     have."""
     if not math.isfinite(terminal_reward) or not 1 <= samples <= MOST_SAMPLES:
         got = f"{terminal_reward} and {samples if abs(samples) <= MOST_SAMPLES else 'more'}"
-        raise InvalidInput(f"expected a finite terminal_reward and 1 to {MOST_SAMPLES} in samples, got {got}")
+        raise InvalidInput(
+            f"expected a finite terminal_reward and samples from 1 to {MOST_SAMPLES}, got {got}; export the model again"
+        )
 
 
 class ModelCodec(ABC):

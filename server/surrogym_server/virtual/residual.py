@@ -52,7 +52,8 @@ class Residual:
         if shapes != {size} or {len(rows) for rows in self.weights} != {outputs}:
             raise InvalidInput(
                 f"residual: expected centre and scale with {size} numbers each, one for each input of the model, and "
-                f"weights with {size + 1} numbers for each of {outputs} outputs; got arrays of other sizes"
+                f"weights with {size + 1} numbers for each of {outputs} outputs; got arrays of other sizes: fit the "
+                "residual to this surrogate"
             )
         if min(self.scale) <= 0:
             raise InvalidInput(f"residual: expected each entry of scale above 0, got {min(self.scale)}")

@@ -106,7 +106,9 @@ def _regression(name: str, arrays: Arrays, inputs: int, outputs: int, *, quadrat
     centre, scale = arrays[f"{name}.centre"], arrays[f"{name}.scale"]
     _require_shapes(name, {"centre": centre, "scale": scale}, {"centre": (outputs,), "scale": (outputs,)})
     if bool((scale < 0).any()):
-        raise InvalidInput(f"{name}: expected each entry of scale to be at least 0, got {float(scale.min()):g}")
+        raise InvalidInput(
+            f"{name}: expected each entry of scale to be at least 0, got {float(scale.min()):g}; export the model again"
+        )
     return Regression(_networks(name, arrays, inputs, outputs, quadratic=quadratic), centre, scale)
 
 
@@ -114,7 +116,9 @@ def _noise(name: str, arrays: Arrays, inputs: int, outputs: int) -> Noise:
     size = arrays[f"{name}.size"]
     _require_shapes(name, {"size": size}, {"size": (outputs,)})
     if bool((size < 0).any()):
-        raise InvalidInput(f"{name}: expected each entry of size to be at least 0, got {float(size.min()):g}")
+        raise InvalidInput(
+            f"{name}: expected each entry of size to be at least 0, got {float(size.min()):g}; export the model again"
+        )
     return Noise(_networks(name, arrays, inputs, outputs, quadratic=False), size)
 
 
@@ -123,7 +127,8 @@ def _networks(name: str, arrays: Arrays, d: int, p: int, *, quadratic: bool) -> 
     k, h = len(networks.skip), networks.last.shape[1]
     if not (2 <= k <= MAX_MEMBERS and 1 <= h <= MAX_UNITS):
         raise InvalidInput(
-            f"{name}: expected 2 to {MAX_MEMBERS} networks with 1 to {MAX_UNITS} units in a layer, got {k} with {h}"
+            f"{name}: expected 2 to {MAX_MEMBERS} networks with 1 to {MAX_UNITS} units in a layer, got {k} with {h}; "
+            "export the model again"
         )
     shapes = {
         "skip": (k, 1 + (2 if quadratic else 1) * d, p),
@@ -155,7 +160,9 @@ def _checked_header(definition: EnvironmentDefinition, stored: StoredModel) -> H
     for name, array in stored.tensors.items():
         if array.dtype != torch.float64 or not bool(torch.isfinite(array).all()):
             came = "NaN or infinity" if array.dtype == torch.float64 else array.dtype
-            raise InvalidInput(f"expected the array {name} as finite numbers in torch.float64, got {came}")
+            raise InvalidInput(
+                f"expected the array {name} as finite numbers in torch.float64, got {came}; export the model again"
+            )
     return Header(terminal_reward, samples, str(header["digest"]), header["ending"])
 
 
@@ -163,7 +170,7 @@ def _require_shapes(name: str, arrays: Mapping[str, Tensor], shapes: Mapping[str
     """Raise ``InvalidInput`` unless each array in ``shapes`` has its shape; ``name`` is the part of the model."""
     for part, shape in shapes.items():
         if (got := tuple(arrays[part].shape)) != shape:
-            raise InvalidInput(f"{name}: expected {part} of shape {shape}, got {got}")
+            raise InvalidInput(f"{name}: expected {part} of shape {shape}, got {got}; export the model again")
 
 
 def _only_label(label: object) -> float:
@@ -171,6 +178,6 @@ def _only_label(label: object) -> float:
     if label not in (0.0, 1.0):
         raise InvalidInput(
             "ending: expected 0 or 1, the label that all samples share, because no network of termination is stored, "
-            f"got {str(label)[:80]}"
+            f"got {str(label)[:80]}; export the model again"
         )
     return float(bool(label))

@@ -30,5 +30,8 @@ class GaussianProcesses(Settings, Learner, TakesPrior):
         self, prior: DynamicsModel, definition: EnvironmentDefinition, samples: Samples, warm: Warm | None = None
     ) -> Learned:
         if not isinstance(prior, GaussianProcessModel):
-            raise TypeError(f"expected a prior of Gaussian processes, got {type(prior).__name__}")
+            raise TypeError(
+                f"expected a prior of Gaussian processes, got {type(prior).__name__}; learn the prior with the same "
+                "model family"
+            )
         return learn(self, definition, samples, warm or {}, prior)

@@ -126,7 +126,7 @@ def test_invalid_ensemble_settings_are_refused(settings, said):
     [
         ({"format": 1}, "expected a model of format 2, got format 1, .* export its samples with that version"),
         ({"outputs": ["theta", "reward"]}, "with the outputs"),
-        ({"samples": 0}, "in samples, got"),
+        ({"samples": 0}, "samples from 1 to .*, got"),
         ({"terminal_reward": float("inf")}, "finite terminal_reward"),
         ({"family": "gaussian_process"}, "family 'ensemble', as the specification says, got one of 'gaussian_process'"),
     ],

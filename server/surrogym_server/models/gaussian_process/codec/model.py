@@ -49,7 +49,7 @@ class GaussianProcessCodec(ModelCodec):
             require_region(region)
         if not all(math.isfinite(jump.size) for jump in model.jumps):
             sizes = [jump.size for jump in model.jumps][:4]
-            raise InvalidInput(f"expected finite sizes of the jumps of the reward, got {sizes}")
+            raise InvalidInput(f"expected finite sizes of the jumps of the reward, got {sizes}; export the model again")
         return model
 
 
@@ -110,16 +110,21 @@ def _require_consistent(model: GaussianProcessModel) -> None:
     """Raise ``InvalidInput`` if the parts of a model don't fit each other or the definition."""
     definition, reward = model.definition, model.reward
     if model.prior is None and any(output.size_with_prior is not None for output in model.outputs):
-        raise InvalidInput("an output needs the prior beside which it was learned, but the model contains no prior")
+        raise InvalidInput(
+            "an output needs the prior beside which it was learned, but the model contains no prior; export the "
+            "model again"
+        )
     require_sums(model.terminal_reward, model.samples)
     if any(output.feature_map.after for output in model.transitions):
         raise InvalidInput(
-            "a transition output reads the state after the step; expected all of them to read the state before it"
+            "a transition output reads the state after the step; expected all of them to read the state before it; "
+            "export the model again"
         )
     if (model.ending is not None) != definition.learns_termination:
         learned, got = ("learned" if x else "declared" for x in (definition.learns_termination, model.ending))
         raise InvalidInput(
-            f"expected a model of an environment whose termination is {learned}, got one whose termination is {got}"
+            f"expected a model of an environment whose termination is {learned}, got one whose termination is {got}; "
+            "load it with the specification that it was learned for"
         )
     declared = definition.declared_reward
     if declared is not None and (reward.posterior, reward.centre, reward.feature_map.after) != (
@@ -127,4 +132,6 @@ def _require_consistent(model: GaussianProcessModel) -> None:
         0.0,
         declared.after,
     ):
-        raise InvalidInput("the model has a learned reward, but the environment's reward is declared; learn it again")
+        raise InvalidInput(
+            "the model has a learned reward, but the environment's reward is declared; learn the model again"
+        )

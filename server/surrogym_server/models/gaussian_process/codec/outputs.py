@@ -93,7 +93,7 @@ def read_output(
     shorter = (None, *range(max(definition.ages)))
     plain = replace(feature_map, drift=(), history=None, rates=(), dropped=())
     if plain not in KNOWN_MAPS or feature_map.history not in shorter:
-        raise ValueError(f"expected a feature map that this version knows, got {feature_map}")
+        raise ValueError(f"expected a feature map that this version knows, got {feature_map}; export the model again")
     mirror = reflection(definition, feature_map)
     if feature_map.parity and mirror is None:
         raise ValueError(
@@ -150,7 +150,8 @@ def _require_drift(definition: EnvironmentDefinition, output: OutputModel) -> No
     shape = (len(definition.angles), len(definition.coordinates))
     if len(drift) != shape[0] or any(len(row) != shape[1] or not all(map(math.isfinite, row)) for row in drift):
         raise InvalidInput(
-            f"output {output.name!r}: expected the drift as finite numbers of shape {shape}, got {drift}"
+            f"output {output.name!r}: expected the drift as finite numbers of shape {shape}, got {drift}; export the "
+            "model again"
         )
 
 
@@ -164,7 +165,7 @@ def _require_dropped(definition: EnvironmentDefinition, output: OutputModel) -> 
     if output.posterior is None or not ordered or len(places) >= count or not 0 <= min(places) <= max(places) < count:
         raise InvalidInput(
             f"output {output.name!r}: expected `dropped` as ascending indices of some, not all, of the inputs 0 to "
-            f"{count - 1}, got {places}"
+            f"{count - 1}, got {places}; export the model again"
         )
 
 
@@ -174,7 +175,7 @@ def _require_size(output: OutputModel) -> None:
     if size is not None and (not 0 < size < math.inf or output.warp is not None):
         raise InvalidInput(
             f"output {output.name!r}: expected `size_with_prior` as a finite number above 0, and no `warp` beside it, "
-            f"got {size} and {output.warp}"
+            f"got {size} and {output.warp}; export the model again"
         )
 
 
@@ -185,7 +186,7 @@ def _require_warp(output: OutputModel) -> None:
     if output.name != REWARD or output.posterior is None or not output.warp.finite:
         raise InvalidInput(
             f"output {output.name!r}: expected `warp` only for a learned reward and with finite numbers, got "
-            f"{output.warp}"
+            f"{output.warp}; export the model again"
         )
 
 
@@ -206,11 +207,12 @@ def _require_rates(definition: EnvironmentDefinition, output: OutputModel) -> No
     ):
         raise InvalidInput(
             f"output {output.name!r}: expected `rates` only for a transition: a number of at most {STEEPEST:g} in size "
-            f"for each of {len(may)} inputs, 0 where the input can't have a rate, got {rates}"
+            f"for each of {len(may)} inputs, 0 where the input can't have a rate, got {rates}; export the model again"
         )
     if not bool((1 + output.posterior.x * torch.tensor(rates, dtype=torch.float64) > 0).all()):
         raise InvalidInput(
-            f"output {output.name!r}: expected `rates` with which the amplitude is above 0 at all samples, got {rates}"
+            f"output {output.name!r}: expected `rates` with which the amplitude is above 0 at all samples, got "
+            f"{rates}; export the model again"
         )
 
 
@@ -222,7 +224,8 @@ def _require_at_limit(definition: EnvironmentDefinition, output: OutputModel) ->
     count = 0 if output.posterior is None else len(output.posterior.y)
     if output.name not in definition.outputs[:-1] or len(sides) != count or not set(sides) <= {-1, 0, 1}:
         raise InvalidInput(
-            f"output {output.name!r}: expected `at_limit` only for a transition: -1, 0 or 1 for each of {count} samples"
+            f"output {output.name!r}: expected `at_limit` only for a transition: -1, 0 or 1 for each of {count} "
+            f"samples, got {len(sides)} entries; export the model again"
         )
 
 
@@ -231,7 +234,8 @@ def _require_shared(definition: EnvironmentDefinition, output: OutputModel) -> N
     transitions = definition.outputs[:-1]
     if output.shared and not {output.name, *output.shared} <= set(transitions):
         raise InvalidInput(
-            f"output {output.name!r}: expected `shared` to name some of {', '.join(transitions)}, got {output.shared}"
+            f"output {output.name!r}: expected `shared` to name some of {', '.join(transitions)}, got "
+            f"{output.shared}; export the model again"
         )
 
 
@@ -256,8 +260,8 @@ def _require_numbers(output: OutputModel) -> None:
         and all(bool(torch.isfinite(t).all()) for t in tensors)
     ):
         raise InvalidInput(
-            f"output {output.name!r}: expected finite numbers, and scale, length scales and variances above 0; the "
-            "model file is damaged or was changed, export the model again"
+            f"output {output.name!r}: expected finite numbers, and scale, length scales and variances above 0; "
+            "got others; export the model again"
         )
 
 
@@ -278,4 +282,7 @@ def _require_shapes(definition: EnvironmentDefinition, output: OutputModel) -> N
     for name, (tensor, shape) in expected.items():
         if tuple(tensor.shape) != shape or tensor.dtype != torch.float64:
             got = f"{tensor.dtype} {tuple(tensor.shape)}"
-            raise InvalidInput(f"output {output.name!r}: expected {name} as torch.float64 of shape {shape}, got {got}")
+            raise InvalidInput(
+                f"output {output.name!r}: expected {name} as torch.float64 of shape {shape}, got {got}; export the "
+                "model again"
+            )

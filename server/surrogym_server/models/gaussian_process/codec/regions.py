@@ -70,7 +70,7 @@ def read_jumps(
     for index, (size, entry) in enumerate(entries):
         region = read_region(definition, entry, tensors, f"{prefix}.{index}")
         if region is None:
-            raise ValueError(f"jump {index}: expected a region, got none")
+            raise ValueError(f"jump {index}: expected a region, got none; export the model again")
         jumps.append(Jump(region, float(size)))
     return tuple(jumps)
 
@@ -79,7 +79,10 @@ def require_region(region: Region) -> None:
     """Raise ``InvalidInput`` unless a region's weights, processes and thresholds are valid."""
     weights = [weight for weight, _ in region.forms]
     if not weights or min(weights) <= 0 or not math.isclose(sum(weights), 1, abs_tol=1e-6):
-        raise InvalidInput(f"expected weights of a region's forms that are above 0 and add up to 1, got {weights[:4]}")
+        raise InvalidInput(
+            f"expected weights of a region's forms that are above 0 and add up to 1, got {weights[:4]}; export the "
+            "model again"
+        )
     for _, form in region.forms:
         if isinstance(form, Classifier):
             _require_classifier(form)
@@ -105,7 +108,8 @@ def _read_form(definition: EnvironmentDefinition, entry: Any, tensors: Mapping[s
 def _require_classifier(classifier: Classifier) -> None:
     if classifier.process.feature_map.lead:
         raise InvalidInput(
-            "expected a region's classifier to read the state alone, got one that also reads its change (`lead`)"
+            "expected a region's classifier to read the state alone, got one that also reads its change (`lead`); "
+            "export the model again"
         )
     require_output(classifier.definition, classifier.process)
 
@@ -124,7 +128,7 @@ def _require_thresholds(thresholds: Thresholds) -> None:
     if not (sound and thresholds.rules and all(thresholds.rules)):
         raise InvalidInput(
             f"expected a region's thresholds on the axes 0 to {axes - 1}, each with outside < inside and a "
-            f"weight above 0 and at most 1, got {cuts[:4]}"
+            f"weight above 0 and at most 1, got {cuts[:4]}; export the model again"
         )
 
 
