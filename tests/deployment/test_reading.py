@@ -178,7 +178,7 @@ def test_deployment_options_that_do_not_fit_the_policy_are_refused(tmp_path: Pat
         (Choices(ranges={"slide": (0.0, np.inf)}), "range of slide: .* got 0 to inf"),
         (Choices(ranges={"slide": (0.0, 1e39)}), r"within -1e\+37 to 1e\+37, got 0 to 1e\+39"),
         (Choices(timeout=1e38), r"--timeout: expected 1e-06 s to 1e\+37 s, got 1e\+38"),
-        (Choices(period=1e-9), r"a period of 1e-06 s"),
+        (Choices(period=1e-9), "--period: expected 1e-06 s"),
     ]:
         with pytest.raises(NotDeployable, match=words):
             controller_of(path, choices=wrong)

@@ -165,7 +165,7 @@ def test_nothing_is_sent_without_a_name(log: Path):
 def test_an_unknown_surrogate_and_a_server_that_is_away_are_named(server_process: ServerProcess, log: Path):
     with pytest.raises(UnknownSurrogate):
         import_log(log, to="nobody", url=server_process.url)
-    with pytest.raises(ValueError, match="either register or to"):
+    with pytest.raises(ValueError, match="expected to without register and spec"):
         import_log(log, register="a", to="b")
 
 

@@ -320,7 +320,9 @@ def test_variables_that_would_overwrite_the_policy_are_refused(tmp_path: Path):
     file = io.BytesIO()
     torch.save({"policy.log_std": torch.zeros(7)}, file)
     policy = changed(saved(tmp_path, "PPO, continuous"), pytorch_variables__pth=file.getvalue())
-    with pytest.raises(UnusablePolicy, match=r"expected no variables but log_ent_coef, got policy\.log_std"):
+    with pytest.raises(
+        UnusablePolicy, match=r"expected no other variables than log_ent_coef in the policy's file, got policy\.log_std"
+    ):
         load_policy(policy)
 
 

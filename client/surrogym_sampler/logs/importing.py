@@ -191,7 +191,7 @@ def import_log(
 
 def _require_one_name(register: str | None, to: str | None, spec: EnvironmentSpec | None) -> None:
     if to is not None and (register is not None or spec is not None):
-        raise ValueError("expected either register or to, and spec only together with register")
+        raise ValueError("expected to without register and spec, got it together with one of them: leave one out")
     if register is not None:
         _require_name(register)
 

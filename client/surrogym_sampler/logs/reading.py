@@ -265,7 +265,9 @@ def read_minari(path: Path) -> Table:
     try:
         data = minari.MinariDataset(path / "data") if path.is_dir() else minari.load_dataset(str(path))
     except (ValueError, KeyError, AssertionError) as error:
-        raise UnusableLog(f"expected a Minari data set in {path}, got one that can't be read: {error}") from error
+        raise UnusableLog(
+            f"expected a Minari data set in {path}, got one that can't be read: {error}; record it again"
+        ) from error
     width = _width(path, data.observation_space)
     spaces = _declared(path, data.action_space)
     episodes = _episodes(path, data, width)

@@ -153,7 +153,9 @@ class SimulatedEpisode(Episode):
 
     def place(self, coordinates: Array) -> Moment:
         if not self._environment.simulator.settable:
-            raise NotSettable(f"this environment can't be set to {coordinates.tolist()}: it can only be reset")
+            raise NotSettable(
+                f"this environment can't be set to {coordinates.tolist()}: it can only be reset, so use its own starts"
+            )
         self._environment.simulator.reset(0)
         self._environment.place(coordinates)
         return Moment(self._shown(coordinates), 0.0, False, coordinates)
@@ -210,7 +212,9 @@ class RolloutEpisode(OwnEpisode):
         return self._started(self._environment.begin(seed))
 
     def place(self, coordinates: Array) -> Moment:
-        raise NotSettable(f"this environment can't be set to {coordinates.tolist()}: it can only be reset")
+        raise NotSettable(
+            f"this environment can't be set to {coordinates.tolist()}: it can only be reset, so use its own starts"
+        )
 
     def step(self, action: Array) -> Moment:
         return self._stepped(self._environment.act(action))

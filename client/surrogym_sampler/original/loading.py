@@ -223,7 +223,9 @@ def load_factory(name: str) -> Any:
     except (ImportError, AttributeError, ValueError) as error:
         raise UnknownEnvironment(f"expected package.module:factory, got {name!r}: {error}") from error
     except SystemExit as error:
-        raise UnknownEnvironment(f"{module_name} ended while it was imported: {sentence(error)}") from error
+        raise UnknownEnvironment(
+            f"{module_name} ended while it was imported: {sentence(error)}; remove the call of sys.exit"
+        ) from error
     if not callable(factory):
         raise UnknownEnvironment(
             f"expected {name!r} to be callable, got a {type(factory).__name__}: name a class or function"
@@ -285,7 +287,9 @@ def _made(name: str) -> Any:
     try:
         return factory()
     except SystemExit as error:
-        raise UnknownEnvironment(f"{name} ended while it was made: {sentence(error)}") from error
+        raise UnknownEnvironment(
+            f"{name} ended while it was made: {sentence(error)}; remove the call of sys.exit"
+        ) from error
 
 
 def _own(name: str, made: Any, spec: EnvironmentSpec | None, choose: Choose) -> Environment:

@@ -128,7 +128,7 @@ class FromReset:
         names = read_names(self._spec)
         if read.shape != (len(names),):
             raise StepFailed(
-                f"expected coordinates() to return ({', '.join(names)}), got an array of shape {read.shape}"
+                f"expected coordinates() to return ({', '.join(names)}), got an array of shape {read.shape}: correct it"
             )
         return read
 

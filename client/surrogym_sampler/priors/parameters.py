@@ -106,7 +106,7 @@ def adjustable(simulator: Any) -> Adjustable:
             return plant
     if getattr(simulator, "step_from", None) is None:
         raise UnknownEnvironment(
-            "expected a simulator in this process, got one in another, whose parameters can't be reached"
+            "expected a simulator in this process, got one in another, whose parameters can't be reached: write a class"
         )
     return Attributes(_layers(simulator)[-1])
 

@@ -92,7 +92,8 @@ class SimulatorPrior(ABC):
     ) -> None:
         if any(coordinate.lag is not None for coordinate in spec.coordinates):
             raise UnknownEnvironment(
-                "expected a plant without lags, because a simulator can't be set to earlier states, got one with lags"
+                "expected a plant without lags, because a simulator can't be set to earlier states, got one with lags: "
+                "do without a prior"
             )
         size = len(spec.coordinates) + spec.action.size
         self.steps = min(MOST, max(FEWEST, BY_INPUT * size)) if steps is None else steps

@@ -62,7 +62,9 @@ def check_query(own: EnvironmentSpec, query: Query) -> None:
         )
     longest = own.max_rollout or own.time_limit or MAX_ROLLOUT_QUERY
     if not 1 <= len(query.actions) <= longest:
-        raise QueryRefused(f"expected a rollout of 1 to {longest} actions, got {len(query.actions)}")
+        raise QueryRefused(
+            f"expected a query of 1 to {longest} actions, got {len(query.actions)}: register with --max-rollout"
+        )
     for action in query.actions:
         _check_action(own, action)
 
@@ -71,13 +73,17 @@ def _check_action(own: EnvironmentSpec, action: Sequence[float]) -> None:
     _check_values("action", [f"action {i}" for i in range(own.action.size)], action, action_ranges(own))
     if not isinstance(own.action, BoxAction) and not all(float(value).is_integer() for value in action):
         raise QueryRefused(
-            f"expected the numbers of discrete actions, got {list(action)}: register this environment anew"
+            f"expected whole numbers for the query's discrete actions, got {list(action)}: register the environment "
+            "under another name"
         )
 
 
 def _check_values(what: str, names: Sequence[str], values: Sequence[float], ranges: Sequence[Range]) -> None:
     if len(values) != len(ranges):
-        raise QueryRefused(f"{what}: expected {len(ranges)} numbers, got {len(values)}")
+        raise QueryRefused(
+            f"{what} of the query: expected {len(ranges)} numbers, as the environment has, got {len(values)}: register "
+            "the environment under another name"
+        )
     for name, value, allowed in zip(names, values, ranges, strict=True):
         if not is_within((value, value), allowed):
             raise QueryRefused(

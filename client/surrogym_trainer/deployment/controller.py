@@ -286,7 +286,8 @@ def _require_in_float(what: str, *arrays: Any) -> None:
     for values in map(np.ravel, arrays):
         if len(wrong := values[~(np.abs(values) <= LARGEST)]):
             raise NotDeployable(
-                f"expected finite numbers up to {LARGEST:g}, the range of a C float, in {what}, got {wrong[0]:g}"
+                f"expected finite numbers up to {LARGEST:g}, the range of a C float, in {what}, got {wrong[0]:g}: "
+                "scale them"
             )
 
 

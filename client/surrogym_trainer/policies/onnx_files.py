@@ -50,7 +50,9 @@ def from_onnx(content: bytes) -> Predict:
         _check(content)
         session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
     except Exception as error:  # errors of onnx and onnxruntime have no common base class
-        raise UnusableOnnx(f"expected a policy in ONNX, got {len(content)} bytes: {error}") from error
+        raise UnusableOnnx(
+            f"expected a policy in ONNX, got {len(content)} bytes that can't be used: {error}"
+        ) from error
 
     def predict(observations: NDArray[np.float32]) -> NDArray[Any]:
         parts = [observations[first : first + LANES] for first in range(0, max(len(observations), 1), LANES)]
@@ -122,7 +124,10 @@ def _for_lanes(graph: Any) -> None:
     weights = {array.name for array in graph.initializer}
     inputs = [given for given in graph.input if given.name not in weights]
     if [given.name for given in inputs] != [INPUT] or len(inputs[0].type.tensor_type.shape.dim) != 2:
-        raise ValueError(f"expected one input {INPUT!r} with 2 dimensions, got {[given.name for given in inputs]}")
+        raise ValueError(
+            f"expected one input {INPUT!r} with 2 dimensions, got the inputs {[given.name for given in inputs]}: "
+            "rename or flatten them"
+        )
     inputs[0].type.tensor_type.shape.dim[0].dim_value = LANES
     del graph.value_info[:]
     for given in graph.output:

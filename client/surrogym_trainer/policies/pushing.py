@@ -128,7 +128,7 @@ def _read(policy: Path) -> list[wire.AddEvaluation]:
         return _WAITING.validate_json(content)
     except (ValidationError, ValueError) as error:
         said = first_fault(error) if isinstance(error, ValidationError) else str(error)
-        raise UnusablePolicy(f"{path} is not a list of evaluations: {said}") from error
+        raise UnusablePolicy(f"{path} is not a list of evaluations: {said}; move the file away") from error
 
 
 def _write(policy: Path, evaluations: Sequence[wire.AddEvaluation]) -> None:

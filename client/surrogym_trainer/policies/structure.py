@@ -203,7 +203,9 @@ def _settings(data: Mapping[str, Any], replaced: set[str]) -> PolicySettings:
 
 def _entry(entries: Mapping[str, bytes], name: str) -> bytes:
     if name not in entries:
-        raise ValueError(f"expected an entry {name!r}, got {', '.join(sorted(entries)[:5]) or 'none'}")
+        raise ValueError(
+            f"expected an entry {name!r} in the policy's file, got {', '.join(sorted(entries)[:5]) or 'none'}"
+        )
     return entries[name]
 
 
@@ -229,7 +231,10 @@ def _require_variables(file: bytes | None) -> None:
     algorithm its name points to."""
     found = {} if file is None else torch.load(io.BytesIO(file), map_location="cpu", weights_only=True)
     if unknown := {*(found or {})} - VARIABLES:
-        raise ValueError(f"expected no variables but {', '.join(VARIABLES)}, got {', '.join(map(str, unknown))}")
+        raise ValueError(
+            f"expected no other variables than {', '.join(VARIABLES)} in the policy's file, got "
+            f"{', '.join(map(str, unknown))}: save the policy again"
+        )
 
 
 def _given(values: dict[str, Any]) -> dict[str, Any]:

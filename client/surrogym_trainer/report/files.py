@@ -34,7 +34,7 @@ def as_pdf(page: str) -> bytes:
     """Return a page as PDF, printed by a headless Chromium. Raises ``NoPdf`` if it is not installed or fails."""
     browser = next((path for name in BROWSERS if (path := shutil.which(name))), None)
     if browser is None:
-        raise NoPdf("a PDF needs Chromium, which is not installed; --out report.html needs nothing")
+        raise NoPdf("a PDF needs Chromium, which is not installed: install it, or write HTML with --out report.html")
     with TemporaryDirectory() as folder:
         html, pdf = Path(folder) / "report.html", Path(folder) / "report.pdf"
         html.write_text(page, encoding="utf-8")

@@ -92,7 +92,7 @@ class Subject:
             return self.ask(method, **fields)
         except RequestRefused as refused:
             if refused.code == UNSUPPORTED:
-                raise LeftOut(f"the program does not support {method}, which it need not") from refused
+                raise LeftOut(f"the program does not support the request {method}, which is optional") from refused
             raise
 
     def refused(self, method: str, **fields: object) -> RequestRefused:

@@ -144,7 +144,9 @@ class Instance:
         try:
             self._fmu.instantiate()
         except Exception as error:  # fmpy raises a plain Exception
-            raise Refused("the FMU could not be instantiated: see the lines that it printed") from error
+            raise Refused(
+                "the FMU could not be instantiated: see the lines that it printed, and export it again"
+            ) from error
         self._exists = True
 
     def _terminate(self) -> None:

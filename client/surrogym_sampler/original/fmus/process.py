@@ -194,7 +194,7 @@ def _extract(archive: Archive, directory: Path, others: Sequence[object]) -> byt
     try:
         extract(str(archive.path), str(directory))
     except Exception as error:  # fmpy refuses unsafe paths in an archive by a plain Exception
-        raise UnknownEnvironment(f"{archive.path} can't be extracted: {error}") from error
+        raise UnknownEnvironment(f"{archive.path} can't be extracted: {error}; export the FMU again") from error
     digest = hashlib.sha256(archive.path.read_bytes())
     digest.update(repr(others).encode())
     return digest.digest()[:16]

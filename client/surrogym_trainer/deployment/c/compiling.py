@@ -67,7 +67,9 @@ def running(controller: Controller, *, single: bool = False) -> Iterator[Compile
                 f"expected a C compiler for this machine, got one whose program can't run here: {error.strerror}"
             ) from error
         if vectors.returncode != 0:
-            raise NotDeployable(f"the compiled controller fails its test vectors: {vectors.stdout[-400:]}")
+            raise NotDeployable(
+                f"the compiled controller fails its test vectors, so it is not used: {vectors.stdout[-400:]}"
+            )
         timed = subprocess.run([executable, "time"], capture_output=True, text=True, check=True)
         program = Program(shlex.join([str(executable), "lines"]), "the compiled controller")
         program.start()

@@ -290,7 +290,9 @@ def noisy(path: Path) -> Predict:
 
 def _require_parameters(headers: Mapping[str, Header]) -> None:
     if "parameters" not in headers or len(headers["parameters"].shape) != 1:
-        raise ValueError("expected an array 'parameters' of shape (n,), got none")
+        raise ValueError(
+            "expected an array 'parameters' of shape (n,) in the file, got none: give a policy that fastppo saved"
+        )
 
 
 def _state(path: Path, require: Callable[[Mapping[str, Header]], None]) -> dict[str, NDArray[Any]]:

@@ -61,7 +61,8 @@ def check_model(where: str, given: Mapping[str, Any], info: Mapping[str, Any]) -
     for key, known in (("SP", states), ("disturbances", list(info["disturbances"] or ()))):
         if unknown := [name for name in given.get(key) or () if name not in known]:
             raise UnknownEnvironment(
-                f"{where}: expected names of {key} among {', '.join(known)}, got {', '.join(unknown)}"
+                f"{where}: expected names of {key} among {', '.join(known)}, got {', '.join(unknown)}: correct the "
+                "parameters"
             )
     setpoints = list(given["SP"])
     shown = f" (states {', '.join(states)}, then setpoints of {', '.join(setpoints)})"
@@ -97,7 +98,7 @@ def _check_schedule(path: Path, key: str, given: Any, count: int) -> None:
         if len(values) < count:
             raise UnknownEnvironment(
                 f"{path}: expected {key} of {name} to have a value for each of the N = {count} samples, "
-                f"got {len(values)}"
+                f"got {len(values)}: add the others"
             )
 
 
@@ -124,4 +125,4 @@ def _number(given: Any) -> bool:
 def _expected(path: Path, key: str, what: str, got: Any) -> UnknownEnvironment:
     text = json.dumps(got)
     shown = text if len(text) <= SHOWN else f"{text[:SHOWN]}..."
-    return UnknownEnvironment(f"{path}: expected {key} to be {what}, got {shown}")
+    return UnknownEnvironment(f"{path}: expected {key} to be {what}, got {shown}; correct the file")
