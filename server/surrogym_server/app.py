@@ -184,12 +184,14 @@ def create_app(settings: Settings, design: DesignPort = DesignPort(), fits: Fits
 def _check_device(name: str) -> None:
     if name == "cuda" and not torch.cuda.is_available():
         why = "this torch build has no CUDA" if torch.version.cuda is None else "torch finds no GPU that it can use"
-        raise InvalidInput(f"setting device: expected cpu, got cuda, and {why}")
+        raise InvalidInput(f"setting device: expected cpu, got cuda, which can't be used, because {why}")
 
 
 def _cluster(engine: str) -> Cluster | None:
     if engine not in ("local", *CLUSTERS):
-        raise InvalidInput(f"setting engine: expected local, got {engine}, a feature that this server does not have")
+        raise InvalidInput(
+            f"setting engine: expected {' or '.join(('local', *CLUSTERS))}, got {engine}, which this server lacks"
+        )
     return CLUSTERS.get(engine)
 
 

@@ -90,7 +90,10 @@ class LocalSurrogate:
 
     def open(self, request: OpenSession) -> SessionView:
         if request.model not in ("latest", VERSION):
-            raise UnknownModel(f"expected model 'latest' or {VERSION}, got {request.model}")
+            raise UnknownModel(
+                f"expected model 'latest' or {VERSION}, the only one of a surrogate without a server, got "
+                f"{request.model}"
+            )
         asked = opening(request)
         digest = digest_of("open", asked)
         for live in self._sessions.values():

@@ -56,12 +56,18 @@ class Models(Protocol):
 def check_size(settings: VirtualSettings, max_lanes: int) -> None:
     """Raise ``TooLarge`` if a session would have more than ``max_lanes`` lanes or too many particles."""
     if settings.num_envs > max_lanes:
-        raise TooLarge(f"expected at most {max_lanes} lanes, got {settings.num_envs}")
+        raise TooLarge(f"expected a session of at most {max_lanes} lanes, got {settings.num_envs}: open fewer")
     particles = settings.num_envs * settings.particles
     if settings.variant == "probabilistic" and particles > MAX_PARTICLES:
-        raise TooLarge(f"expected at most {MAX_PARTICLES} particles in all lanes, got {particles}")
+        raise TooLarge(
+            f"expected at most {MAX_PARTICLES} particles in all lanes of a session, got {particles}: open fewer lanes "
+            "or choose fewer particles"
+        )
     if settings.variant == "pathwise" and settings.num_envs > MAX_PATHWISE_LANES:
-        raise TooLarge(f"expected at most {MAX_PATHWISE_LANES} lanes of variant pathwise, got {settings.num_envs}")
+        raise TooLarge(
+            f"expected at most {MAX_PATHWISE_LANES} lanes in a session of variant pathwise, got {settings.num_envs}: "
+            "open fewer"
+        )
 
 
 def opened(

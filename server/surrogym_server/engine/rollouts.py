@@ -84,7 +84,10 @@ def roll_policy(session: Session, run: PolicyRun, step: OneStep) -> tuple[Sessio
 
 def _check_steps(steps: int, lanes: int) -> None:
     if steps * lanes > MAX_LANE_STEPS:
-        raise TooLarge(f"expected at most {MAX_LANE_STEPS} steps times lanes in one request, got {steps} x {lanes}")
+        raise TooLarge(
+            f"expected at most {MAX_LANE_STEPS} steps times lanes in one request, got {steps} x {lanes}: take fewer "
+            "steps"
+        )
 
 
 def _actor(observation: int, action: ActionDefinition, run: PolicyRun) -> Actor:

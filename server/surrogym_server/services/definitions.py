@@ -136,7 +136,7 @@ def check_rollouts(definition: EnvironmentDefinition, queries: Sequence[Query]) 
     longest = definition.max_rollout or 0
     for query in queries:
         if query.steps > longest:
-            raise InvalidInput(f"rollouts: expected at most {longest} actions, got {query.steps}")
+            raise InvalidInput(f"rollouts: expected at most {longest} actions in each, got {query.steps}: split it")
     actions = (model_actions(definition.action, np.array(query.actions)) for query in queries)
     return [Query.rollout(u.tolist(), query.snapshot) for u, query in zip(actions, queries, strict=True)]
 

@@ -111,13 +111,15 @@ class QueryService:
         if definition.max_rollout is None:
             if kinds != {"step"}:
                 raise InvalidInput(
-                    "expected coordinates and actions, no rollouts: the original environment can be set to any state"
+                    "expected coordinates and actions, got rollouts: the original environment can be set to any state, "
+                    "so send single steps"
                 )
             queries = check_steps(definition, queries)
         else:
             if kinds != {"rollout"}:
                 raise InvalidInput(
-                    "expected rollouts, no coordinates: the original environment can't be set to a state"
+                    "expected rollouts, got coordinates: the original environment can't be set to a state, so send "
+                    "actions from a reset or snapshot"
                 )
             queries = check_rollouts(definition, queries)
         ids = self._storage.queries.enqueue(name, queries, purpose=purpose, key=key)

@@ -167,7 +167,9 @@ def check_trajectories(samples: Sequence[NewSample]) -> None:
         if before is None or sample.query_id is None:
             continue
         if before.terminated or before.truncated:
-            raise InvalidInput(f"samples.{index}: expected no step after the end of an episode, got {sample.step}")
+            raise InvalidInput(
+                f"samples.{index}: expected no step after the end of an episode, got step {sample.step}: leave it out"
+            )
         if before.next_coordinates != sample.coordinates:
             raise InvalidInput(
                 f"samples.{index}.coordinates: expected {list(before.next_coordinates)}, where step {before.step} "

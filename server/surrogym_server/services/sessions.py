@@ -53,7 +53,7 @@ class SessionService:
         """
         info = await self._engine.describe(id)
         if info.behind:  # a caller that needs this description has kept no requests that it could repeat
-            raise UnknownSession(f"session {id!r} lost its session host, and is behind its last reply: open a new one")
+            raise UnknownSession(f"session {id!r} has lost its last replies with its session host: open a new one")
         return info
 
     async def coordinates(self, id: str) -> Array:

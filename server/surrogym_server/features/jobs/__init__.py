@@ -1,4 +1,4 @@
-"""Jobs: people queue trainings and evaluations, and trainer workers (``surrogym work``) run them under leases."""
+"""Jobs: trainings and evaluations that people queue, and that trainer workers (``surrogym work``) run under leases."""
 
 from surrogym_server.feature import Feature
 from surrogym_server.features.jobs.routes import router

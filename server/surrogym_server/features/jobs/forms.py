@@ -9,7 +9,7 @@ from surrogym_server.convert.stored import read_stored
 from surrogym_server.features.jobs.records import JobProgress, JobRecord, JobResult, LeasedJob
 from surrogym_shared import wire
 
-JOB = "a job"  # name in the error if it is damaged
+JOB = "a job"  # name of this stored document in an error message
 
 
 def claimed_job(job: LeasedJob | None, lease_seconds: float) -> wire.ClaimedJob:
@@ -35,7 +35,7 @@ def job_view(record: JobRecord) -> wire.JobView:
 
 
 def job_detail(record: JobRecord) -> wire.JobDetail:
-    """Convert a job with its curve so far."""
+    """Convert a stored job, with its learning curve so far, to the reply."""
     return read_stored(wire.JobDetail, JOB, {**_fields(record), "curve": record.curve})
 
 

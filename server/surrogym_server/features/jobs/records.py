@@ -1,7 +1,7 @@
 """Records of jobs.
 
-A job asks a trainer worker to train or to evaluate a policy. It is queued, running, done, failed or cancelled. A worker
-runs it under a lease, as a sampler answers a query: the lease ends by the database's clock, and each report renews it.
+A job is a request to train or to evaluate a policy. It is queued, running, done, failed or cancelled. A trainer worker
+runs it under a lease, which ends by the database's clock, and which each report of the worker renews.
 """
 
 from __future__ import annotations
@@ -11,15 +11,15 @@ from dataclasses import dataclass, field
 from surrogym_server.storage.records import JSON
 from surrogym_shared.states import JobEnd, JobKind, JobStatus
 
-MAX_JOBS = 100  # ended jobs of a surrogate; older ones are removed
-MAX_OPEN = 20  # jobs of a surrogate that are queued or running
-MAX_RUNS = 3  # runs of a training whose workers fall silent; an evaluation has one: it may move a machine
+MAX_JOBS = 100  # largest number of ended jobs that are kept for a surrogate
+MAX_OPEN = 20  # largest number of queued and running jobs of a surrogate
+MAX_RUNS = 3  # attempts at a training whose workers disappear; an evaluation has one, because it may move a machine
 SILENT = "its worker fell silent, and its lease ended"
 
 
 @dataclass(frozen=True)
 class NewJob:
-    """A job to queue. ``episodes`` is the number of real episodes that it takes: 0 for a training."""
+    """A job to queue. ``episodes`` is the number of real episodes of an evaluation, and 0 for a training."""
 
     kind: JobKind
     task: JSON
@@ -28,7 +28,8 @@ class NewJob:
 
 @dataclass(frozen=True)
 class JobProgress:
-    """Progress of a job: ``state``, which a list shows, and the ``curve`` so far. Both replace the earlier ones."""
+    """Progress of a job: its present ``state``, and its learning ``curve`` so far. Both replace those reported
+    earlier."""
 
     state: JSON = field(default_factory=dict)
     curve: list[JSON] = field(default_factory=list)
@@ -36,7 +37,7 @@ class JobProgress:
 
 @dataclass(frozen=True)
 class JobResult:
-    """Result of a job: how it ended, the version of its policy, and the number of its evaluation, if there are any."""
+    """Result of a job: its status at the end, the version of the policy, and the id of the evaluation, if any."""
 
     status: JobEnd
     error: str | None = None
@@ -46,23 +47,23 @@ class JobResult:
 
 @dataclass(frozen=True)
 class JobRecord:
-    """A stored job."""
+    """A stored job, with its status, its lease and its progress."""
 
     id: int
     kind: JobKind
     task: JSON
     status: JobStatus
-    cancelling: bool  # running, and its worker is asked to stop
+    cancelling: bool  # whether the job is running and its worker has been asked to stop
     created_at: float
-    begun: float | None  # when its last worker began
+    begun: float | None  # time of the last claim
     finished_at: float | None
-    worker: str | None  # the last one to claim it
+    worker: str | None  # name of the worker that claimed the job last
     attempts: int
     state: JSON
     error: str | None
     version: int | None
     evaluation: int | None
-    curve: list[JSON] = field(default_factory=list, repr=False)  # empty in a list
+    curve: list[JSON] = field(default_factory=list, repr=False)  # learning curve; left empty in lists of jobs
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Routes of jobs: people queue, read and cancel jobs; trainer workers claim, report on and finish them."""
+"""Routes of jobs: people queue, read and cancel jobs; trainer workers claim them, report progress and finish them."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ FINISH = {"lease_token": "the token of the claim", "status": "done", "version": 
     responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST),
 )
 def list_all(name: str, jobs: Jobs) -> JobList:
-    """List all jobs, newest first, and the connected trainer workers."""
+    """List the jobs of a surrogate, newest first, and the trainer workers that are connected."""
     return forms.job_list(*jobs.list(name))
 
 
@@ -78,9 +78,9 @@ def list_all(name: str, jobs: Jobs) -> JobList:
     ),
 )
 def add(name: str, body: Annotated[AddJob, example(ADD)], jobs: Jobs) -> JobView:
-    """Queue a job for a trainer worker (``surrogym work``). A task consists of numbers and of words from fixed lists;
-    all code is the worker's own. An evaluation runs in the environment that the worker was started with, if the worker
-    accepts that many real episodes."""
+    """Queue a training or an evaluation for a trainer worker (``surrogym work``). The task contains no code, only
+    numbers and words from fixed lists. An evaluation runs in the original environment of the worker, which must accept
+    that many real episodes."""
     task, fields = body.task, body.task.model_dump(mode="json")
     if isinstance(task, TrainTask):
         return forms.job_view(jobs.train(name, fields, body.idempotency_key))
@@ -89,7 +89,7 @@ def add(name: str, body: Annotated[AddJob, example(ADD)], jobs: Jobs) -> JobView
 
 @router.get("/jobs/{job_id}", summary="One job", dependencies=[READ], responses=documented(*THERE))
 def get(name: str, job_id: Number, jobs: Jobs) -> JobDetail:
-    """Return a job with the curve of its training so far."""
+    """Return a job with its learning curve so far."""
     return forms.job_detail(jobs.get(name, job_id))
 
 
@@ -107,7 +107,7 @@ def cancel(name: str, job_id: Number, jobs: Jobs) -> JobView:
     responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST, Code.TOO_MANY_REQUESTS),
 )
 async def claim(name: str, body: Annotated[ClaimJob, example(CLAIM)], request: Request, jobs: Jobs) -> ClaimedJob:
-    """Lease the oldest queued job to this worker only. If there is none, the reply waits for one, up to
+    """Lease the oldest queued job to a trainer worker. If none is queued, the reply waits for one, at most
     ``wait_seconds``."""
     offer = Offer(body.most_episodes, body.reference)
     present = partial(require_present, request)
@@ -124,8 +124,8 @@ async def claim(name: str, body: Annotated[ClaimJob, example(CLAIM)], request: R
     responses=documented(*THERE, Code.LEASE_EXPIRED),
 )
 def report(name: str, job_id: Number, body: Annotated[ReportJob, example(REPORT)], jobs: Jobs) -> ReportedJob:
-    """Renew the lease of a job and store its progress. The reply tells the worker whether to stop. Without reports the
-    lease ends: a training then goes to the next worker, and an evaluation fails."""
+    """Renew the lease of a job and store its progress. ``cancel`` in the reply is true if the worker has to stop.
+    Without reports the lease expires: a training is then queued again, and an evaluation fails."""
     progress = forms.job_progress(body.state)
     return ReportedJob(cancel=jobs.report(name, job_id, body.lease_token, body.lease_seconds, progress))
 
@@ -137,5 +137,5 @@ def report(name: str, job_id: Number, body: Annotated[ReportJob, example(REPORT)
     responses=documented(*THERE, Code.UNKNOWN_POLICY, Code.LEASE_EXPIRED),
 )
 def finish(name: str, job_id: Number, body: Annotated[FinishJob, example(FINISH)], jobs: Jobs) -> JobView:
-    """End a job, with the version of the policy that was stored. A repeat is harmless."""
+    """End a job with its result, such as the version of the stored policy. A repeat changes nothing."""
     return forms.job_view(jobs.finish(name, job_id, body.lease_token, forms.job_result(body)))

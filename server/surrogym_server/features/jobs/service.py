@@ -1,4 +1,4 @@
-"""Jobs of trainer workers: people queue them, and workers claim them with a long poll, report on them and end them."""
+"""Use cases of jobs: people queue jobs, and trainer workers claim them by a long poll, report progress and end them."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from surrogym_server.storage.records import JSON
 
 
 class _Claim(NamedTuple):
-    """Answer to a claim."""
+    """Answer to a worker's claim: a leased job, or None."""
 
     job: LeasedJob | None
 
 
 class JobService:
-    """Queues jobs, and hands them to trainer workers under leases."""
+    """Queues jobs, and leases them to trainer workers."""
 
     def __init__(self, storage: Storage, notices: Notices, metrics: ProcessMetrics) -> None:
         self.claims = Waiting("waiting claims of jobs")
@@ -41,29 +41,31 @@ class JobService:
         return cls(core.storage, core.notices, core.metrics)
 
     async def sweep(self) -> None:
-        """End the leases of workers that fell silent."""
+        """End the expired leases of jobs."""
         self._metrics.expired_leases += await asyncio.to_thread(self._jobs.sweep_expired)
 
     def metrics(self) -> tuple[()]:
-        """There are none."""
+        """Return no metrics: jobs have none."""
         return ()
 
     def train(self, name: str, task: JSON, key: str | None) -> JobRecord:
-        """Queue a training.
+        """Queue a training, once for each idempotency key.
 
         Raises:
             NoModel: the surrogate has no model yet.
-            Overloaded: too many jobs are queued or running.
+            Overloaded: the surrogate has too many queued or running jobs.
         """
         self._storage.models.get(name)
         return self._add(name, NewJob("train", task), key)
 
     def evaluate(self, name: str, task: JSON, episodes: int, key: str | None) -> JobRecord:
-        """Queue an evaluation of ``episodes`` real episodes. An alias in the task is replaced by the policy's version.
+        """Queue an evaluation of ``episodes`` real episodes, once for each idempotency key.
+
+        An alias of the policy in ``task`` is replaced by its version.
 
         Raises:
             UnknownPolicy: the policy does not exist.
-            Overloaded: too many jobs are queued or running.
+            Overloaded: the surrogate has too many queued or running jobs.
         """
         version = self._storage.policy_names.version(name, task["policy"])
         return self._add(name, NewJob("evaluate", {**task, "policy": str(version)}, episodes), key)
@@ -77,12 +79,21 @@ class JobService:
         wait_seconds: float,
         present: Present | None = None,
     ) -> LeasedJob | None:
-        """Lease a job to a worker. If there is none, wait up to ``wait_seconds``, and then return None.
+        """Lease the oldest suitable job to a worker. If there is none, wait for one.
 
-        ``present`` raises if the worker has closed its connection; then it gets no lease.
+        Args:
+            name: name of the surrogate.
+            worker: name of the worker.
+            offer: the jobs that the worker accepts.
+            lease_seconds: duration of the lease.
+            wait_seconds: longest wait.
+            present: raises if the worker has closed its connection, which then gets no lease.
+
+        Returns:
+            The leased job; None if no job came in time.
 
         Raises:
-            UnknownSurrogate: the surrogate does not exist, or was deleted while the worker waited.
+            UnknownSurrogate: the surrogate does not exist, or was deleted during the wait.
         """
         most, reference = offer
 
@@ -90,7 +101,7 @@ class JobService:
             return _Claim(self._jobs.claim(name, worker, most, lease_seconds, reference=reference))
 
         if self._workers.heard(name, worker, offer):
-            self._notices.post(name)  # the page shows a worker as soon as it is connected
+            self._notices.post(name)  # so that the dashboard shows a new worker at once
         claimed = await self._lines.claim(name, offer, claim, wait_seconds, present)
         self._workers.heard(name, worker)
         if claimed.job is not None:
@@ -98,11 +109,11 @@ class JobService:
         return claimed.job
 
     def report(self, name: str, id: int, token: str, lease_seconds: float, progress: JobProgress | None) -> bool:
-        """Renew the lease of a job, and store its progress. Returns whether the worker is to stop.
+        """Renew the lease of a job, and store its progress (None: unchanged). Return whether the worker has to stop.
 
         Raises:
             UnknownJob: the job does not exist.
-            LeaseExpired: the job has ended, or another worker has it.
+            LeaseExpired: the job has ended, or another worker has leased it.
         """
         cancel = self._jobs.report(name, id, token, lease_seconds, progress)
         if worker := self._jobs.get(name, id).worker:
@@ -110,19 +121,21 @@ class JobService:
         return cancel
 
     def finish(self, name: str, id: int, token: str, result: JobResult) -> JobRecord:
-        """End a job.
+        """End a job with its result. A repeat changes nothing.
 
         Raises:
             UnknownJob: the job does not exist.
-            UnknownPolicy: the surrogate has no policy of the result's version, or that has no such evaluation.
-            LeaseExpired: another worker has the job.
+            UnknownPolicy: the policy or the evaluation in the result does not exist.
+            LeaseExpired: another worker has leased the job.
         """
         if result.version is not None:
             names, version, evaluation = self._storage.policy_names, result.version, result.evaluation
             names.version(name, str(version))
             if evaluation is not None and not names.has_evaluation(name, version, evaluation):
                 place = f"version {result.version} of {name!r}'s policies"
-                raise UnknownPolicy(f"expected an evaluation of {place}, got {result.evaluation}")
+                raise UnknownPolicy(
+                    f"expected the id of an evaluation of {place}, got {result.evaluation}, which does not exist"
+                )
         return self._changed(name, self._jobs.finish(name, id, token, result))
 
     def cancel(self, name: str, id: int) -> JobRecord:
@@ -134,7 +147,8 @@ class JobService:
         return self._jobs.get(name, id)
 
     def list(self, name: str) -> tuple[list[JobRecord], dict[str, Offer]]:
-        """Return all jobs, newest first, and the offer of each connected worker."""
+        """Return the jobs of a surrogate, newest first, and the offer of each connected worker, by the worker's
+        name."""
         return self._jobs.list(name), self._workers.of(name)
 
     def _add(self, name: str, new: NewJob, key: str | None) -> JobRecord:

@@ -1,4 +1,4 @@
-"""Jobs and their leases, stored as rows of one table."""
+"""Storage of jobs and their leases, in one table."""
 
 from __future__ import annotations
 
@@ -44,21 +44,21 @@ jobs = checked(
         sa.Column("kind", Word("jobs.kind", JobKind), nullable=False),
         sa.Column("status", Word("jobs.status", JobStatus), nullable=False),
         sa.Column("task", Json("jobs.task"), nullable=False),
-        sa.Column("episodes", sa.Integer, nullable=False),  # real ones that it asks for
+        sa.Column("episodes", sa.Integer, nullable=False),  # number of real episodes of an evaluation
         sa.Column("created_at", sa.Double, nullable=False),
         sa.Column("attempts", sa.Integer, nullable=False),
         sa.Column("worker", sa.Text),
-        sa.Column("token", sa.Text),  # of the last lease
+        sa.Column("token", sa.Text),  # token of the last lease
         sa.Column("begun", sa.Double),
         sa.Column("expires", sa.Double),
-        sa.Column("seconds", sa.Double),  # for how long the lease was given out last
+        sa.Column("seconds", sa.Double),  # duration of the lease at its last renewal
         sa.Column("cancelling", sa.Boolean, nullable=False),
-        sa.Column("lost", sa.Boolean, nullable=False),  # it ended because its lease did
+        sa.Column("lost", sa.Boolean, nullable=False),  # whether the job ended because its lease expired
         sa.Column("finished_at", sa.Double),
         sa.Column("state", Json("jobs.state"), nullable=False),
         sa.Column("curve", Json("jobs.curve"), nullable=False),
         sa.Column("error", sa.Text),
-        sa.Column("version", sa.Integer),  # of the policy
+        sa.Column("version", sa.Integer),  # version of the policy that the job stored or evaluated
         sa.Column("evaluation", Id),
         sa.Index(None, "surrogate_id", "status", "id"),
         sa.Index(None, "status", "expires"),
@@ -78,13 +78,14 @@ OPEN = jobs.c.status.in_(("queued", "running"))
 
 
 class Jobs:
-    """Jobs of a surrogate, and their leases.
+    """Storage of the jobs of surrogates and their leases.
 
-    A training whose lease ends is queued again, and failed after ``MAX_RUNS``. An evaluation whose lease ends is
-    failed, because its real steps may have been taken. A job that was to be cancelled is then cancelled.
+    When the lease of a training expires, the training is queued again, or fails after ``MAX_RUNS`` attempts. When the
+    lease of an evaluation expires, the evaluation fails, because real steps may have been taken. A job that should be
+    cancelled becomes cancelled.
 
-    A worker proves its lease by the token. It may continue although the lease has ended, as long as no other worker has
-    claimed the job and nobody has cancelled it: its next report makes the job running again, and its result counts.
+    A worker whose lease has expired may continue as long as no other worker has claimed the job and it is not
+    cancelled: the worker's next report makes the job running again, and its result is stored.
 
     An operation on a job that does not exist raises ``UnknownJob``.
     """
@@ -93,10 +94,11 @@ class Jobs:
         self._database = database
 
     def add(self, name: str, new: NewJob, *, key: str | None = None) -> int:
-        """Queue a job, and return its id. The oldest ended jobs beyond ``MAX_JOBS`` are removed.
+        """Queue a job, once for each idempotency key, and return its id. Ended jobs beyond the newest ``MAX_JOBS`` are
+        removed.
 
         Raises:
-            Overloaded: there are ``MAX_OPEN`` jobs that are queued or running.
+            Overloaded: the surrogate has ``MAX_OPEN`` queued or running jobs.
         """
         body = fingerprint(new.kind, new.task)
         with self._database.write() as connection:
@@ -116,13 +118,18 @@ class Jobs:
     def claim(
         self, name: str, worker: str, most_episodes: int, seconds: float, *, reference: bool = False
     ) -> LeasedJob | None:
-        """Lease the oldest queued job of at most ``most_episodes`` real episodes to one caller. None if there is none.
+        """Lease the oldest queued job that a worker accepts to it for ``seconds``. Return None if there is none.
 
-        Jobs that ask for a reference controller are leased only to a worker that has one.
+        Args:
+            name: name of the surrogate.
+            worker: name of the worker.
+            most_episodes: largest number of real episodes that the worker accepts.
+            seconds: duration of the lease.
+            reference: whether the worker has a reference controller, which some jobs need.
 
-        Expired leases are ended first. A new lease clears the progress of the one before.
+        Expired leases are ended before. A new lease clears the progress of an earlier one.
         """
-        with self._database.read() as connection:  # waiting workers don't block writers
+        with self._database.read() as connection:  # a read first, so that waiting workers don't block writers
             own = jobs.c.surrogate_id == find(connection, name)
             waiting = (jobs.c.status == "queued") | has_ended(jobs, RUNNING)
             if not connection.execute(sa.select(sa.exists().where(own, waiting))).scalar():
@@ -144,10 +151,12 @@ class Jobs:
             return LeasedJob(row.id, row.task, row.attempts + 1, token)
 
     def report(self, name: str, id: int, token: str, seconds: float, progress: JobProgress | None) -> bool:
-        """Extend the lease to ``seconds`` from now, and store the progress. Returns whether the worker is to stop.
+        """Extend the lease of a job to ``seconds`` from now, and store its progress (None: unchanged).
+
+        Returns whether the worker has to stop.
 
         Raises:
-            LeaseExpired: the job has ended, or another worker has it.
+            LeaseExpired: the job has ended, or another worker has leased it.
         """
         with self._database.write() as connection:
             surrogate = find(connection, name)
@@ -163,10 +172,10 @@ class Jobs:
             return bool(cancelling)
 
     def finish(self, name: str, id: int, token: str, result: JobResult) -> JobRecord:
-        """End a job. A repeat is harmless, and changes nothing.
+        """End a job with its result. A repeat changes nothing.
 
         Raises:
-            LeaseExpired: another worker has the job, or it was cancelled before a worker had it again.
+            LeaseExpired: another worker has leased the job, or the job was cancelled while it was queued again.
         """
         with self._database.write() as connection:
             held = hold(connection, name)
@@ -180,7 +189,7 @@ class Jobs:
             return _record(_read(connection, held.id, id))
 
     def cancel(self, name: str, id: int) -> JobRecord:
-        """Cancel a queued job at once, and ask the worker of a running one to stop. A job that has ended stays."""
+        """Cancel a queued job at once, or ask the worker of a running job to stop. An ended job does not change."""
         with self._database.write() as connection:
             held = hold(connection, name)
             row = _read(connection, held.id, id)
@@ -194,21 +203,21 @@ class Jobs:
             return _record(_read(connection, held.id, id))
 
     def get(self, name: str, id: int) -> JobRecord:
-        """Return a job with its curve."""
+        """Return a job with its learning curve."""
         with self._database.read() as connection:
             return _record(_read(connection, find(connection, name), id))
 
     def list(self, name: str) -> list[JobRecord]:
-        """Return all jobs, newest first, without their curves."""
+        """Return all jobs of a surrogate, newest first, without their learning curves."""
         with self._database.read() as connection:
             own = jobs.c.surrogate_id == find(connection, name)
             rows = connection.execute(sa.select(*SHOWN).where(own).order_by(jobs.c.id.desc()))
             return [JobRecord(**row._mapping) for row in rows]
 
     def sweep_expired(self) -> int:
-        """End the expired leases of all surrogates, and return how many there were.
+        """End the expired leases of jobs of all surrogates, and return their number.
 
-        A lease with more time left than it was given, because the clock was set back, gets that time from now.
+        A lease with more time left than its duration, because the clock was set back, is shortened to its duration.
         """
         with self._database.read() as connection:
             owners = sa.select(jobs.c.surrogate_id).where(has_ended(jobs, RUNNING)).distinct()
@@ -225,12 +234,12 @@ class Jobs:
         try:
             with self._database.write() as connection:
                 return _sweep(connection, hold(connection, name))
-        except UnknownSurrogate:  # deleted meanwhile
+        except UnknownSurrogate:  # the surrogate was just deleted
             return 0
 
 
 def _sweep(connection: Connection, held: Row[Any]) -> int:
-    """End the expired leases of the surrogate's jobs. Returns their number."""
+    """End the expired leases of a surrogate's jobs, and return their number."""
     again = (jobs.c.kind == "train") & (jobs.c.attempts < MAX_RUNS) & ~jobs.c.cancelling
     status = sa.case((jobs.c.cancelling, "cancelled"), (again, "queued"), else_="failed")
     ended = connection.execute(
@@ -250,12 +259,12 @@ def _sweep(connection: Connection, held: Row[Any]) -> int:
 
 
 def _require_room(connection: Connection, surrogate: int, name: str) -> None:
-    """Refuse a job if too many are queued or running, and remove the oldest jobs that have ended."""
+    """Raise ``Overloaded`` if a surrogate has too many queued or running jobs; else remove its oldest ended jobs."""
     own = jobs.c.surrogate_id == surrogate
     waiting = sa.select(sa.func.count()).select_from(jobs).where(own, OPEN)
     if connection.execute(waiting).scalar_one() >= MAX_OPEN:
-        most = f"expected at most {MAX_OPEN} jobs of {name!r} that wait or run"
-        raise Overloaded(f"{most}, got one more: cancel one, or wait until one has ended")
+        most = f"expected at most {MAX_OPEN} queued and running jobs of {name!r}"
+        raise Overloaded(f"{most}, got one more job: cancel one, or wait until one has ended")
     kept = sa.select(jobs.c.id).where(own, ~OPEN).order_by(jobs.c.id.desc()).limit(MAX_JOBS)
     connection.execute(sa.delete(jobs).where(own, ~OPEN, jobs.c.id.not_in(kept)))
 
@@ -268,7 +277,9 @@ def _read(connection: Connection, surrogate: int, id: int) -> Row[Any]:
     wanted: sa.Select[Any] = sa.select(*SHOWN, jobs.c.curve, jobs.c.token, jobs.c.lost).where(_own(surrogate, id))
     row = connection.execute(wanted).one_or_none()
     if row is None:
-        raise UnknownJob(f"expected a job of this surrogate, got {id}, which is not there")
+        raise UnknownJob(
+            f"expected the id of a job of this surrogate, got {id}, which is not there: surrogym jobs lists them"
+        )
     return row
 
 

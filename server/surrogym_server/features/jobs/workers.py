@@ -1,4 +1,4 @@
-"""Trainer workers that are active."""
+"""The trainer workers that called recently, and which jobs they accept."""
 
 from __future__ import annotations
 
@@ -8,21 +8,23 @@ from surrogym_server.services.activity import Alive
 
 
 class Offer(NamedTuple):
-    """The largest number of real episodes that a trainer worker takes, and whether it has a reference controller."""
+    """Which jobs a trainer worker accepts: the largest number of real episodes, and whether it has a reference
+    controller."""
 
     most_episodes: int = 0
     reference: bool = False
 
 
 class Workers(Alive[Offer]):
-    """When each trainer worker was last heard of, and its offer."""
+    """Time of the last call of each trainer worker, and the jobs that it accepts (its offer)."""
 
     def heard(self, surrogate: str, worker: str, offer: Offer | None = None) -> bool:
-        """Note that a worker claimed or reported, and return whether it is new. None keeps its earlier offer."""
+        """Record a claim or report of a worker, and return whether the worker is new. An ``offer`` of None keeps the
+        earlier one."""
         if offer is None:
             _, offer = self._heard.get(surrogate, {}).get(worker, (0.0, Offer()))
         return self.note(surrogate, worker, offer)
 
     def of(self, surrogate: str) -> dict[str, Offer]:
-        """The offer of each worker heard of lately, by its name."""
+        """Return the offers of a surrogate's workers that called recently, by the worker's name."""
         return {worker: offer for owner, worker, offer in self.alive() if owner == surrogate}

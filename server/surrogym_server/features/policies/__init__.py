@@ -1,4 +1,4 @@
-"""Policies: stored with their trainings and evaluations, named by aliases, and returned unchanged."""
+"""Storage of trained policies, with their cards, learning curves, evaluations and aliases."""
 
 from surrogym_server.feature import Feature
 from surrogym_server.features.policies.routes import router

@@ -1,7 +1,7 @@
-"""Blobs as files of a folder, and as rows of a table.
+"""Storage of blobs (contents of policy files) as files in a folder or as rows of a table.
 
-A SQLite database has one server and lies on a disk, so its blobs are files in a folder beside it. Several servers may
-share a PostgreSQL database but no disk, so there the blobs are rows, in a table that a backup may leave out.
+With a SQLite database, which has one server, blobs are files in a folder beside it. Several servers may share a
+PostgreSQL database but no disk, so there blobs are rows of a table, which a backup may leave out.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from surrogym_server.storage.sql.database import NOW, Database, damaged
 from surrogym_server.storage.sql.tables import checked, metadata
 
 blobs = checked(
-    sa.Table(  # files, where they have no folder; a backup leaves this table out
+    sa.Table(  # contents of files, if they are not in a folder; a backup may leave this table out
         "blobs",
         metadata,
         sa.Column("name", sa.Text, primary_key=True),
@@ -32,16 +32,17 @@ blobs = checked(
 )
 
 NAME = re.compile(r"[0-9a-f]{32}")
-PART = ".part"  # of a file that is being written
+PART = ".part"  # suffix of the name of a file that is being written
 
 
 def open_blobs(storage: Storage, url: str, folder: Path | None) -> Blobs:
-    """The files of policies.
+    """Open the storage of policy files.
 
     Args:
-        storage: of the server.
+        storage: storage of the server.
         url: address of its database.
-        folder: None means ``<database>.files`` beside a SQLite file, and the database itself for PostgreSQL.
+        folder: folder for the files. None: the folder ``<database>.files`` beside a SQLite file, or a table of a
+            PostgreSQL database.
     """
     address = sa.make_url(url)
     if folder is None and address.get_backend_name() == "sqlite":
@@ -50,7 +51,7 @@ def open_blobs(storage: Storage, url: str, folder: Path | None) -> Blobs:
 
 
 class FolderBlobs(Blobs):
-    """Files in a folder, which is created with the first file. Only their owner may read them."""
+    """Blobs as files in a folder, which is created with the first file. Only the files' owner may read them."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -82,7 +83,7 @@ class FolderBlobs(Blobs):
 
     def remove(self, names: Freed) -> None:
         for name in names:
-            with suppress(OSError):  # the next sweep tries again
+            with suppress(OSError):  # the next periodic sweep tries again
                 (self._folder / _checked(name)).unlink()
 
     def older(self, seconds: float) -> set[str]:
@@ -96,7 +97,7 @@ class FolderBlobs(Blobs):
         return found
 
     def _sync(self) -> None:
-        """Make the new name durable."""
+        """Sync the folder, so that a renamed file survives a crash."""
         descriptor = os.open(self._folder, os.O_RDONLY)
         try:
             os.fsync(descriptor)
@@ -105,7 +106,7 @@ class FolderBlobs(Blobs):
 
 
 class RowBlobs(Blobs):
-    """Rows of the table ``blobs``."""
+    """Blobs as rows of the table ``blobs``."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
@@ -121,7 +122,7 @@ class RowBlobs(Blobs):
         with self._database.read() as connection:
             content = connection.execute(sa.select(blobs.c.content).where(blobs.c.name == name)).scalar()
         if content is None:
-            raise damaged("expected a policy's file in the table blobs, but there is none")
+            raise damaged(f"the file {name} of a policy is missing in the table blobs")
         return bytes(content)
 
     def remove(self, names: Freed) -> None:
@@ -138,5 +139,5 @@ class RowBlobs(Blobs):
 
 def _checked(name: str) -> str:
     if not NAME.fullmatch(name.removesuffix(PART)):
-        raise damaged(f"expected the name of a blob, got {name!r}")
+        raise damaged(f"expected the name of a blob, 32 hexadecimal digits, got {name!r}")
     return name

@@ -20,11 +20,11 @@ from surrogym_server.storage.records import JSON
 from surrogym_shared import wire
 from surrogym_shared.wire.drifts import AddDrift
 
-CARD = "the card of a policy"  # name in the error if it is damaged
+CARD = "the card of a policy"  # name of this stored document in an error message
 
 
 def new_policy(body: wire.AddPolicy) -> tuple[JSON, list[JSON], PolicyFile]:
-    """Card, curve and announced file of a request."""
+    """Return the card, the learning curve and the announced file of a request that stores a policy."""
     curve = [point.model_dump(mode="json") for point in body.curve]
     return body.card.model_dump(mode="json"), curve, policy_file(body.file)
 
@@ -61,7 +61,7 @@ def pushed_policy(record: PolicyRecord, *, created: bool) -> wire.PushedPolicy:
 
 
 def policy_detail(record: PolicyRecord) -> wire.PolicyDetail:
-    """A policy with the settings and the curve of its training."""
+    """Convert a policy, with the settings and the learning curve of its training, to the reply."""
     card = _card(record)
     curve = [read_stored(wire.CurvePoint, "the curve of a training", point) for point in record.curve]
     of_training = {
@@ -77,7 +77,11 @@ def evaluation_view(policy: PolicyRecord, record: EvaluationRecord) -> wire.Eval
 def evaluation_detail(
     policy: PolicyRecord, record: EvaluationRecord, episodewise: JSON | None, missing: str | None, *, traces: bool
 ) -> wire.EvaluationDetail:
-    """An evaluation with its episodes. ``episodewise`` is None if they are ``missing``."""
+    """Convert an evaluation with its episodes to the reply.
+
+    ``episodewise`` has the returns, lengths and traces of the episodes. It is None if they can't be read; ``missing``
+    then says why. ``traces`` says whether the reply has the traces.
+    """
     there = episodewise or {"returns": [], "lengths": [], "success": None, "traces": []}
     fields = {**_evaluation(record, _card(policy)), **there, "missing": missing}
     if not traces:
@@ -113,8 +117,10 @@ def _fields(record: PolicyRecord, card: wire.PushedCard) -> dict[str, Any]:
 
 
 def _trust(card: wire.PushedCard, evaluations: list[dict[str, Any]]) -> tuple[bool | None, str]:
-    """The verdict on a promise with its reason: that of the card, unless the latest evaluation that judges the promise
-    broke it."""
+    """Return whether a policy's promise is trusted, with the reason.
+
+    Both are those of the card, unless the latest evaluation that can judge the promise broke it.
+    """
     latest = _latest(evaluations)
     if latest is None or latest["promise_kept"] or card.promise is None:
         return card.trusted, card.reason
@@ -125,7 +131,7 @@ def _trust(card: wire.PushedCard, evaluations: list[dict[str, Any]]) -> tuple[bo
 
 
 def _standing(evaluations: list[dict[str, Any]], drifts: tuple[EvaluationRecord, ...]) -> EvaluationRecord | None:
-    """The latest drift, unless a later evaluation judges the promise."""
+    """Return the latest report of drift; None if there is none, or if a later evaluation judges the promise."""
     judged, drift = _latest(evaluations), max(drifts, key=lambda one: one.id, default=None)
     return drift if drift is not None and (judged is None or drift.id > int(judged["id"])) else None
 
@@ -136,7 +142,7 @@ def _words(drift: EvaluationRecord) -> str:
 
 
 def _latest(evaluations: list[dict[str, Any]]) -> dict[str, Any] | None:
-    """The latest evaluation that judges the promise."""
+    """Return the latest evaluation that can judge the promise; None if there is none."""
     judged = [one for one in evaluations if one["promise_kept"] is not None]
     return max(judged, key=lambda one: int(one["id"]), default=None)
 

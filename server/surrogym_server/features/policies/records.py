@@ -1,8 +1,8 @@
-"""Records of policies, and the port of their files.
+"""Records of policies, and the interface of the storage of their files.
 
 A policy of a surrogate has a version: 1, 2, ... Its description is in the database, and its files are blobs. A blob is
 stored before the row that names it, and removed after that row, so that no row names a missing blob. Blobs without a
-row, which a crash can leave, are swept.
+row, which a crash can leave, are removed later.
 """
 
 from __future__ import annotations
@@ -13,15 +13,16 @@ from dataclasses import dataclass, field
 from surrogym_server.storage.records import JSON
 from surrogym_shared.wire import FEWEST_TO_JUDGE
 
-MAX_POLICIES = 200  # of a surrogate
-MAX_EVALUATIONS = 100  # of a policy
-PUSHED_BY = "pushed_by"  # entry of a card: who stored it
-DRIFT = "drift"  # entry of the summary of a report that the plant has drifted; other summaries are of episodes
+MAX_POLICIES = 200  # largest number of policies of a surrogate
+MAX_EVALUATIONS = 100  # largest number of evaluations and reports of drift of a policy
+PUSHED_BY = "pushed_by"  # key in a card: role and fingerprint of the token that stored the policy
+DRIFT = "drift"  # key in the summary of a report of drift; summaries of episodes don't have it
+# Values of fields that the summary of an older evaluation lacks.
 OLDER: JSON = {
     "environment": "",
     "own": True,
     "seeded": True,
-}  # of evaluations that were stored before these fields existed
+}
 
 
 @dataclass(frozen=True)
@@ -42,11 +43,15 @@ class EvaluationRecord:
     summary: JSON
     bytes: int
     digest: str
-    blob: str | None  # of its episodes
+    blob: str | None  # name of the blob with the episodes; None if it was removed to free space
 
 
 def judges(summary: JSON) -> bool:
-    """Return whether episodes can judge a promise: enough of them, by the policy, as declared, in its own plant."""
+    """Return whether an evaluation, given its summary, can judge a policy's promise.
+
+    It can if it has enough episodes, if the policy itself acted, if the starts were those of the specification, and if
+    the original environment was the surrogate's own.
+    """
     there = OLDER | summary
     declared = there.get("controller") == "policy" and there.get("declared") and there["own"]
     return bool(declared) and int(there["episodes"]) >= FEWEST_TO_JUDGE
@@ -70,31 +75,31 @@ class PolicyRecord:
     files: tuple[PolicyFile, ...] = ()
     aliases: tuple[str, ...] = ()
     evaluations: tuple[EvaluationRecord, ...] = ()
-    drifts: tuple[EvaluationRecord, ...] = ()  # without episodes
+    drifts: tuple[EvaluationRecord, ...] = ()  # reports of drift, which have no episodes
 
 
 Freed = tuple[str, ...]  # names of blobs that no row refers to any more
 
 
 class Blobs(ABC):
-    """Bytes by name. A name is used once."""
+    """Interface of a storage of files by name. A name is never used twice."""
 
     @abstractmethod
     def put(self, content: bytes) -> str:
-        """Store bytes durably, and return their name.
+        """Store the content of a file durably, and return its new name.
 
         Raises:
-            Unavailable: they can't be stored now.
+            Unavailable: the content can't be stored now.
         """
 
     @abstractmethod
     def get(self, name: str) -> bytes:
-        """Return the bytes. Raises ``Damaged`` if they are missing or can't be read."""
+        """Return the content of the file with this name. Raises ``Damaged`` if it is missing or can't be read."""
 
     @abstractmethod
     def remove(self, names: Freed) -> None:
-        """Remove blobs. Missing ones are ignored."""
+        """Remove the files with these names. Missing files are ignored."""
 
     @abstractmethod
     def older(self, seconds: float) -> set[str]:
-        """Return the names of the blobs that are older than a number of seconds."""
+        """Return the names of the files that were stored more than ``seconds`` ago."""

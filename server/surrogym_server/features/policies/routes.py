@@ -1,4 +1,4 @@
-"""Routes of policies: store, list, download, evaluate, name."""
+"""Routes of policies: store, list, download, report evaluations and drift, set aliases."""
 
 from __future__ import annotations
 
@@ -87,17 +87,17 @@ def list_all(name: str, policies: Policies) -> PolicyList:
 def add(
     name: str, body: Annotated[AddPolicy, example(POLICY_EXAMPLE)], request: Request, policies: Policies
 ) -> PushedPolicy:
-    """Store a policy's card, the curve of its training, and the form of the file that follows with ``PUT
-    .../files/{form}``. A version never changes: the same file with another card or curve is a new version, and a repeat
-    of all three returns the version that is there. A policy for other observations or actions is refused; other
-    differences of its specification are named in ``differs``."""
+    """Store a policy's card and learning curve, and announce its file, which follows with ``PUT .../files/{form}``. A
+    version never changes: the same file with another card or curve is a new version, and a repeat of all three returns
+    the existing version. A policy for other observations or actions is refused; other differences of its specification
+    are named in ``differs``."""
     record, created = policies.add(name, *forms.new_policy(body), by=holder(request.scope))
     return forms.pushed_policy(record, created=created)
 
 
 @router.get("/{which}", summary="One policy", dependencies=[READ], responses=documented(*THERE))
 def get(name: str, which: Which, policies: Policies) -> PolicyDetail:
-    """Return a policy with the settings and the curve of its training. ``which`` is a version, an alias, or
+    """Return a policy with the settings and the learning curve of its training. ``which`` is a version, an alias, or
     ``latest``."""
     return forms.policy_detail(policies.get(name, which))
 
@@ -128,9 +128,9 @@ async def put_file(
     request: Request,
     policies: Policies,
 ) -> PolicyView:
-    """Send a file as the body. Its size, digest and outer form are checked; it is never loaded. A file
-    that is there is never replaced, and only the token that stored the version adds files to it. If the files of a
-    surrogate's policies exceed their limit, the files of the oldest policies without an alias are removed."""
+    """Store a file of a policy, which is the body. Its size, digest and format are checked, but it is never loaded. A
+    stored file is never replaced, and only the token that stored the version may add files. If the files of a
+    surrogate's policies exceed their limit, files of the oldest policies without an alias are removed."""
     content = await request.body()
     file = forms.policy_file(FileNotice(form=form, bytes=max(1, len(content)), digest=digest))
     by = None if role_of(request.scope) == "admin" else holder(request.scope)
@@ -164,7 +164,8 @@ def file(name: str, which: Which, form: PolicyForm, policies: Policies) -> Respo
 def evaluate(
     name: str, version: Version, body: Annotated[AddEvaluation, example(EVALUATION_EXAMPLE)], policies: Policies
 ) -> EvaluationView:
-    """Report real episodes, once for each idempotency key. ``POST .../ledger`` counts their real steps separately."""
+    """Report real episodes of a policy, once for each idempotency key. Their real steps are reported separately, by
+    ``POST .../ledger``."""
     return forms.evaluation_view(*policies.evaluate(name, version, forms.episodes(body), body.idempotency_key))
 
 
@@ -178,8 +179,8 @@ def evaluate(
 def report_drift(
     name: str, version: Version, body: Annotated[AddDrift, example(DRIFT_EXAMPLE)], policies: Policies
 ) -> PolicyView:
-    """Report, once for each idempotency key, that real steps no longer agree with the model. The policy's promise is
-    not trusted from then on, until a later evaluation keeps it."""
+    """Report that real steps no longer agree with the model (drift), once for each idempotency key. The policy's
+    promise is then not trusted until a later evaluation confirms it."""
     drift = body.model_dump(mode="json", exclude={"idempotency_key"})
     return forms.policy_view(policies.report_drift(name, version, drift, body.idempotency_key))
 
@@ -192,8 +193,8 @@ def evaluation(
     policies: Policies,
     traces: Annotated[bool, Query(description="whether the reply has traces too; they are most of its bytes")] = True,
 ) -> EvaluationDetail:
-    """Return an evaluation with the return of each episode, and traces of some. ``missing`` says why they can't be
-    read."""
+    """Return an evaluation with the return of each episode, and traces of some episodes. If these can't be read,
+    ``missing`` has the reason."""
     return forms.evaluation_detail(*policies.episodes(name, which, id), traces=traces)
 
 
@@ -201,7 +202,7 @@ def evaluation(
 def put_alias(
     name: str, alias: AliasName, body: Annotated[PutAlias, example(ALIAS_EXAMPLE)], policies: Policies
 ) -> PolicyView:
-    """Let the alias, such as ``production``, point to this version, and no longer to another one."""
+    """Set an alias, such as ``production``, to a version of the policies. An existing alias moves to this version."""
     return forms.policy_view(policies.put_alias(name, alias, body.version))
 
 
@@ -209,6 +210,6 @@ def put_alias(
     "/aliases/{alias}", status_code=204, summary="Take a name away", dependencies=[ADMIN], responses=documented(*THERE)
 )
 def drop_alias(name: str, alias: AliasName, policies: Policies) -> Response:
-    """Remove an alias. The policy itself stays."""
+    """Remove an alias of a policy. The policy itself stays."""
     policies.drop_alias(name, alias)
     return Response(status_code=204)

@@ -1,4 +1,4 @@
-"""Policies: stored with their trainings and evaluations, and returned unchanged."""
+"""Use cases of policies: store them with their files and evaluations, return them, set aliases, report drift."""
 
 from __future__ import annotations
 
@@ -41,13 +41,14 @@ from surrogym_shared.environments import is_name, is_same
 logger = logging.getLogger(__name__)
 
 MEBIBYTE = 2**20
-ORPHAN_SECONDS = 3_600.0  # wait before unreferenced files are removed; an upload takes less
-MUST_AGREE = ("observation", "action")  # of two specifications: a policy's inputs and outputs
+ORPHAN_SECONDS = 3_600.0  # age from which a file that no policy names is removed; an upload takes less time
+MUST_AGREE = ("observation", "action")  # parts of a specification on which a policy's inputs and outputs depend
 
 
 @dataclass(frozen=True)
 class Episodes:
-    """Real episodes of a report; lists have one entry for each episode."""
+    """Reported real episodes of a policy. ``returns``, ``lengths`` and ``success`` have one entry for each episode;
+    ``traces`` are of some episodes."""
 
     controller: str
     note: str
@@ -63,12 +64,15 @@ class Episodes:
 
 class PolicyService:
     def __init__(self, storage: Storage, blobs: Blobs, complete: Complete, notices: Notices, most_bytes: int) -> None:
-        """Args:
-        storage: holds the policies.
-        blobs: holds their files.
-        complete: returns a specification with every field that this program knows, as JSON.
-        notices: of this process.
-        most_bytes: limit for all files of one surrogate's policies."""
+        """Keep the objects of the server that this service needs.
+
+        Args:
+            storage: stores the policies.
+            blobs: stores the files of the policies.
+            complete: adds the fields that a specification (JSON) of an older program lacks.
+            notices: notices of this process.
+            most_bytes: largest size of all files of one surrogate's policies together.
+        """
         self._storage = storage
         self._policies = storage.part(Policies)
         self._blobs = blobs
@@ -84,11 +88,11 @@ class PolicyService:
         return cls(core.storage, blobs, core.complete, core.notices, settings.policies_mib * MEBIBYTE)
 
     async def sweep(self) -> None:
-        """Once in ``ORPHAN_SECONDS``, remove the files whose policy or surrogate was deleted or never stored."""
+        """Every ``ORPHAN_SECONDS``, remove files whose policy was deleted or never stored."""
         await asyncio.to_thread(self._sweep_files)
 
     def metrics(self) -> Iterator[Metric]:
-        """When drift was last found, for each policy of which it was."""
+        """Yield a metric with the time of the last report of drift, for each policy that has one."""
         words = "When real steps last disagreed with the model of a policy, in seconds since 1970."
         family = GaugeMetricFamily("surrogym_policy_drift_time_seconds", words, labels=("surrogate", "version"))
         for name, version, at in self._policies.drifts():
@@ -96,11 +100,19 @@ class PolicyService:
         yield family
 
     def add(self, name: str, card: JSON, curve: list[JSON], file: PolicyFile, by: str) -> tuple[PolicyRecord, bool]:
-        """Store a policy before its file is sent. Returns it, and whether it is new: a policy with the same file, card
-        and curve is known. ``by`` says who stores it.
+        """Store a policy whose file will be sent later. Return it, and whether it is new.
+
+        A policy with the same file, card and curve as a stored one is not new.
+
+        Args:
+            name: name of the surrogate.
+            card: what the policy's file says about its training, as JSON.
+            curve: learning curve of the training.
+            file: the announced file.
+            by: role and fingerprint of the token that stores the policy.
 
         Raises:
-            SpecConflict: it was made for a specification with other observations or actions.
+            SpecConflict: the policy was trained for other observations or actions.
         """
         differs = self._difference(name, card["spec"])
         kept = {**card, "spec": card["spec"] if differs else None, "differs": differs, PUSHED_BY: by}
@@ -109,23 +121,29 @@ class PolicyService:
         return self._policies.get(name, str(version)), created
 
     def list(self, name: str) -> list[PolicyRecord]:
-        """All policies, newest first."""
+        """Return all policies of a surrogate, newest first."""
         return self._policies.list(name)
 
     def get(self, name: str, which: str) -> PolicyRecord:
-        """Return a policy. Raises ``UnknownPolicy``."""
+        """Return a policy by its version, an alias, or ``latest``. Raises ``UnknownPolicy``."""
         return self._policies.get(name, which)
 
     def put_file(
         self, name: str, version: int, file: PolicyFile, content: bytes, by: str | None = None
     ) -> PolicyRecord:
-        """Store an announced file. ``add`` announces a policy's own file. ``by`` says who sends it; None may add to any
-        policy.
+        """Store a file of a policy, and return the policy.
+
+        Args:
+            name: name of the surrogate.
+            version: version of the policy.
+            file: format, size and hash of the file; of the main file as ``add`` announced it.
+            content: the file.
+            by: role and fingerprint of the token that sends the file; None for an admin.
 
         Raises:
-            Forbidden: somebody else stored the policy.
-            InvalidInput: it differs from the announcement, or does not have its form.
-            TooLarge: there is no room for it.
+            Forbidden: another token stored the policy.
+            InvalidInput: the content differs from ``file``, or does not have its format.
+            TooLarge: the files of the surrogate's policies would exceed their limit.
         """
         record = self._policies.get(name, str(version))
         owner = record.card.get(PUSHED_BY, by)
@@ -133,7 +151,10 @@ class PolicyService:
             raise Forbidden(f"expected the token that stored version {version}, {owner}, or an admin's, got {by}")
         own = next((known for known in record.files if known.form == file.form and known.main), None)
         if own is not None and own.digest != file.digest:
-            raise InvalidInput(f"expected the file that version {version} was announced with, got a different file")
+            raise InvalidInput(
+                f"expected the file that version {version} was announced with, got a different file: send that file "
+                "or store a new version"
+            )
         check_file(file.form, content, file.bytes, file.digest)
         blob = self._blobs.put(content)
         with self._removed_if_refused(blob):
@@ -143,7 +164,7 @@ class PolicyService:
         return self._policies.get(name, str(version))
 
     def file(self, name: str, which: str, form: str) -> tuple[int, bytes]:
-        """Return a file, and the version to which it belongs.
+        """Return the version of a policy, and its file of the format ``form``.
 
         Raises:
             UnknownPolicy: there is no such policy, or it has no such file.
@@ -158,11 +179,11 @@ class PolicyService:
         return record.version, self._content(file.blob, file.digest, f"the {form} file of {place}")
 
     def evaluate(self, name: str, version: int, episodes: Episodes, key: str) -> tuple[PolicyRecord, EvaluationRecord]:
-        """Store real episodes of a policy, once for each key. Returns the policy and the evaluation.
+        """Store real episodes of a policy, once for each idempotency key. Return the policy and the evaluation.
 
         Raises:
-            InvalidInput: lists of different lengths.
-            TooLarge: there is no room for it.
+            InvalidInput: the lists have different lengths, or a trace does not fit the specification.
+            TooLarge: the files of the surrogate's policies would exceed their limit.
         """
         _require_lengths(episodes, self._storage.surrogates.get(name).spec)
         episodewise = {name: getattr(episodes, name) for name in ("returns", "lengths", "success", "traces")}
@@ -177,7 +198,8 @@ class PolicyService:
         return self._policies.get(name, str(version)), stored
 
     def report_drift(self, name: str, version: int, drift: JSON, key: str) -> PolicyRecord:
-        """Store that the plant has drifted, once for each key, which withdraws the trust. Returns the policy."""
+        """Store a report of drift, once for each idempotency key, and return the policy, whose promise is then not
+        trusted."""
         new = NewEvaluation(f"{DRIFT} {key}", {DRIFT: drift})
         _, created, freed = self._policies.evaluate(name, version, new, self._most_bytes)
         if created:
@@ -187,7 +209,7 @@ class PolicyService:
     def episodes(
         self, name: str, which: str, id: int
     ) -> tuple[PolicyRecord, EvaluationRecord, JSON | None, str | None]:
-        """Return an evaluation and its episodes, or why these are missing.
+        """Return a policy, an evaluation of it, the evaluation's episodes, and the reason if these can't be read.
 
         Raises:
             UnknownPolicy: there is no such policy, or it has no such evaluation.
@@ -195,7 +217,10 @@ class PolicyService:
         record = self._policies.get(name, which)
         found = next((one for one in record.evaluations if one.id == id), None)
         if found is None:
-            raise UnknownPolicy(f"expected an evaluation of version {record.version} of {name!r}'s policies, got {id}")
+            raise UnknownPolicy(
+                f"expected the id of an evaluation of version {record.version} of {name!r}'s policies, got {id}, which "
+                "does not exist"
+            )
         if found.blob is None:
             return record, found, None, "they were removed to free space for newer files"
         try:
@@ -205,8 +230,12 @@ class PolicyService:
             return record, found, None, str(error)
 
     def put_alias(self, name: str, alias: str, version: int) -> PolicyRecord:
-        """Let an alias point to a version. Raises ``UnknownPolicy``, or ``InvalidInput`` for the reserved alias of the
-        newest."""
+        """Set an alias to a version, and return the policy.
+
+        Raises:
+            UnknownPolicy: there is no policy of this version.
+            InvalidInput: the alias is ``latest``, which is reserved.
+        """
         if alias == LATEST:
             raise InvalidInput(
                 f"expected another alias than {LATEST!r}, which is always the newest version: choose another word"
@@ -216,12 +245,12 @@ class PolicyService:
         return self._policies.get(name, alias)
 
     def drop_alias(self, name: str, alias: str) -> None:
-        """Remove an alias. Raises ``UnknownPolicy``."""
+        """Remove an alias of a policy. Raises ``UnknownPolicy`` if the alias does not exist."""
         self._policies.drop_alias(name, alias)
         self._changed(name)
 
     def delete(self, name: str, version: int) -> None:
-        """Remove a policy with its files and evaluations. Raises ``UnknownPolicy``."""
+        """Delete a policy with its files, evaluations and aliases. Raises ``UnknownPolicy``."""
         self._changed(name, self._policies.delete(name, version))
 
     def _sweep_files(self) -> None:
@@ -237,10 +266,10 @@ class PolicyService:
 
     @contextmanager
     def _removed_if_refused(self, blob: str) -> Iterator[None]:
-        """Remove a blob if its row was refused.
+        """Return a context that removes a blob if the row that names it is refused within the context.
 
-        After a lost connection it is unknown whether the row was stored, and a row must not point to a missing blob. So
-        the blob stays then, and is swept later if there is no row.
+        After a lost connection it is unknown whether the row was stored, so the blob stays. If there is no row, a later
+        sweep removes it.
         """
         try:
             yield
@@ -256,10 +285,10 @@ class PolicyService:
         return content
 
     def _is_own(self, name: str, environment: str) -> bool:
-        """Whether a name means the surrogate's own environment.
+        """Whether ``environment``, the name in an evaluation, is the surrogate's own original environment.
 
-        A specification may call the environment by free text, which no name of an evaluation can equal. Then the name
-        in the surrogate's first evaluation is its own.
+        If the specification describes its environment by free text instead of a name, the name in the surrogate's first
+        evaluation counts as its own. An empty name counts as its own too.
         """
         own = str(self._storage.surrogates.get(name).spec["environment"])
         if not is_name(own):
@@ -269,7 +298,11 @@ class PolicyService:
         return not environment or is_same(environment, own)
 
     def _difference(self, name: str, spec: JSON | None) -> str | None:
-        """Name the part in which the specification of a card differs from the surrogate's."""
+        """Return the first field in which the specification of a policy's card differs from that of the surrogate.
+
+        Returns None if they are equal, or if the card has none. Raises ``SpecConflict`` if the observations or actions
+        differ.
+        """
         own = self._complete(self._storage.surrogates.get(name).spec)
         if spec is None or own == spec:
             return None
@@ -278,8 +311,9 @@ class PolicyService:
                 where, had, got = difference(own[part], spec[part])
                 place = f"{part}.{where}".rstrip(".")
                 raise SpecConflict(
-                    f"expected a policy for {name!r}, got one for another specification: {place} is "
-                    f"{short(had)} there, {short(got)} in the policy's card"
+                    f"expected a policy for {name!r}, got one for another specification: {place} is {short(had)} in "
+                    f"the surrogate's, {short(got)} in the policy's card; store it with the surrogate that it was "
+                    "trained on"
                 )
         return difference(own, spec)[0]
 
@@ -289,7 +323,8 @@ class PolicyService:
 
 
 def _require_lengths(episodes: Episodes, spec: JSON) -> None:
-    """Check that lists belong together, and that traces have the specification's numbers of coordinates and actions."""
+    """Check the lengths of an evaluation's lists, and that its traces have the sizes of the specification's coordinates
+    and actions. Raises ``InvalidInput``."""
     count = len(episodes.returns)
     for what in ("lengths", "success"):
         values = getattr(episodes, what)
@@ -303,7 +338,7 @@ def _require_lengths(episodes: Episodes, spec: JSON) -> None:
 
 
 def _summary(episodes: Episodes) -> JSON:
-    """Statistics of the episodes, with intervals of 95 %."""
+    """Return statistics of an evaluation's episodes, with 95 % intervals, as JSON."""
     returns, success = list(episodes.returns), episodes.success
     share = None if success is None else intervals.of_share(sum(success), len(success))
     interval = intervals.of_mean(returns)
@@ -318,7 +353,7 @@ def _summary(episodes: Episodes) -> JSON:
         "steps": sum(episodes.lengths),
         "mean": statistics.fmean(returns),
         "mean_interval": None if interval is None else interval._asdict(),
-        "median": statistics.median_low(returns),  # the return of an episode, which is shown as the median one
+        "median": statistics.median_low(returns),  # one of the returns, so that the dashboard can show its episode
         "least": min(returns),
         "most": max(returns),
         "success_rate": None if not success else sum(success) / len(success),

@@ -1,4 +1,4 @@
-"""Policies by version, their files, evaluations and aliases."""
+"""Storage of policies by version, with their files, evaluations and aliases, in the database."""
 
 from __future__ import annotations
 
@@ -45,34 +45,35 @@ policy_files = checked(
         sa.Column("surrogate_id", Id, primary_key=True, autoincrement=False),
         sa.Column("version", sa.Integer, primary_key=True, autoincrement=False),
         sa.Column("form", sa.Text, primary_key=True),
-        sa.Column("main", sa.Boolean, nullable=False),  # the file that the version came with
+        sa.Column("main", sa.Boolean, nullable=False),  # whether the policy was stored with this file
         sa.Column("bytes", sa.BigInteger, nullable=False),
-        sa.Column("digest", sa.Text, nullable=False),  # SHA-256 of its content
-        sa.Column("blob", sa.Text),  # NULL: not there
+        sa.Column("digest", sa.Text, nullable=False),  # SHA-256 of the file
+        sa.Column("blob", sa.Text),  # name of the blob with the content; NULL: not stored
         policy_key(),
     )
 )
 
-OWNED = (policy_files, policy_evaluations)  # tables whose rows may have a blob
+OWNED = (policy_files, policy_evaluations)  # tables whose rows may name a blob
 
 
 class Policies:
-    """Policies by version. ``which`` is a version, an alias, or ``latest``.
+    """Storage of the policies of surrogates, by version.
 
-    An operation on a policy that does not exist raises ``UnknownPolicy``.
+    An argument ``which`` is a version, an alias, or ``latest``. An operation on a policy that does not exist raises
+    ``UnknownPolicy``. ``Freed`` in a result are the names of blobs that no row names any more.
     """
 
     def __init__(self, database: Database) -> None:
         self._database = database
 
     def add(self, name: str, card: JSON, curve: list[JSON], file: PolicyFile) -> tuple[int, bool, Freed]:
-        """Store a policy before its ``file`` is sent. Returns its version, and whether that is new.
+        """Store a policy whose ``file`` will be sent later. Return its version, whether it is new, and freed blobs.
 
-        A version never changes. The same main file, card and curve are the same version, whoever stores them. Beyond
-        ``MAX_POLICIES`` the oldest policy without an alias of whoever stored most is removed.
+        A version never changes. A repeat with the same main file, card and curve returns the stored version. Beyond
+        ``MAX_POLICIES`` policies, one without an alias is removed: the oldest of the token that stored most policies.
 
         Raises:
-            TooLarge: there are ``MAX_POLICIES``, and all have aliases.
+            TooLarge: the surrogate has ``MAX_POLICIES`` policies, and all have aliases.
         """
         with self._database.write() as connection:
             held = hold(connection, name)
@@ -88,7 +89,7 @@ class Policies:
             return version, True, freed
 
     def list(self, name: str) -> list[PolicyRecord]:
-        """Return all policies, newest first, without their curves."""
+        """Return all policies of a surrogate, newest first, without their learning curves."""
         with self._database.read() as connection:
             return _records(connection, find(connection, name), sa.true(), curves=False)
 
@@ -100,13 +101,13 @@ class Policies:
             return record
 
     def attach(self, name: str, version: int, file: PolicyFile, most: int) -> Freed:
-        """Store a file of a policy. A file of this form that was stored or announced is the same one.
+        """Store a file of a policy, and return the freed blobs.
 
-        If the files of the surrogate's policies then exceed ``most`` bytes together, files of policies
-        without an alias are removed: the oldest of whoever stored most. Their descriptions stay.
+        If the files of the surrogate's policies then exceed ``most`` bytes together, files of policies without an alias
+        are removed: the oldest of the token that stored most bytes. The policies themselves stay.
 
         Raises:
-            InvalidInput: the policy has another file of this form.
+            InvalidInput: a file of this format with another hash was stored or announced for the policy.
             TooLarge: the files of policies with aliases and of this one exceed the limit.
         """
         with self._database.write() as connection:
@@ -119,8 +120,8 @@ class Policies:
                 connection.execute(sa.insert(policy_files).values(**place, **_of_file(file)))
             elif before.digest != file.digest:
                 raise InvalidInput(
-                    f"expected the {file.form} file that version {version} has, got another one: "
-                    "what was stored is never replaced"
+                    f"version {version} has another {file.form} file, and a stored file is never replaced: store a new "
+                    "version"
                 )
             else:
                 connection.execute(sa.update(policy_files).where(own).values(**_of_file(file)))
@@ -130,8 +131,12 @@ class Policies:
             return (*replaced, *freed)
 
     def evaluate(self, name: str, version: int, new: NewEvaluation, most: int) -> tuple[EvaluationRecord, bool, Freed]:
-        """Store an evaluation, once for each key. Returns whether it is new. Beyond ``MAX_EVALUATIONS`` of the policy,
-        see ``_displaced``. ``most`` is that of ``attach``."""
+        """Store an evaluation of a policy, once for each idempotency key. Return it, whether it is new, and freed
+        blobs.
+
+        Beyond ``MAX_EVALUATIONS`` of the policy, older ones are removed. If the files of the surrogate's policies then
+        exceed ``most`` bytes together, files of policies without an alias are removed.
+        """
         table = policy_evaluations
         with self._database.write() as connection:
             held = hold(connection, name)
@@ -153,12 +158,14 @@ class Policies:
             return _evaluation(row), True, (*gone, *freed)
 
     def drifts(self) -> Sequence[tuple[str, int, float]]:
-        """Return the policies of which a drift was reported: surrogate, version, and when, in seconds since 1970."""
+        """Return the policies with a report of drift: surrogate, version, and time of the latest report in seconds
+        since
+        1970."""
         rows = policy_evaluations.c
         statement = (
             sa.select(surrogates.c.name, rows.version, sa.func.max(rows.created_at))
             .join_from(policy_evaluations, surrogates, rows.surrogate_id == surrogates.c.id)
-            .where(rows.bytes == 0)  # episodes have bytes, drifts have none
+            .where(rows.bytes == 0)  # reports of drift, which have no episodes
             .group_by(surrogates.c.name, rows.version)
             .order_by(surrogates.c.name, rows.version)
         )
@@ -166,7 +173,7 @@ class Policies:
             return [(name, int(version), float(at)) for name, version, at in connection.execute(statement)]
 
     def put_alias(self, name: str, alias: str, version: int) -> None:
-        """Let the alias point to this version, and no longer to another one."""
+        """Set an alias to a version; an existing alias moves to this version."""
         with self._database.write() as connection:
             held = hold(connection, name)
             require_version(connection, held.id, name, version)
@@ -187,7 +194,8 @@ class Policies:
             append_event(connection, held, "policy", what="alias", alias=alias)
 
     def delete(self, name: str, version: int) -> Freed:
-        """Remove a policy with its evaluations and aliases. Its version is never used again."""
+        """Delete a policy with its evaluations and aliases, and return the freed blobs. Its version is not used
+        again."""
         with self._database.write() as connection:
             held = hold(connection, name)
             require_version(connection, held.id, name, version)
@@ -196,7 +204,7 @@ class Policies:
             return freed
 
     def blobs(self) -> set[str]:
-        """Return the names of all blobs that rows of policies refer to, of all surrogates."""
+        """Return the names of all blobs that the policies of all surrogates need."""
         with self._database.read() as connection:
             return {
                 name
@@ -210,7 +218,7 @@ def _own(table: sa.Table, surrogate: int, version: int) -> sa.ColumnElement[bool
 
 
 def _next_version(connection: Connection, surrogate: int) -> int:
-    """A version that was never used."""
+    """Return a new version number for a policy, which was never used for this surrogate."""
     count = sa.update(surrogates).where(surrogates.c.id == surrogate)
     given = count.values(policy_versions=surrogates.c.policy_versions + 1).returning(surrogates.c.policy_versions)
     return int(connection.execute(given).scalar_one())
@@ -221,7 +229,10 @@ def _of_file(file: PolicyFile) -> dict[str, Any]:
 
 
 def _known(connection: Connection, surrogate: int, card: JSON, curve: list[JSON], digest: str) -> int | None:
-    """The newest version with this file, card and curve. A downloaded policy is pushed again without its curve."""
+    """Return the newest policy version with this main file, card and curve; None if there is none.
+
+    An empty ``curve`` matches any curve, because a downloaded policy has none when it is stored again.
+    """
     files = policy_files.c
     same = sa.select(files.version).where(files.surrogate_id == surrogate, files.digest == digest, files.main)
     own = (policies.c.surrogate_id == surrogate) & policies.c.version.in_(same)
@@ -237,7 +248,10 @@ def _without_owner(card: JSON) -> JSON:
 
 
 def _make_place(connection: Connection, surrogate: int, version: int, name: str) -> Freed:
-    """Remove policies without an alias, but for this version, until there are ``MAX_POLICIES``."""
+    """Remove policies without an alias, except ``version``, until the surrogate has ``MAX_POLICIES``.
+
+    Returns the freed blobs. Raises ``TooLarge`` if too many policies have aliases.
+    """
     own = sa.select(policies.c.version).where(policies.c.surrogate_id == surrogate)
     counts = dict.fromkeys(connection.execute(own).scalars(), 1)
     beyond = len(counts) - MAX_POLICIES
@@ -252,7 +266,10 @@ def _make_place(connection: Connection, surrogate: int, version: int, name: str)
 
 
 def _within(connection: Connection, surrogate: int, version: int, most: int, name: str) -> Freed:
-    """Remove files of policies without an alias, but for this version, until all have at most ``most`` bytes."""
+    """Remove files of policies without an alias, except ``version``, until all files have at most ``most`` bytes.
+
+    Returns the freed blobs. Raises ``TooLarge`` if that is not enough.
+    """
     sizes = _sizes(connection, surrogate)
     beyond = sum(sizes.values()) - most
     if beyond <= 0:
@@ -266,13 +283,13 @@ def _within(connection: Connection, surrogate: int, version: int, most: int, nam
         for table in OWNED:
             connection.execute(sa.update(table).where(_own(table, surrogate, oldest)).values(blob=None))
     if beyond > 0:
-        kept = f"files of {name!r}'s policies of at most {most} bytes"
+        kept = f"the files of {name!r}'s policies to take at most {most} bytes"
         raise TooLarge(f"expected {kept}, got {beyond} more: delete a policy, or remove an alias")
     return tuple(freed)
 
 
 def _sizes(connection: Connection, surrogate: int) -> dict[int, int]:
-    """Bytes of each version's blobs."""
+    """Return the total size in bytes of each policy's blobs, by version."""
     sizes: defaultdict[int, int] = defaultdict(int)
     for table in OWNED:
         there = sa.select(table.c.version, table.c.bytes)
@@ -282,9 +299,10 @@ def _sizes(connection: Connection, surrogate: int) -> dict[int, int]:
 
 
 def _in_order_of_removal(connection: Connection, surrogate: int, kept: int, sizes: Mapping[int, int]) -> Iterator[int]:
-    """Versions without an alias, but for ``kept``: again and again the oldest of whoever holds most.
+    """Yield the policy versions without an alias, except ``kept``, in the order in which to remove them.
 
-    So a flood of policies removes those of its own sender, and none of others.
+    The next one is always the oldest of the token with the largest remaining sum of ``sizes`` (by version). So a token
+    that stores very many policies displaces its own.
     """
     cards = sa.select(policies.c.version, policies.c.card).where(policies.c.surrogate_id == surrogate)
     senders = {row.version: row.card.get(PUSHED_BY) for row in connection.execute(cards)}
@@ -305,7 +323,7 @@ def _in_order_of_removal(connection: Connection, surrogate: int, kept: int, size
 
 
 def _unaliased(connection: Connection, surrogate: int) -> list[int]:
-    """Versions without an alias, oldest first."""
+    """Return the policy versions of a surrogate without an alias, oldest first."""
     aliased = sa.select(policy_aliases.c.version).where(policy_aliases.c.surrogate_id == surrogate)
     own = (policies.c.surrogate_id == surrogate) & policies.c.version.not_in(aliased)
     return list(connection.execute(sa.select(policies.c.version).where(own).order_by(policies.c.version)).scalars())
@@ -329,7 +347,10 @@ def _delete(connection: Connection, surrogate: int, versions: Sequence[int]) -> 
 def _records(
     connection: Connection, surrogate: int, condition: sa.ColumnElement[bool], *, curves: bool
 ) -> list[PolicyRecord]:
-    """Policies, newest first. The number of statements does not depend on their number."""
+    """Return the policies of a surrogate that meet an SQL condition, newest first, with or without learning curves.
+
+    The number of SQL statements does not depend on the number of policies.
+    """
     columns = [policies.c.version, policies.c.created_at, policies.c.card, *([policies.c.curve] if curves else [])]
     wanted = sa.select(*columns).where(policies.c.surrogate_id == surrogate, condition)
     rows = connection.execute(wanted.order_by(policies.c.version.desc())).all()
@@ -363,13 +384,13 @@ def _by_version(rows: Iterable[Row[Any]]) -> defaultdict[int, list[Row[Any]]]:
 
 
 def _displaced(summaries: Mapping[int, JSON]) -> list[int]:
-    """Ids of rows beyond ``MAX_EVALUATIONS``: the oldest of the kind that has most.
+    """Return the ids of a policy's evaluations to remove, so that ``MAX_EVALUATIONS`` remain.
 
-    Reports of drift and episodes that judge the promise decide whether a policy is trusted. So a flood of other
-    episodes removes none of them.
+    There are three kinds: reports of drift, evaluations that can judge the promise, and others. The oldest of the most
+    frequent kind is removed first, so that many evaluations of one kind displace none of the others.
 
     Args:
-        summaries: by id, oldest first.
+        summaries: summaries of the evaluations by id, oldest first.
     """
     kinds: defaultdict[tuple[bool, bool], deque[int]] = defaultdict(deque)
     for id, summary in summaries.items():
@@ -380,7 +401,7 @@ def _displaced(summaries: Mapping[int, JSON]) -> list[int]:
 
 
 def _told_apart(rows: Iterable[EvaluationRecord]) -> tuple[tuple[EvaluationRecord, ...], tuple[EvaluationRecord, ...]]:
-    """Split rows into evaluations and reports of drift."""
+    """Split records into evaluations of episodes and reports of drift."""
     both: tuple[list[EvaluationRecord], list[EvaluationRecord]] = ([], [])
     for row in rows:
         both[DRIFT in row.summary].append(row)

@@ -1,4 +1,4 @@
-"""Priors: a model of what is known of an environment beforehand, beside which a design learns the rest."""
+"""Priors: models known before the first real step, such as of a simulator; a design learns the remaining error."""
 
 from surrogym_server.feature import Feature
 from surrogym_server.features.priors.routes import router

@@ -1,4 +1,4 @@
-"""Routes of priors: look at, store, wait for, remove."""
+"""Routes of a surrogate's prior: describe, store, wait for, remove."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ THERE = (Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST)
 
 @router.get("", summary="The prior", dependencies=[READ], responses=documented(*THERE))
 def get(name: str, priors: Priors) -> PriorView:
-    """Return what the prior was made from, and how well its parameters were calibrated."""
+    """Return the description of a surrogate's prior: its source, and how well its parameters were calibrated."""
     return _view(priors.get(name))
 
 
@@ -39,9 +39,9 @@ def get(name: str, priors: Priors) -> PriorView:
     responses=documented(*THERE, Code.TOO_LARGE, Code.NOT_INSTALLED),
 )
 async def put(name: str, request: Request, priors: Priors) -> PriorView:
-    """Store the model of an exported surrogate with the same coordinates and actions as the prior. Each output of the
-    next fit learns what the prior leaves, if this predicts left-out samples better. Queries that no sampler has begun
-    are withdrawn, and chosen again."""
+    """Store the prior of a surrogate: the body is a file of ``surrogym export`` with the same coordinates and actions.
+    In the next fit, each output learns the error of the prior, if this predicts left-out samples better. Adaptive
+    queries without a real step so far are withdrawn, and the design chooses new ones."""
     data = await request.body()
     await run_in_threadpool(priors.put, name, data)
     return _view(await run_in_threadpool(priors.get, name))
@@ -49,14 +49,15 @@ async def put(name: str, request: Request, priors: Priors) -> PriorView:
 
 @router.post(":await", summary="Wait for a prior", dependencies=[ADMIN], responses=documented(*THERE))
 def wait(name: str, priors: Priors) -> PriorView:
-    """Let the design wait after its initial queries until a prior is set. If there is one, nothing changes."""
+    """Let the design of a surrogate wait after its initial queries until a prior is stored. Does nothing if it has
+    one."""
     priors.wait(name)
     return _view(priors.get(name))
 
 
 @router.delete("", status_code=204, summary="Remove the prior", dependencies=[ADMIN], responses=documented(*THERE))
 def delete(name: str, priors: Priors) -> Response:
-    """Remove the prior, or stop waiting for one. The next fit learns without it."""
+    """Remove the prior of a surrogate, or stop waiting for one. The next fit uses no prior."""
     priors.drop(name)
     return Response(status_code=204)
 

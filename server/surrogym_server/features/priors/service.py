@@ -1,4 +1,4 @@
-"""The prior of a surrogate: checked, stored, awaited, removed."""
+"""Use cases of a surrogate's prior: check and store it, wait for it, remove it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.surrogate_file import NotASurrogateFile, SurrogateFile
 from surrogym_shared.wire.priors import PriorAbout
 
-SHARED = ("name", "kind", "unit", "lag")  # fields of a coordinate in which a prior is like the surrogate
+SHARED = ("name", "kind", "unit", "lag")  # fields of a coordinate that a prior and the surrogate must have in common
 
 
 class PriorService:
@@ -41,23 +41,23 @@ class PriorService:
         return cls(core.storage, core.notices)
 
     async def sweep(self) -> None:
-        """Do nothing: a prior never expires."""
+        """Do nothing, because a prior never expires."""
 
     def metrics(self) -> tuple[Metric, ...]:
-        """Return no series."""
+        """Return no metrics: priors have none."""
         return ()
 
     def get(self, name: str) -> PriorRecord | None:
-        """Return the description of a prior; None if there is none. Raises ``UnknownSurrogate``."""
+        """Return the description of a surrogate's prior; None if it has none. Raises ``UnknownSurrogate``."""
         return self._storage.priors.get(name)
 
     def put(self, name: str, data: bytes) -> None:
-        """Store the model in a surrogate's file as the prior, in place of any other.
+        """Store the model in a file of ``surrogym export`` (``data``) as the prior, which replaces an earlier one.
 
         Raises:
             UnknownSurrogate: there is no surrogate of this name.
-            InvalidInput: it is no surrogate's file; or its coordinates or actions are not those of this surrogate; or
-                its model can't be used; or the surrogate's family of models takes no prior.
+            InvalidInput: ``data`` is no such file, its coordinates or actions differ from those of this surrogate, its
+                model can't be used, or the surrogate's model family can't use a prior.
         """
         spec = read_stored(EnvironmentSpec, "a stored specification", self._storage.surrogates.get(name).spec)
         definition = stored_definition(spec)
@@ -80,14 +80,19 @@ class PriorService:
         self._notices.post(name)
 
     def wait(self, name: str) -> None:
-        """Let a design wait for its prior. Raises as ``put`` does."""
+        """Let the design of a surrogate wait for a prior.
+
+        Raises:
+            UnknownSurrogate: there is no surrogate of this name.
+            InvalidInput: the surrogate's model family can't use a prior.
+        """
         spec = read_stored(EnvironmentSpec, "a stored specification", self._storage.surrogates.get(name).spec)
         self._require_family(stored_definition(spec))
         self._storage.priors.wait(name)
         self._notices.post(name)
 
     def drop(self, name: str) -> None:
-        """Remove the prior, or stop waiting for one. Raises ``UnknownSurrogate``."""
+        """Remove a surrogate's prior, or stop waiting for one. Raises ``UnknownSurrogate``."""
         self._storage.priors.drop(name)
         self._notices.post(name)
 
@@ -95,11 +100,12 @@ class PriorService:
     def _require_family(definition: EnvironmentDefinition) -> None:
         family = definition.learning.model
         if not isinstance(learner_of(family), TakesPrior):
-            raise InvalidInput(f"expected a surrogate whose family of models takes a prior, got {family.name}")
+            raise InvalidInput(f"expected a surrogate whose family of models takes a prior, got {family.name!r}")
 
 
 def _require_alike(spec: EnvironmentSpec, other: EnvironmentSpec) -> None:
-    """Raise ``InvalidInput`` if the coordinates or the actions of a prior are not those of the surrogate."""
+    """Raise ``InvalidInput`` if the specification of a prior (``other``) has other coordinates or actions than the
+    surrogate's."""
     own, got = _shared_fields(spec), _shared_fields(other)
     if own != got:
         where, expected, came = difference(own, got)

@@ -1,1 +1,1 @@
-"""Sessions in a fixed pool of processes of a Ray cluster, with leases and checkpoints; fits as tasks of the cluster."""
+"""Sessions in a pool of processes of a Ray cluster, with leases and checkpoints; fits as tasks of the cluster."""

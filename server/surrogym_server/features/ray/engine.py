@@ -1,4 +1,4 @@
-"""RayEngine: sends the requests of sessions to session hosts in a Ray cluster. This process keeps no session."""
+"""``RayEngine``: sends the requests of sessions to session hosts, processes of a Ray cluster that run the sessions."""
 
 from __future__ import annotations
 
@@ -25,31 +25,31 @@ from surrogym_server.features.ray.store import LiveSessions
 
 logger = logging.getLogger(__name__)
 
-ANSWERING_SECONDS, TAKING_SECONDS = 5.0, 60.0  # longest waits for a host
+ANSWERING_SECONDS, TAKING_SECONDS = 5.0, 60.0  # longest wait for a sign of a host, and for it to take over a session
 ENDED, SILENT = "has ended and is started again", "does not answer now"
-MOVES = 3  # hosts that one request tries while its session changes hosts
-REMEMBERED = 10_000  # sessions whose present host is remembered, because it is not the one in their id
+MOVES = 3  # largest number of hosts that one request tries while its session changes hosts
+REMEMBERED = 10_000  # largest number of sessions whose host is cached, because it differs from the one in their id
 
 
 class _Gone(Exception):
-    """A session host has died, or does not answer."""
+    """A session host has died, does not answer, or no longer has the session."""
 
 
 class RayEngine(SessionEngine):
-    """Engine that sends each request to the session host that has the session.
+    """Engine that sends each request to the session host that runs the session.
 
-    The id of a session ends with the number of the host that opened it. If that host does not have the session, the
-    database names the host that does. If the session's lease has ended, another host takes it over.
+    The id of a session ends with the number of the host that opened it. If that host no longer has the session, the
+    database names the host that has it. If the session's lease has expired, another host takes it over.
 
     Args:
-        hosts: actor handles of ``SessionHost``, by number.
+        hosts: Ray's actor handles of the ``SessionHost`` processes, by number.
         machines: kind of machine of each host, as ``machine_kind`` returns it.
         store: records of the sessions in the database.
-        settings: those of the hosts.
+        settings: settings of the hosts.
     """
 
     lasting = True
-    replay = 10_000  # requests; a checkpoint may be some seconds old, and a session takes many requests in a second
+    replay = 10_000  # number of requests since a checkpoint, which may be some seconds old
 
     def __init__(
         self, hosts: Sequence[Any], machines: Sequence[str], store: LiveSessions, settings: HostSettings
@@ -62,14 +62,16 @@ class RayEngine(SessionEngine):
         self._patience = settings.pace.lease_seconds / 2
         self._turns = itertools.count()
         self._places: OrderedDict[str, int] = OrderedDict()
-        self._away: set[int] = set()  # hosts whose end or silence was logged
+        self._away: set[int] = set()  # hosts that were logged as dead or silent
 
     async def open(self, request: Open) -> SessionInfo:
         key, turn = request.opening.key, next(self._turns)
         if key is not None:
             if (known := await asyncio.to_thread(self._store.opened, request.surrogate_id, key)) is not None:
                 if known[1] != digest_of("open", request.opening):
-                    raise IdempotencyConflict("this idempotency key opened a session with another body: use a new key")
+                    raise IdempotencyConflict(
+                        "this idempotency key has opened a session with other settings: use a new key"
+                    )
                 return await self.describe(known[0])
             turn = crc32(f"{request.surrogate}|{key}".encode())
         for host in self._in_turn(turn):
@@ -93,7 +95,7 @@ class RayEngine(SessionEngine):
         holder = await asyncio.to_thread(self._store.holder, session)
         await asyncio.to_thread(self._store.remove, session)
         self._places.pop(session, None)
-        with suppress(Unavailable, TimeoutError):  # a host that does not answer now finds the record gone
+        with suppress(Unavailable, TimeoutError):  # a silent host will find the record removed
             async with asyncio.timeout(ANSWERING_SECONDS):
                 host = _number(holder.owner) if holder else self._place(session)
                 if host < len(self._hosts):
@@ -112,7 +114,7 @@ class RayEngine(SessionEngine):
         answers, _ = ray.wait(asked, num_returns=len(asked), timeout=ANSWERING_SECONDS)
         found: list[Counts] = []
         for answer in answers:
-            with suppress(RayError):  # it has died, and holds nothing
+            with suppress(RayError):  # the host has died, so it has no sessions
                 found.append(ray.get(answer))
         return _together(found)
 
@@ -121,10 +123,10 @@ class RayEngine(SessionEngine):
         await asyncio.to_thread(self._store.sweep, self.idle_seconds)
 
     async def start(self) -> None:
-        """Do nothing: the hosts have started already."""
+        """Do nothing, because the hosts have started already."""
 
     async def stop(self) -> None:
-        """Do nothing: the hosts keep running, because other front servers use their sessions too."""
+        """Do nothing, because other servers of the cluster use the hosts too."""
 
     async def save(self) -> list[Saved]:
         return [one for of_host in await self._ask_all("save") for one in of_host]
@@ -133,7 +135,7 @@ class RayEngine(SessionEngine):
         await self._reply(self._place(request.saved.id), "restore", request)
 
     async def _of(self, session: str, operation: str, *arguments: Any) -> Any:
-        """Ask the host that has a session now, and return its reply."""
+        """Send an operation to the host that has a session now, and return its reply."""
         host = self._place(session)
         for _ in range(MOVES):
             try:
@@ -151,7 +153,11 @@ class RayEngine(SessionEngine):
         return crc32(session.encode()) % len(self._hosts)  # the session was saved by another engine
 
     async def _moved(self, session: str, asked: int, error: Exception) -> int:
-        """Find the host of a session that the host ``asked`` does not have. Returns its number."""
+        """Return the number of the host that has a session, after the host ``asked`` failed with ``error``.
+
+        If the session's lease has expired, another host takes the session over first. Raises ``UnknownSession`` or
+        ``Unavailable``.
+        """
         holder = await asyncio.to_thread(self._store.holder, session)
         if holder is None:
             self._places.pop(session, None)
@@ -173,7 +179,10 @@ class RayEngine(SessionEngine):
         return self._remember(session, host)
 
     async def _taken(self, session: str, asked: int, machine: str) -> int:
-        """Let another host take over a session whose lease has ended. Returns its number."""
+        """Let another host on a machine of this kind take over a session whose lease has expired. Return its number.
+
+        Raises ``UnknownSession`` if there is no such host, and ``Unavailable`` if none can take it now.
+        """
         alike = [host for host in self._in_turn(asked + 1) if self._machines[host] == machine]
         if not alike:
             await asyncio.to_thread(self._store.remove, session)
@@ -204,7 +213,7 @@ class RayEngine(SessionEngine):
         return host
 
     async def _lives(self, host: int) -> bool:
-        """Whether a host answers at all. A process that a signal has stopped does not."""
+        """Whether a host answers within ``ANSWERING_SECONDS``."""
         try:
             async with asyncio.timeout(ANSWERING_SECONDS):
                 await cast(Awaitable[None], self._hosts[host].ping.remote())
@@ -220,22 +229,22 @@ class RayEngine(SessionEngine):
         return True
 
     def _note_away(self, host: int, what: str) -> None:
-        """Log that a host is away, once until it answers again."""
+        """Log that a host is dead or silent, once until it answers again."""
         if host not in self._away:
             self._away.add(host)
             logger.warning("session host %d %s: its sessions go on at another one when its lease has ended", host, what)
 
     async def _answer(self, session: str, host: int, operation: str, *arguments: Any) -> Any:
-        """Wait for a host's reply as long as the session belongs to that host.
+        """Send an operation to a host, and wait for the reply as long as the host has the session.
 
         Raises:
-            _Gone: the host died, does not answer, or has lost the session.
+            _Gone: the host has died, does not answer, or no longer has the session.
             SurrogymError: the host refused the request.
         """
         return await self._heard(host, partial(self._has_left, session, host), operation, *arguments)
 
     async def _has_left(self, session: str, host: int) -> bool:
-        """Whether a session has left a host. A host that is only late still answers."""
+        """Whether a host no longer has a session: another host has it, or its lease expired and the host is silent."""
         holder = await asyncio.to_thread(self._store.holder, session)
         if holder is None or _number(holder.owner) != host:
             return True
@@ -245,17 +254,20 @@ class RayEngine(SessionEngine):
         return not await self._lives(host)
 
     async def _reply(self, host: int, operation: str, *arguments: Any) -> Any:
-        """Wait for a host's reply as long as the host answers at all."""
+        """Send an operation to a host, and wait for the reply as long as the host answers pings.
+
+        Raises ``Unavailable`` if the host dies or does not answer, and the errors of the operation.
+        """
         try:
             return await self._heard(host, partial(self._is_silent, host), operation, *arguments)
         except _Gone as gone:
             raise Unavailable(f"session host {host} {gone}: try again later") from gone
 
     async def _heard(self, host: int, is_gone: Callable[[], Awaitable[bool]], operation: str, *arguments: Any) -> Any:
-        """Wait for a host's reply, and ask ``is_gone`` each time that it does not come in half a lease.
+        """Send an operation to a host, and wait for the reply. Call ``is_gone`` each time that half a lease has passed.
 
         Raises:
-            _Gone: the host died, or ``is_gone``; says which.
+            _Gone: the host has died, or ``is_gone`` returned True.
             SurrogymError: the host refused the request.
         """
         asked = self._hosts[host].ask.remote(operation, *arguments)
@@ -271,7 +283,7 @@ class RayEngine(SessionEngine):
                     raise _Gone(SILENT) from None
 
     async def _ask_all(self, operation: str, *arguments: Any) -> list[Any]:
-        """Return the replies of all hosts that answer."""
+        """Send an operation to all hosts, and return the replies of those that answer."""
         replies = await asyncio.gather(*(self._asked(host, operation, *arguments) for host in range(len(self._hosts))))
         return [reply for reply in replies if not isinstance(reply, _Gone)]
 
@@ -285,12 +297,12 @@ class RayEngine(SessionEngine):
 
 
 def _number(owner: str) -> int:
-    """Return the number of the host from its name as an owner of leases."""
+    """Return the number of a session host, given its name as an owner of leases."""
     return int(owner.split()[0])
 
 
 def _pool(owner: str) -> str:
-    """Return the pool of the host from its name as an owner of leases."""
+    """Return the pool of a session host, given its name as an owner of leases."""
     return owner.split()[1]
 
 

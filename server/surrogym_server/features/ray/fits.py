@@ -1,4 +1,4 @@
-"""RayFits: runs each round of a design as a task of a Ray cluster, on any machine that has a free CPU."""
+"""``RayFits``: computes each round of a design as a task of a Ray cluster, on any machine with a free CPU."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from surrogym_server.plugins import in_one_line
 
 logger = logging.getLogger(__name__)
 
-RETRIES = 1  # of a job whose process or machine died
+RETRIES = 1  # further attempts at a job whose process or machine died
 
 
 class RayFits(Compute):
-    """Runs each job as a task of Ray. When this process ends, for any reason, Ray ends its tasks.
+    """Computes each job as a task of Ray. When this process ends, for any reason, Ray ends its tasks.
 
     Args:
-        function: does a job.
-        gpus: what each job takes of the cluster's GPUs, for example 0.5. Its process sees no others.
+        function: computes a job.
+        gpus: number of the cluster's GPUs for each job, for example 0.5. The job's process sees no other GPUs.
     """
 
     def __init__(self, function: Function = run_design_job, gpus: float = 0.0) -> None:
@@ -38,14 +38,14 @@ class RayFits(Compute):
         self._task: Any = ray.remote(num_cpus=1, num_gpus=gpus, max_retries=RETRIES)(_done_there)
 
     def start(self) -> None:
-        """Do nothing: Ray starts the processes of tasks itself."""
+        """Do nothing, because Ray starts the processes of tasks itself."""
 
     async def run(self, job: DesignJob) -> DesignResult:
         asked = self._task.remote(self._function, job, versions())
         self._running.add(asked)
         try:
             outcome = await cast(Awaitable[Any], asked)
-        except RayTaskError as error:  # the result can't be sent
+        except RayTaskError as error:  # the result can't be pickled
             raise PluginFailed(in_one_line(error.cause or error)) from error
         except TaskCancelledError as error:
             raise Unavailable("the fit was ended: this server stops") from error
@@ -69,13 +69,14 @@ class RayFits(Compute):
 
 
 def _end(asked: Any) -> None:
-    """End the process of a task."""
+    """Kill the process of a Ray task."""
     with suppress(RayError, ValueError):
         ray.cancel(asked, force=True)
 
 
 def _done_there(function: Function, job: DesignJob, expected: Mapping[str, str]) -> DesignResult | Failure:
-    """Do a job in a process of the cluster, which may be on another machine. Its versions must be the expected ones."""
+    """Compute a job in a process of the cluster. Return a ``Failure`` if its versions of packages are not those in
+    ``expected``."""
     for name, here in versions().items():
         if here != expected[name]:
             wrong = f"expected {name} {expected[name]} on every machine of the cluster, got {here} on {platform.node()}"

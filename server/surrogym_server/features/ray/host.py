@@ -1,4 +1,4 @@
-"""A session host: one process of the pool. It steps sessions for front servers, with models from the database."""
+"""A session host: a process of a Ray cluster that runs sessions for servers, with models from the database."""
 
 from __future__ import annotations
 
@@ -52,21 +52,22 @@ OPERATIONS = frozenset(
 
 
 def versions() -> dict[str, str]:
-    """Return the versions that all processes of a cluster must share, because they exchange pickled objects."""
+    """Return the versions of Python and of packages, by name. They must be equal in all processes of a cluster, because
+    these exchange pickled objects."""
     packages = ("surrogym", "torch", "numpy", "ray")
     return {"Python": platform.python_version(), **{name: version(name) for name in packages}}
 
 
 @dataclass(frozen=True)
 class HostSettings:
-    """Settings that all hosts of a pool are started with.
+    """Settings of all session hosts of a pool.
 
-    ``pool`` tells pools apart that use one database. The front server that starts the first host draws it. It is no
-    setting of a user's, so it does not count when settings are compared.
+    ``pool`` is a random id, which distinguishes several pools with one database. The server that starts the first host
+    creates it. It is ignored when settings are compared.
     """
 
     hosts: int
-    database: str = field(repr=False)  # it may hold a password
+    database: str = field(repr=False)  # the address may contain a password
     limits: Limits
     max_lanes: int
     idle_seconds: float
@@ -91,14 +92,14 @@ class HostSettings:
 
 @dataclass(frozen=True)
 class Refused:
-    """A refusal, returned as a value. If it were raised, Ray would wrap it in an exception of its own."""
+    """An error that a session host returns as a value, because Ray would wrap a raised error in its own exception."""
 
     error: SurrogymError
 
 
 @dataclass(frozen=True)
 class HostInfo:
-    """Settings of a running host, its versions and its machine."""
+    """Description of a running session host: its settings, its versions of packages, and its machine."""
 
     settings: HostSettings
     versions: dict[str, str]
@@ -108,11 +109,11 @@ class HostInfo:
 
 
 class SessionHost:
-    """Actor of Ray that steps sessions. It handles many requests at once, in one event loop.
+    """Ray actor that runs sessions. It handles many requests at a time, in one event loop.
 
     Args:
-        settings: settings of the pool.
-        number: number of this host, from 0. The ids of its sessions end with it.
+        settings: settings of the pool of hosts.
+        number: number of this host, from 0. The ids of the sessions that it opens end with this number.
     """
 
     def __init__(self, settings: HostSettings, number: int) -> None:
@@ -125,15 +126,16 @@ class SessionHost:
         self._starting: asyncio.Task[None] | None = None
 
     async def about(self) -> HostInfo:
-        """Describe this host, after it has started."""
+        """Wait until this host has started, and return its description."""
         await self._started()
         return HostInfo(self._settings, versions(), self._machine, platform.node(), os.getpid())
 
     async def ping(self) -> None:
-        """Return, which shows that this process runs."""
+        """Return at once, to show that this process runs."""
 
     async def ask(self, operation: str, *arguments: Any) -> Any:
-        """Call a method of the engine, and return its reply, or ``Refused`` if the engine refused."""
+        """Call the method ``operation`` of the engine. Return its result, or ``Refused`` if it raised a
+        ``SurrogymError``."""
         if operation not in OPERATIONS:
             raise ValueError(f"expected one of {sorted(OPERATIONS)}, got {operation!r}")
         await self._started()
@@ -143,11 +145,11 @@ class SessionHost:
             return Refused(error.with_traceback(None))
 
     async def counts(self) -> Any:
-        """Return the counts of ``SessionEngine.counts`` for this host."""
+        """Return the counts of this host's engine."""
         return self._engine.counts()
 
     async def _started(self) -> None:
-        """Start the engine, if it has not started. Ray restarts a dead host without informing any front server."""
+        """Start the engine if it has not started. This is needed after Ray has restarted a dead host."""
         if self._starting is None:
             self._starting = asyncio.create_task(self._engine.start())
         if not self._starting.done():
@@ -157,14 +159,14 @@ class SessionHost:
 def recorded_engine(
     settings: HostSettings, storage: Storage, number: int, machine: str, clock: Callable[[], float] = seconds_now
 ) -> RecordedEngine:
-    """Build the engine of one host.
+    """Build the engine of a session host.
 
     Args:
-        settings: settings of the pool.
-        storage: the database.
+        settings: settings of the pool of hosts.
+        storage: storage of surrogates, models and session records.
         number: number of the host.
-        machine: kind of the machine, as ``machine_kind`` returns it.
-        clock: returns seconds; leases end by it in this process.
+        machine: kind of the host's machine, as ``machine_kind`` returns it.
+        clock: returns the time in seconds, by which leases end in this process.
     """
     definitions = Definitions(
         storage, lambda spec: stored_definition(read_stored(EnvironmentSpec, "a stored specification", spec))

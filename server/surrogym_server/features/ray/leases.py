@@ -1,4 +1,4 @@
-"""Leases and checkpoints of the sessions of one process. Call all methods in the event loop's thread."""
+"""Leases and checkpoints of the sessions of one process. Methods must be called in the event loop's thread."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from surrogym_server.features.ray.store import LiveSessions
 
 logger = logging.getLogger(__name__)
 
-MAX_BYTES = 16 * 2**20  # largest checkpoint; the state of a larger session is not recorded
-BYTES_PER_SECOND = 8 * 2**20  # highest rate at which checkpoints of one session are written
-RENEWALS = 5  # number of renewals within the time of a lease
+MAX_BYTES = 16 * 2**20  # largest checkpoint; a larger session has no checkpoints
+BYTES_PER_SECOND = 8 * 2**20  # largest rate at which checkpoints of one session are written
+RENEWALS = 5  # number of renewals within the duration of a lease
 
 
 def seconds_now() -> float:
-    """Return seconds of a clock that also runs while the machine sleeps, if it has such a clock."""
+    """Return the time in seconds, by a clock that also runs while the machine sleeps, if the system has one."""
     return time.clock_gettime(getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC))
 
 
 @dataclass(frozen=True)
 class Pace:
-    """How often checkpoints of a session are written, and how long a lease lasts."""
+    """Time between two checkpoints of a session, and duration of a lease, in seconds."""
 
     checkpoint_seconds: float = 1.0
     lease_seconds: float = 10.0
@@ -37,25 +37,25 @@ class Pace:
 @dataclass
 class _Held:
     lease: SessionLease
-    until: float  # by this process's clock; not later than the lease's end by the database's
-    seq: int  # of the last checkpoint
-    next_at: float  # when the next one may be made
-    recorded: bool = field(default=True)  # False: the last one had no bytes
+    until: float  # end of the lease by this process's clock, not later than by the database's clock
+    seq: int  # the session's sequence number at the last checkpoint
+    next_at: float  # earliest time of the next checkpoint
+    recorded: bool = field(default=True)  # whether the last checkpoint has data
 
 
 class Leases:
-    """Leases of the sessions that one owner, a process, holds.
+    """The leases and checkpoints of this process's sessions.
 
-    The time of a lease counts from before the statement that renews it. So a lease ends here no later than in the
-    database. A step only compares the end with a clock, and does not ask the database.
+    A lease counts from before the SQL statement that renews it, so it ends here no later than in the database. A step
+    only compares the end of the lease with a clock, without asking the database.
 
     Args:
-        store: the database.
-        owner: a name that no other process has or had.
-        machine: kind of this machine; the last bits of a step depend on it.
-        pace: how often to write checkpoints, and how long leases last.
-        drop: called with the id of a session whose lease another owner has; it ends the session here.
-        clock: returns seconds.
+        store: records of the sessions in the database.
+        owner: unique name of this process.
+        machine: kind of this machine, on which the last bits of a step depend.
+        pace: time between checkpoints, and duration of leases.
+        drop: ends the session with this id, after another process has taken its lease.
+        clock: returns the time in seconds.
     """
 
     def __init__(
@@ -79,13 +79,14 @@ class Leases:
         return id in self._held
 
     def require(self, id: str) -> None:
-        """Raise ``Unavailable`` if this owner holds a session whose lease has ended."""
+        """Raise ``Unavailable`` if this process has the session, but its lease has expired."""
         held = self._held.get(id)
         if held is not None and self._clock() >= held.until:
             raise Unavailable(f"the lease of session {id!r} has ended, and is not renewed yet: try again later")
 
     async def add(self, session: Session, surrogate_id: int) -> None:
-        """Record a new session, under a lease of this owner. Raises like ``LiveSessions.add``."""
+        """Record a new session in the database, under a lease of this process. Raises the errors of
+        ``LiveSessions.add``."""
         key, digest = session.opened_by or (None, None)
         checkpoint = await asyncio.to_thread(_checkpoint, session)
         new = NewLiveSession(session.id, surrogate_id, self.machine, checkpoint, key, digest)
@@ -94,29 +95,29 @@ class Leases:
         self._keep(lease, began, checkpoint)
 
     async def take(self, id: str) -> TakenSession:
-        """Take over the lease of a session. Raises like ``LiveSessions.take``."""
+        """Take over a session from another process, and return it. Raises the errors of ``LiveSessions.take``."""
         began = self._clock()
         taken = await asyncio.to_thread(self._store.take, id, self._owner, self._pace.lease_seconds)
         self._keep(taken.lease, began, taken.checkpoint)
         return taken
 
     async def release(self, id: str) -> None:
-        """End the lease of a session now, so that another owner can take it."""
+        """End the lease of a session now, so that another process can take it."""
         if held := self._held.pop(id, None):
             await asyncio.to_thread(self._store.release, held.lease)
 
     async def remove(self, id: str) -> None:
-        """Delete the record of a session. If that fails, ``remove_all_but`` tries again."""
+        """Delete the record of a session in the database. If that fails, ``remove_all_but`` will repeat it."""
         await asyncio.to_thread(self._store.remove, id)
         self._held.pop(id, None)
 
     async def remove_all_but(self, alive: Sequence[str]) -> None:
-        """Delete the records of this owner's sessions whose ids are not in ``alive``."""
+        """Delete the database records of this process's sessions, except those with an id in ``alive``."""
         for id in self._held.keys() - set(alive):
             await self.remove(id)
 
     async def renew(self) -> None:
-        """Renew all leases, and drop the sessions that another owner has."""
+        """Renew all leases of this process, and end the sessions that another process has taken."""
         before, began = dict(self._held), self._clock()
         if not before:
             return
@@ -130,7 +131,7 @@ class Leases:
                 logger.warning("session %s was taken by another host, or was removed", id)
 
     async def record(self, sessions: Sequence[Session]) -> None:
-        """Write checkpoints of the sessions that have changed since their last one."""
+        """Write checkpoints of those sessions that have changed since their last checkpoint."""
         for session in sessions:
             held = self._held.get(session.id)
             if held is None or session.seq == held.seq or self._clock() < held.next_at:
@@ -141,13 +142,13 @@ class Leases:
             _note(held, checkpoint, self._clock(), self._pace.checkpoint_seconds)
 
     async def keep_renewing(self) -> None:
-        """Renew all leases again and again, until cancelled."""
+        """Renew all leases periodically, until cancelled."""
         while True:
             await _tried(self.renew())
             await asyncio.sleep(self._pace.lease_seconds / RENEWALS)
 
     async def keep_recording(self, sessions: Callable[[], Sequence[Session]]) -> None:
-        """Write checkpoints again and again, until cancelled."""
+        """Write checkpoints of all sessions periodically, until cancelled."""
         while True:
             await asyncio.sleep(self._pace.checkpoint_seconds)
             alive = sessions()
@@ -165,7 +166,7 @@ def _note(held: _Held, checkpoint: Checkpoint, now: float, seconds: float) -> No
 
 
 def _checkpoint(session: Session) -> Checkpoint:
-    """Make a checkpoint of a session. Its data is None if it would exceed ``MAX_BYTES``, which is estimated first."""
+    """Return a checkpoint of a session. Its data is None if it would exceed ``MAX_BYTES``."""
     if session.nbytes > MAX_BYTES:
         return Checkpoint(session.seq, None)
     data = session_to_bytes(session)
@@ -177,5 +178,5 @@ async def _tried(work: Awaitable[None]) -> None:
         await work
     except SurrogymError as error:
         logger.warning("leases or checkpoints of sessions could not be written, the next try follows: %s", error)
-    except Exception:  # a lease that ends refuses steps; it must not end the loop
+    except Exception:  # an error must not end the periodic renewal; an expired lease only refuses steps
         logger.exception("leases or checkpoints of sessions could not be written; the next try follows")

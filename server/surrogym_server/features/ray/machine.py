@@ -1,4 +1,4 @@
-"""Kind of a machine. On machines of one kind, with the same versions, a step gives the same bits."""
+"""Kind of a machine: on machines of one kind, with the same versions of packages, a step gives the same bits."""
 
 from __future__ import annotations
 
@@ -13,16 +13,18 @@ NAMES = ("model name", "flags", "Features")
 
 
 def machine_kind(device: str, threads: int) -> str:
-    """Return the kind of processor, the number of threads of one operation, and the device, as one text.
+    """Describe processor, number of threads and device as one text, which is equal on machines that round equally.
 
-    If one of these differs, sums may be added in another order or rounded differently.
+    Args:
+        device: "cpu" or "cuda".
+        threads: number of threads of a torch operation.
     """
     parts = [platform.machine(), _processor(), f"threads {threads}"]
     return ", ".join([*parts, torch.cuda.get_device_name() if device == "cuda" else device])
 
 
 def _processor() -> str:
-    """Return the name of the first processor, and a digest of its features."""
+    """Return the name of the first processor, and a hash of its instruction sets."""
     try:
         lines = PROCESSORS.read_text().split("\n\n")[0].splitlines()
     except OSError:

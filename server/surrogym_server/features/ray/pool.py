@@ -1,4 +1,4 @@
-"""The pool of session hosts in a cluster. The first front server starts it, and later ones find it."""
+"""The pool of session hosts in a Ray cluster. The first server starts it, and further servers find it."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ logger = logging.getLogger(__name__)
 
 NAMESPACE = "surrogym"
 STARTING_SECONDS = 180.0
-QUIET_SECONDS = 10.0  # after which hosts that have not started are mentioned
+QUIET_SECONDS = 10.0  # time after which the log mentions hosts that have not started
 
 
 def check(settings: Settings) -> None:
     """Raise ``InvalidInput`` if this server can't use a cluster: Ray is not installed, or the database is SQLite."""
     if find_spec("ray") is None:
-        raise InvalidInput("engine ray: expected the package ray, got none: pip install 'surrogym[ray]'")
+        raise InvalidInput("engine ray: the package ray is not installed: pip install 'surrogym[ray]'")
     if settings.database_url.startswith("sqlite"):
         raise InvalidInput(
-            "engine ray: expected a PostgreSQL database, which all machines reach, got a SQLite file: --database "
-            "postgresql+psycopg://user@host/name"
+            "engine ray: expected a PostgreSQL database, which all machines reach, got a SQLite file: give "
+            "--database postgresql+psycopg://user@host/name"
         )
 
 
@@ -43,11 +43,11 @@ def connect(settings: Settings, storage: Storage) -> SessionEngine:
 
     Args:
         settings: settings of this server.
-        storage: its storage, where the sessions are recorded.
+        storage: storage of this server, where the sessions are recorded.
 
     Raises:
-        InvalidInput: the settings can't serve a cluster, there is no cluster, or it runs other versions or settings.
-        Unavailable: the hosts do not become ready.
+        InvalidInput: this server can't use a cluster, there is none, or it runs with other versions or settings.
+        Unavailable: the session hosts don't become ready.
     """
     check(settings)
     send_token()
@@ -62,7 +62,7 @@ def connect(settings: Settings, storage: Storage) -> SessionEngine:
         ray.init(settings.ray_address, namespace=NAMESPACE, ignore_reinit_error=True, **quiet)
     except ConnectionError as error:
         raise InvalidInput(f"engine ray: {no_cluster(settings.ray_address)}") from error
-    except RuntimeError as error:  # Ray compares its own version and Python's
+    except RuntimeError as error:  # among others, the versions of Ray or Python differ
         said = " ".join(str(error).split())
         if "ersion mismatch" in said:
             raise InvalidInput(f"engine ray: expected a cluster of the same versions: {said}") from error
@@ -71,7 +71,7 @@ def connect(settings: Settings, storage: Storage) -> SessionEngine:
 
 
 def fits_of(settings: Settings, function: Callable[[DesignJob], DesignResult]) -> Compute | None:
-    """Return the object that runs fits in the connected cluster; None if session hosts leave no CPU or too few GPUs."""
+    """Return what computes fits in the connected cluster; None if the session hosts leave no CPU or too few GPUs."""
     import ray
 
     from surrogym_server.features.ray.fits import RayFits
@@ -107,7 +107,7 @@ def _of_hosts(wanted: HostSettings, store: LiveSessions) -> SessionEngine:
     pool = pool_name(wanted.database)
     first = _host(pool, 0, wanted)
     about_first = _about([first], wanted)
-    _require_same(wanted, about_first)  # before any other is started
+    _require_same(wanted, about_first)  # checked before further hosts are started
     settings = about_first[0].settings
     hosts = [first, *(_host(pool, number, settings) for number in range(1, settings.hosts))]
     found = _about(hosts, wanted)
@@ -130,8 +130,8 @@ def _about(hosts: Sequence[Any], wanted: HostSettings) -> list[HostInfo]:
         found: list[HostInfo] = ray.get(asked, timeout=STARTING_SECONDS - quiet)
     except ray.exceptions.GetTimeoutError as error:
         raise Unavailable(
-            f"engine ray: expected {wanted.hosts} session hosts within {STARTING_SECONDS:g} s, got fewer: each takes "
-            f"{_taken_by_host(wanted.device)}"
+            f"engine ray: expected {wanted.hosts} session hosts to start within {STARTING_SECONDS:g} s, but fewer did: "
+            f"each takes {_taken_by_host(wanted.device)}, so add machines or choose fewer --ray-hosts"
         ) from error
     except ray.exceptions.RayError as error:
         last = str(error).strip().splitlines()[-1]
@@ -161,7 +161,7 @@ def _tell_waiting(count: int, device: str) -> None:
 
 
 def pool_name(database: str) -> str:
-    """Return the name of the pool that belongs to a database. It does not depend on user and password."""
+    """Return the name of the pool for a database, from its address without user and password."""
     url = sa.make_url(database)
     return f"{url.host or url.query.get('host', '')}:{url.port or ''}/{url.database}"
 
@@ -171,7 +171,7 @@ def _host(pool: str, number: int, settings: HostSettings) -> Any:
 
     options: dict[str, Any] = {
         "name": f"session host {number} of {pool}",
-        "lifetime": "detached",  # it outlives the front server that was first
+        "lifetime": "detached",  # a host outlives the server that started it
         "get_if_exists": True,
         "max_restarts": -1,
         "num_cpus": 1,
@@ -194,8 +194,8 @@ def _require_same(wanted: HostSettings, found: Sequence[HostInfo]) -> None:
             if theirs != ours:
                 told = f"{theirs}, got {ours}" if field.repr else "another one"
                 raise InvalidInput(
-                    f"engine ray: expected the settings of the session hosts, which have {field.name} {told}; ray stop "
-                    "ends them"
+                    f"engine ray: expected the settings of the running session hosts, which have {field.name} {told}: "
+                    "use the same, or end the hosts with ray stop"
                 )
 
 

@@ -1,4 +1,4 @@
-"""RecordedEngine: steps the sessions of one process under leases, with checkpoints in the database."""
+"""``RecordedEngine``: runs the sessions of one process under leases, with checkpoints in the database."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ UNKNOWN = -1
 
 @dataclass(frozen=True)
 class Surroundings:
-    """Functions that restoring a session needs in addition to its record.
+    """Functions that are needed to restore a session from its checkpoint.
 
-    Args:
-        surrogate: returns name and definition of a surrogate, given its id; raises ``UnknownSurrogate``.
-        refresh: loads the newest model of a surrogate, given its id, and returns the version.
+    Attributes:
+        surrogate: returns name and environment definition of a surrogate, given its id; raises ``UnknownSurrogate``.
+        refresh: loads the newest model of a surrogate, given its id, and returns its version.
     """
 
     surrogate: Callable[[int], tuple[str, EnvironmentDefinition]]
@@ -44,14 +44,14 @@ class Surroundings:
 class RecordedEngine(SessionEngine):
     """Engine that wraps the engine of this process, and carries out a request only under the session's lease.
 
-    A session that was taken over from another process is in the state of its last checkpoint, so the requests since
-    then are missing. The session refuses all other requests until its client has sent these again, in order.
+    A session that was taken over from another process is in the state of its last checkpoint. It refuses new requests
+    until its client has repeated the requests since that checkpoint, in order.
 
     Args:
-        inner: engine that steps the sessions.
-        store: the database.
-        leases: leases of this process.
-        surroundings: functions for sessions that are taken over.
+        inner: engine that runs the sessions.
+        store: records of the sessions in the database.
+        leases: leases and checkpoints of this process's sessions.
+        surroundings: functions to restore sessions from checkpoints.
     """
 
     lasting = True
@@ -64,7 +64,7 @@ class RecordedEngine(SessionEngine):
         self._surroundings = surroundings
         self._opening = OpeningLocks()
         self._taking = asyncio.Lock()
-        self._behind: dict[str, int] = {}  # sessions that were taken over, and the seq that they have to reach
+        self._behind: dict[str, int] = {}  # for sessions taken over: sequence number to reach
         self._tasks: list[asyncio.Task[None]] = []
 
     async def open(self, request: Open) -> SessionInfo:
@@ -142,11 +142,11 @@ class RecordedEngine(SessionEngine):
         await self._add(request.saved.id, request.surrogate_id)
 
     async def take(self, session: str) -> SessionInfo:
-        """Take over a session whose host has died, in the state of its last checkpoint.
+        """Take over a session whose host has died, in the state of its last checkpoint, and return its description.
 
         Raises:
             UnknownSession: the session can't be continued; the message gives the reason.
-            Unavailable: the lease of another host has time left.
+            Unavailable: the lease of another host has not expired.
             Overloaded: this process has no room for the session; another host may have.
         """
         async with self._taking:
@@ -161,7 +161,9 @@ class RecordedEngine(SessionEngine):
         except BaseException as error:
             await self._inner.close(id)
             if isinstance(error, IdempotencyConflict):
-                raise Unavailable("another host opens a session under this key: try again later") from error
+                raise Unavailable(
+                    "another session host is opening a session with this idempotency key: try again later"
+                ) from error
             raise
 
     async def _restored(self, id: str, taken: TakenSession) -> None:
@@ -183,7 +185,8 @@ class RecordedEngine(SessionEngine):
             raise
 
     async def _lost(self, id: str, why: str) -> UnknownSession:
-        """End a session that can't be continued, and return the error to raise."""
+        """End a session that can't be continued, and return the error to raise; ``why`` is the reason in its
+        message."""
         await self.close(id)
         return UnknownSession(f"session {id!r} was lost with its session host: {why}; open a new one")
 
@@ -193,7 +196,13 @@ class RecordedEngine(SessionEngine):
             raise await self._lost(id, "it was read before the requests since its last checkpoint came again")
 
     def _require_still(self, id: str) -> None:
-        """Raise if the lease was lost during a request, for example while a signal had stopped this process."""
+        """Check, after a request, that this process still has the session's lease.
+
+        Raises:
+            Unavailable: the lease has expired.
+            UnknownSession: the session was closed, or another host has taken it, for example while this process was
+                suspended.
+        """
         self._leases.require(id)
         if not self._leases.holds(id):
             raise UnknownSession(
@@ -202,7 +211,7 @@ class RecordedEngine(SessionEngine):
             )
 
     async def _settle(self) -> None:
-        """Delete the records of sessions that the inner engine has ended."""
-        async with self._taking:  # while a session is taken, its lease exists before the session itself
+        """Delete the database records of sessions that the inner engine has ended."""
+        async with self._taking:  # wait, because a session that is being taken over has a lease before it exists
             await self._leases.remove_all_but([session.id for session in self._inner.sessions()])
             self._behind = {id: seq for id, seq in self._behind.items() if self._leases.holds(id)}

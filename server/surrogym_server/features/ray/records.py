@@ -1,7 +1,7 @@
 """Records of the sessions of a cluster.
 
-A session lives in the memory of one process, its owner, which has a lease on it. The database has the session as it was
-at its last checkpoint. When the lease has ended, another process may take the session from there.
+A session is in the memory of one process, its owner, which has a lease on it. The database has the last checkpoint of
+the session. When the lease has expired, another process may continue the session from this checkpoint.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True)
 class SessionLease:
-    """The right to carry out a session's requests. ``fence`` grows each time that the session changes its owner."""
+    """Lease of a session, which allows its ``owner`` to carry out requests. ``fence`` increases with each new owner."""
 
     id: str
     owner: str
@@ -20,7 +20,7 @@ class SessionLease:
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A session as it was after the request ``seq``, as bytes; None where they are more than are recorded."""
+    """State of a session after the request with the sequence number ``seq``, as bytes; None if it is too large."""
 
     seq: int
     data: bytes | None = field(repr=False)
@@ -28,11 +28,12 @@ class Checkpoint:
 
 @dataclass(frozen=True)
 class NewLiveSession:
-    """A session that was opened. ``key`` is the idempotency key of its opening, ``digest`` that of the opening."""
+    """A new session to record. ``key`` is the idempotency key of the request that opened it, and ``digest`` the
+    request's content hash."""
 
     id: str
     surrogate_id: int
-    machine: str  # the kind of machine that its numbers depend on
+    machine: str  # kind of machine, on which the last bits of the session's numbers depend
     checkpoint: Checkpoint
     key: str | None = None
     digest: str | None = None
@@ -40,7 +41,7 @@ class NewLiveSession:
 
 @dataclass(frozen=True)
 class SessionHolder:
-    """Who has a session, and for how many seconds yet; below 0 the lease has ended."""
+    """Owner of a session, and the time left of its lease in seconds; negative if the lease has expired."""
 
     owner: str
     seconds_left: float
@@ -49,7 +50,7 @@ class SessionHolder:
 
 @dataclass(frozen=True)
 class TakenSession:
-    """A session with its new lease."""
+    """A session that was taken over, with its new lease and its last checkpoint."""
 
     lease: SessionLease
     surrogate_id: int

@@ -1,4 +1,4 @@
-"""Sessions of a cluster: their leases and their last checkpoints."""
+"""Storage of the sessions of a cluster: their leases and their last checkpoints."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ from surrogym_server.storage.sql.database import NOW, Database, conflict_insert
 from surrogym_server.storage.sql.rows import IS_THERE, has_ended, shorten
 from surrogym_server.storage.sql.tables import AT_ONCE, checked, metadata, owner, surrogates
 
-live = checked(  # each is in the memory of its owner, and here as at its last checkpoint
+live = checked(  # last checkpoint of each session, which itself is in the memory of its owner
     sa.Table(
         "live_sessions",
         metadata,
         sa.Column("id", sa.Text, primary_key=True),
         owner(),
-        sa.Column("key", sa.Text),  # idempotency key of its opening
-        sa.Column("digest", sa.Text),  # of the opening
+        sa.Column("key", sa.Text),  # idempotency key of the request that opened the session
+        sa.Column("digest", sa.Text),  # content hash of the request that opened the session
         sa.Column("machine", sa.Text, nullable=False),
         sa.Column("owner", sa.Text, nullable=False, index=True),
         sa.Column("fence", sa.BigInteger, nullable=False),
         sa.Column("expires", sa.Double, nullable=False),
-        sa.Column("seconds", sa.Double, nullable=False),  # that the lease was given
+        sa.Column("seconds", sa.Double, nullable=False),  # duration of the lease at its last renewal
         sa.Column("seq", sa.BigInteger, nullable=False),
-        sa.Column("data", sa.LargeBinary),  # NULL: too large
+        sa.Column("data", sa.LargeBinary),  # state of the session; NULL: too large
         sa.UniqueConstraint("surrogate_id", "key"),
         info={AT_ONCE: True},
     )
@@ -41,10 +41,10 @@ live = checked(  # each is in the memory of its owner, and here as at its last c
 
 
 class LiveSessions:
-    """Sessions of a cluster, each with one owner at a time.
+    """Storage of the sessions of a cluster, each of which has one owner (a process) at a time.
 
-    Only the owner of the last lease changes a session's row. A lease ends by the database's clock. It may be renewed
-    after its end as long as nobody has taken the session. The sessions of a deleted surrogate are removed with it.
+    Only the owner of the last lease can change a session's row. A lease ends by the database's clock. It may be renewed
+    after its end as long as no other process has taken the session. Sessions are removed with their surrogate.
     """
 
     def __init__(self, database: Database) -> None:
@@ -55,7 +55,7 @@ class LiveSessions:
 
         Raises:
             UnknownSurrogate: the surrogate was deleted.
-            IdempotencyConflict: its id, or the key of its opening, is taken.
+            IdempotencyConflict: a session with the same id or the same idempotency key exists.
         """
         with self._database.write() as connection:
             _require_surrogate(connection, new.surrogate_id)
@@ -71,30 +71,33 @@ class LiveSessions:
                 **_lease(owner, seconds),
             )
             if connection.execute(insert.on_conflict_do_nothing().returning(live.c.id)).one_or_none() is None:
-                raise IdempotencyConflict("the id of this session, or the key of its opening, is taken")
+                raise IdempotencyConflict(
+                    f"a session with the id {new.id!r} or with the idempotency key {new.key!r} exists: use a new key"
+                )
         return SessionLease(new.id, owner, 1)
 
     def opened(self, surrogate_id: int, key: str) -> tuple[str, str] | None:
-        """Return the id of the session that was opened under a key, and the digest of that opening."""
+        """Return the id of the session that was opened with an idempotency key, and the content hash of that request;
+        None if there is none."""
         with self._database.read() as connection:
             wanted = sa.select(live.c.id, live.c.digest).where(live.c.surrogate_id == surrogate_id, live.c.key == key)
             row = connection.execute(wanted).one_or_none()
         return None if row is None else (row.id, row.digest)
 
     def holder(self, id: str) -> SessionHolder | None:
-        """Return who has a session; None if there is no such session."""
+        """Return the owner of a session and the time left of its lease; None if there is no such session."""
         with self._database.read() as connection:
             left = (live.c.expires - NOW).label("left")
             row = connection.execute(sa.select(live.c.owner, live.c.machine, left).where(live.c.id == id)).one_or_none()
         return None if row is None else SessionHolder(row.owner, row.left, row.machine)
 
     def renew(self, owner: str, ids: Collection[str], seconds: float) -> frozenset[str]:
-        """Extend an owner's leases of these sessions to ``seconds`` from now, and return the ids of those it has.
+        """Extend an owner's leases of these sessions to ``seconds`` from now. Return the ids of those it still has.
 
-        The owner names its sessions, because the database may know of more: the answer to ``add`` or ``take`` may be
-        lost with the connection. Nobody steps such a session, so its lease has to end.
+        Sessions that are not in ``ids`` are not renewed, even if the database has them for this owner: the reply to
+        ``add`` or ``take`` may have been lost, and then no process runs the session.
         """
-        # in the text of the statement, because the number of its parameters is limited
+        # The ids are in the SQL text, because the number of parameters is limited.
         wanted = sa.bindparam("ids", list(ids), sa.Text(), expanding=True, literal_execute=True)
         with self._database.write() as connection:
             held = sa.update(live).where(live.c.owner == owner, live.c.id.in_(wanted))
@@ -102,17 +105,19 @@ class LiveSessions:
             return frozenset(connection.execute(renewed.returning(live.c.id)).scalars())
 
     def record(self, lease: SessionLease, checkpoint: Checkpoint) -> bool:
-        """Store a checkpoint, and return True. If the lease was replaced, store nothing and return False."""
-        with self._database.write() as connection:  # of one row; with more, it and ``renew`` could wait for each other
+        """Store a checkpoint of a leased session. If another process has taken the lease, store nothing and return
+        False."""
+        with self._database.write() as connection:  # one row only, against a deadlock with ``renew``
             update = _held(sa.update(live), lease).values(seq=checkpoint.seq, data=checkpoint.data)
             return connection.execute(update).rowcount == 1
 
     def take(self, id: str, owner: str, seconds: float) -> TakenSession:
-        """Take over a session whose lease has ended, or the owner's own, with a new lease.
+        """Give ``owner`` a new lease of a session whose lease has expired or is the owner's own, and return the
+        session.
 
         Raises:
             UnknownSession: there is no such session.
-            Unavailable: the lease of another owner has time left; says how much.
+            Unavailable: the lease of another owner has not expired; the message has the time left.
         """
         with self._database.write() as connection:
             free = has_ended(live, sa.true()) | (live.c.owner == owner)
@@ -128,24 +133,24 @@ class LiveSessions:
         )
 
     def release(self, lease: SessionLease) -> None:
-        """End a lease now. Harmless if it was replaced."""
+        """End the lease of a session now. Does nothing if another process has taken it."""
         with self._database.write() as connection:
             connection.execute(_held(sa.update(live), lease).values(expires=NOW))
 
     def remove(self, id: str) -> None:
-        """Remove a session. Harmless if it is not there."""
+        """Remove the record of a session. Does nothing if it does not exist."""
         with self._database.write() as connection:
             connection.execute(sa.delete(live).where(live.c.id == id))
 
     def remove_all_of(self, surrogate_id: int) -> None:
-        """Remove the sessions of a surrogate."""
+        """Remove the records of all sessions of a surrogate, given its id."""
         with self._database.write() as connection:
             connection.execute(sa.delete(live).where(live.c.surrogate_id == surrogate_id))
 
     def sweep(self, seconds: float) -> int:
-        """Remove sessions whose lease ended more than ``seconds`` ago, and return how many there were.
+        """Remove sessions whose lease expired more than ``seconds`` ago, and return their number.
 
-        A lease with more time left than it was given, because the clock was set back, gets that time from now.
+        A lease with more time left than its duration, because the clock was set back, is shortened to its duration.
         """
         with self._database.write() as connection:
             shorten(connection, live, sa.true())
@@ -162,12 +167,12 @@ def _held(update: sa.Update, lease: SessionLease) -> sa.Update:
 
 
 def _require_surrogate(connection: Connection, id: int) -> None:
-    """Keep the surrogate from being deleted until the transaction ends. Raises ``UnknownSurrogate``."""
+    """Lock the surrogate with this id against deletion until the transaction ends. Raises ``UnknownSurrogate``."""
     wanted = (
         sa.select(surrogates.c.id).where(surrogates.c.id == id, IS_THERE).with_for_update(read=True, key_share=True)
     )
     if connection.execute(wanted).one_or_none() is None:
-        raise UnknownSurrogate(f"expected the id of a surrogate, got {id}, which is not there")
+        raise UnknownSurrogate(f"the surrogate with the id {id} does not exist; it may have just been deleted")
 
 
 def _not_taken(id: str, seconds_left: float | None) -> UnknownSession | Unavailable:

@@ -275,16 +275,22 @@ def connect(url: str, synchronous: Synchronous = "full") -> Database:
             return _postgresql(location)
         case _:
             address = location.render_as_string()
-            raise InvalidInput(f"expected sqlite:///path or postgresql://user@host/name, got {address}")
+            raise InvalidInput(
+                f"expected a database address such as sqlite:///path or postgresql://user@host/name, got {address}"
+            )
 
 
 def _sqlite(path: Path, synchronous: Synchronous) -> Database:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise Unavailable(f"expected a folder for the database, got {path.parent}: {error}") from None
+        raise Unavailable(
+            f"the folder {path.parent} for the database can't be created: {error}; choose another path"
+        ) from None
     if path.exists() and not (path.is_file() or path.is_dir()):  # opening a pipe could block forever
-        raise InvalidInput(f"expected a file for the database, got {path}, which is a pipe, a socket or a device")
+        raise InvalidInput(
+            f"expected a file for the database, got {path}, which is a pipe, a socket or a device: choose another path"
+        )
     lock = FileLock(path)
     engine = sa.create_engine(URL.create("sqlite", database=str(path)), connect_args={"timeout": BUSY_SECONDS}, **POOL)
     sa.event.listen(engine, "do_connect", lambda *_: lock.require_in_place())  # SQLite would create a missing file

@@ -211,7 +211,7 @@ def _open(path: Path) -> int:
     try:
         return os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
     except OSError as error:
-        raise Unavailable(f"expected a file to read and write the database, got {path}: {error.strerror}") from None
+        raise Unavailable(f"the database {path} can't be opened for reading and writing: {error.strerror}") from None
 
 
 def _displaced(path: Path, way_out: str) -> Unavailable:

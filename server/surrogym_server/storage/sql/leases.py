@@ -273,12 +273,13 @@ def _check_steps(lease: Answered, steps: set[int]) -> None:
     if lease.reported:
         if more := steps - lease.reported.keys():
             raise IdempotencyConflict(
-                f"expected the {len(lease.reported)} samples first reported for query {lease.query_id}, "
-                f"got step {min(more)} in addition"
+                f"expected the {len(lease.reported)} samples first reported for query {lease.query_id}, got step "
+                f"{min(more)} in addition: a stored answer can't be extended"
             )
     elif steps != set(range(len(steps))) or len(steps) > lease.steps:
         raise InvalidInput(
-            f"expected steps 0, 1, ... of query {lease.query_id}, at most {lease.steps}, got {sorted(steps)}"
+            f"expected all steps from 0 on of query {lease.query_id}, at most {lease.steps} steps, got the steps "
+            f"{sorted(steps)}: send the whole answer in one request"
         )
 
 

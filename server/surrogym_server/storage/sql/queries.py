@@ -185,7 +185,7 @@ def _require_room(connection: Connection, surrogate: Row[Any], steps: int) -> No
     if before + steps > limit:
         raise BeyondBudget(
             f"expected at most {max(0, limit - int(before))} more real steps of audits, got {steps}: all audits "
-            f"together may take {limit}, the larger of the budget and {LEAST_AUDITED}: raise the budget with surrogym "
+            f"together may take {limit}, the larger of the budget and {LEAST_AUDITED}; raise the budget with surrogym "
             "change --budget"
         )
 

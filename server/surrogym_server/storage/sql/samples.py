@@ -144,7 +144,8 @@ def _store(
         row = row_of(surrogate, sampler, sample, lease)
         if prints.setdefault(identity, row["fingerprint"]) != row["fingerprint"]:
             raise IdempotencyConflict(
-                f"expected the same sample as first reported for query {sample.query_id}, got another"
+                f"expected the same sample as first reported for query {sample.query_id}, got another: a stored sample "
+                "can't be changed"
             )
         if identity not in ids:
             new.setdefault(identity, row)
@@ -226,7 +227,8 @@ def store_logged(
     for index, sample in enumerate(batch):
         if sample.query_id is not None:
             raise InvalidInput(
-                f"samples.{index}: expected no query_id, because the sample comes from a log, got {sample.query_id}"
+                f"samples.{index}: expected no query_id, because the sample comes from a log, got {sample.query_id}: "
+                "leave it out"
             )
     rows = [row_of(surrogate, sampler, sample, logged=True) for sample in batch]
     before = after or ""

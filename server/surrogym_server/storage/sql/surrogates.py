@@ -86,7 +86,7 @@ class SqlSurrogates(port.Surrogates):
             statement = sa.select(surrogates.c.name).where(surrogates.c.id == id, IS_THERE)
             name = connection.execute(statement).scalar()
         if name is None:
-            raise UnknownSurrogate("expected an existing surrogate, got one that was deleted")
+            raise UnknownSurrogate(f"the surrogate with the id {id} does not exist any more: it was deleted")
         return str(name)
 
     def summary(self, name: str) -> SurrogateSummary:
