@@ -29,7 +29,7 @@ class Conditions:
 
     terms: TermSet  # the K terms
     sign: Tensor  # (K,) 1 or -1
-    threshold: Tensor  # (K,)
+    threshold: Tensor  # (K,) threshold for sign * term
     membership: Tensor  # (K, G) 1 if the inequality belongs to the group, otherwise 0
 
     @classmethod

@@ -16,8 +16,8 @@ from surrogym_shared.nouns import Query
 class Points:
     """m states, each with an action."""
 
-    q: Tensor  # (m, C)
-    u: Tensor  # (m, F)
+    q: Tensor  # (m, C) coordinates
+    u: Tensor  # (m, F) actions
 
     def __len__(self) -> int:
         return len(self.q)

@@ -21,8 +21,8 @@ class Samples:
     q: Tensor  # (n, C) coordinates before the step
     u: Tensor  # (n, F) actions
     q_next: Tensor  # (n, C) coordinates after the step
-    reward: Tensor  # (n,)
-    terminated: Tensor  # (n,) bool
+    reward: Tensor  # (n,) reward of the step
+    terminated: Tensor  # (n,) bool: whether the step ended the episode
 
     def __len__(self) -> int:
         return len(self.q)

@@ -35,7 +35,7 @@ class TermDefinition:
 class TermSet:
     """T compiled terms over q (..., C): value = constant + [q, sin(q W), cos(q W)] A, clipped."""
 
-    constant: Tensor  # (T,)
+    constant: Tensor  # (T,) constant of each term
     frequencies: Tensor  # W (C, P)
     coefficients: Tensor  # A^T (T, C + 2 P)
     low: Tensor | None  # (T,) lower limits; None if no term is clipped

@@ -24,7 +24,7 @@ class Joint:
     """Posterior of a process at m fixed points, in the standardised units of the process."""
 
     hyper: Hyperparameters
-    x: Tensor  # (m, d)
+    x: Tensor  # (m, d) inputs of the m points
     whitened: Tensor  # (n, m) L^-1 k(X, x), with L the Cholesky factor of the process
     observed: Tensor  # (p, m) the vector r (see the module) of each of p points that are assumed observed
     variance: Tensor  # (m,) latent variance at the points

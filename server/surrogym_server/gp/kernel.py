@@ -37,8 +37,8 @@ class Polynomial:
     """The coefficients of constant + sum_j linear_j x_j x'_j + sum_j quadratic_j x_j^2 x'_j^2."""
 
     constant: float
-    linear: Tensor  # (d,)
-    quadratic: Tensor  # (d,)
+    linear: Tensor  # (d,) coefficient of each x_j x'_j
+    quadratic: Tensor  # (d,) coefficient of each x_j^2 x'_j^2
     has_squares: bool
 
     @classmethod
@@ -73,7 +73,7 @@ class Polynomial:
 class Hyperparameters:
     """Hyperparameters of a process, chosen by the marginal likelihood, in units of standardised inputs and outputs."""
 
-    lengthscale: Tensor  # (d,)
+    lengthscale: Tensor  # (d,) one for each input
     signal_variance: float
     linear_variance: float  # 0 means no linear part
     quadratic_variance: float  # 0 means no quadratic part

@@ -53,10 +53,10 @@ class Posterior:
     nothing."""
 
     hyper: Hyperparameters
-    x: Tensor  # (n, d)
-    y: Tensor  # (n,)
+    x: Tensor  # (n, d) inputs of the points
+    y: Tensor  # (n,) standardised targets
     factor: Tensor  # (n, n) lower Cholesky factor of K + (sigma_n^2 + jitter) I
-    weights: Tensor  # (n,)
+    weights: Tensor  # (n,) beta, the weights of the points in the mean
     jitter: float  # added to the diagonal before factoring, usually 0
     sparse: Sparse | None = None  # None if the n points are all the data; see ``gp.sparse``
 

@@ -52,7 +52,7 @@ def select_inputs(posterior: Posterior, options: FitOptions, may: Tensor, odds: 
 
 @dataclass(frozen=True)
 class _Subset:
-    mask: Tensor  # (d,) bool
+    mask: Tensor  # (d,) bool, true for the inputs in the subset
     theta: Array
     cost: float  # negative log evidence, priors included
 

@@ -42,7 +42,7 @@ EXPLAINED, BELOW_NOISE = 1e-10, 1e-3
 class Censored:
     """Points for which only a bound of f is known: side * f(x) is at least side * y."""
 
-    x: Tensor  # (k, d)
+    x: Tensor  # (k, d) inputs of the points
     y: Tensor  # (k,) the bounds
     side: Tensor  # (k,) 1 if y is a lower bound of f(x), -1 if it is an upper bound
 

@@ -297,7 +297,7 @@ Floats = NDArray[np.float64]
 class ArrayTransition:
     """Predicted step from each of m points, as NumPy arrays."""
 
-    q_next: Floats  # (m, C)
+    q_next: Floats  # (m, C) coordinates after the step
     reward: Floats  # (m,) mean, without the penalty and without the terminal reward
     std: Floats  # (m, O) requested standard deviations, the reward's last
     terminated: NDArray[np.bool_]  # (m,) whether the step ends the episode

@@ -35,7 +35,7 @@ MOST_SAMPLES = 2**31 - 1  # greatest number of samples of a model, the limit of 
 class Transition:
     """Predicted step from each of m points."""
 
-    q_next: Tensor  # (m, C)
+    q_next: Tensor  # (m, C) coordinates after the step
     reward: Tensor  # (m,) mean, without the penalty and without the terminal reward; see ``paid``
     std: Tensor | None  # (m, M) standard deviation of each transition output, if requested
     reward_std: Tensor | None  # (m,) standard deviation of the reward, if requested

@@ -28,7 +28,7 @@ class Moved:
     particles: Tensor  # (N, P, C) particles after the step; P is 0 except in variant probabilistic
     reward_mean: Tensor  # (N,) reward without penalty
     reward: Tensor  # (N,) penalised reward, eq. 14
-    terminated: Tensor  # (N,) bool
+    terminated: Tensor  # (N,) bool: whether the step ends the episode
     std: Tensor | None  # (N, O) standard deviation of each output, if needed
 
 

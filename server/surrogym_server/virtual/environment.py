@@ -64,10 +64,10 @@ class VirtualSettings:
 class LaneTransition:
     """Results of one step of N lanes, as NumPy arrays. Lanes that the mask excludes have reward 0 and no flags."""
 
-    observation: Floats  # (N, D) float32
-    reward: Floats  # (N,)
-    terminated: Bools  # (N,)
-    truncated: Bools  # (N,)
+    observation: Floats  # (N, D) float32, of the new episode in lanes that were reset
+    reward: Floats  # (N,) reward less penalties
+    terminated: Bools  # (N,) lanes whose episode ended in a terminal state
+    truncated: Bools  # (N,) lanes whose episode was cut off
     final_lanes: Ints  # (K,) indices of lanes that ended and were reset in this step (same_step only)
     final_observation: Floats  # (K, D) float32, last observations of these lanes' episodes
     reset_lanes: Bools  # (N,) lanes in which a new episode began

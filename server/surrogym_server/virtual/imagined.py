@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 @dataclass(frozen=True)
 class ImaginedEpisode:
     coordinates: Array  # (t + 1, C) states, the start included; t < T if the episode terminated
-    reward: NDArray[np.floating[Any]]  # (t,)
+    reward: NDArray[np.floating[Any]]  # (t,) reward of each step
     terminated: bool
 
 

@@ -30,7 +30,7 @@ class LaneState:
     elapsed: Tensor  # (N,) int64, number of steps in this episode
     phase: Tensor  # (N,) int8: NEW, RUNNING, or ENDED and waiting for a reset
     q: Tensor  # (N, C) state, which determines observation and termination
-    particles: Tensor  # (N, P, C)
+    particles: Tensor  # (N, P, C) states of the particles
     path: Tensor  # (N, W) weights of the function that the episode follows; sampled in its first step
 
     def __len__(self) -> int:

@@ -18,11 +18,11 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class PointPrediction:
-    next_coordinates: Array  # (n, C)
-    next_observation: Array  # (n, D)
+    next_coordinates: Array  # (n, C) after the step
+    next_observation: Array  # (n, D) after the step
     reward: Array  # (n,) mean, without the penalty
     reward_std: Array  # (n,) standard deviation of the reward
-    terminated: NDArray[Any]  # (n,) bool
+    terminated: NDArray[Any]  # (n,) bool: whether the step ends the episode
 
 
 def predict_points(model: DynamicsModel, q: Array, u: Array) -> PointPrediction:

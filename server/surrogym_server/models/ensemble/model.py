@@ -34,8 +34,8 @@ class Regression:
     0."""
 
     networks: Networks
-    centre: Tensor  # (p,)
-    scale: Tensor  # (p,)
+    centre: Tensor  # (p,) mean of each output over the samples
+    scale: Tensor  # (p,) standard deviation of each output over the samples
     noise: Noise | None = None  # None for a reward, whose noise is not learned
 
     def __call__(self, x: Tensor) -> Tensor:

@@ -33,7 +33,7 @@ def candidates(
 
     Args:
         definition: the environment.
-        follows: whether the output may read the change of the leading coordinate in the same step.
+        follows: whether the output may read the predicted next values of leading coordinates.
         drift: learned motion of angles, or empty.
         parity: parity of the output if the environment has mirror symmetry.
     """

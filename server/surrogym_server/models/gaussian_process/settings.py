@@ -18,7 +18,7 @@ class Settings:
         kernel: kernel of every process; ``composite`` adds a linear part, and for the reward a quadratic one.
         reward_jumps: whether the reward may jump at the edge of a learned region.
         symmetry: ``auto`` also compares feature maps with mirror symmetry, ``none`` does not.
-        rates: whether a transition may change the faster the further along an input; see ``gp.growth``.
+        rates: whether the size of a transition may grow along its inputs; see ``gp.growth``.
         reward_peaks: whether the reward may be learned by its logarithm, if it is nearly zero almost everywhere.
         drop_inputs: whether an output may ignore inputs that don't matter to it; see ``gp.selection``.
         repeated_parts: whether outputs that are the same function of different inputs may share samples; see

@@ -40,10 +40,10 @@ NO_LANES = np.zeros(0, dtype=np.int64)
 class _Changed:
     """Copies of the arrays that a step of N lanes changes in place, and the arrays of its results."""
 
-    q: Floats  # (N, C)
-    episode: Ints  # (N,)
-    elapsed: Ints  # (N,)
-    phase: NDArray[np.int8]  # (N,)
+    q: Floats  # (N, C) states
+    episode: Ints  # (N,) numbers of the episodes
+    elapsed: Ints  # (N,) numbers of steps in the episodes
+    phase: NDArray[np.int8]  # (N,) phases of the lanes
     rewards: Floats  # (2, N) penalised rewards, and mean rewards
     ends: Bools  # (5, N) terminated, truncated, untrusted, terminated or truncated, left
 
@@ -104,8 +104,8 @@ def _divided(
     """Divide the lanes by what this step does with them.
 
     Returns:
-        A mask (N,) of the lanes to move, the same as a mask or EVERY, and the lanes (N,) to reset; None if there are
-        none.
+        A mask (N,) of the lanes to move; the same selection as a mask or EVERY; and a mask (N,) of the lanes to reset,
+        None if there are none.
     """
     running = phase == RUNNING
     if mask is None and running.all():

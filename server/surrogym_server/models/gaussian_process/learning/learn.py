@@ -68,7 +68,7 @@ class _Among:
     Attributes:
         inputs: features (n, d) of each candidate map.
         keep: samples that no bound has cut.
-        keep_lead: samples for maps that read the change of the leading coordinate.
+        keep_lead: samples to learn from with maps that read the next values of leading coordinates.
         past: samples to learn from if limits of other coordinates don't affect this output.
         side: (n,) 1 for a sample that ended at the output's own upper limit, -1 at the lower, otherwise 0.
     """

@@ -50,7 +50,7 @@ def past_limits(
     """Return the output, or one that also learns from samples at limits of other coordinates if its error is smaller.
 
     Args:
-        output: the output, learned from the samples ``keep``, or ``keep_lead`` if it reads the leading coordinate.
+        output: the output, learned from the samples ``keep``, or ``keep_lead`` if it reads a lead.
         target: targets (n,) of all samples.
         inputs: features (n, d) of each candidate map.
         keep, keep_lead: (n,) bool, see ``output``.

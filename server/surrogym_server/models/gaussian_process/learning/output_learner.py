@@ -62,7 +62,7 @@ class OutputLearner:
             target: targets (n,).
             inputs: features (n, d) of each candidate map.
             keep: (n,) bool, the samples to learn from.
-            keep_lead: (n,) bool, the samples to learn from if the best map reads the leading coordinate.
+            keep_lead: (n,) bool, the samples to learn from if the best map reads a lead (a next value).
             side: (n,) 1 for a sample that ended at the output's own upper limit, -1 at the lower, otherwise 0. If there
                 are many samples, those outside ``keep`` help to choose hyperparameters.
         """

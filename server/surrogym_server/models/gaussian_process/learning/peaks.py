@@ -98,7 +98,8 @@ def _account_of(
     base: float,
     sign: float,
 ) -> tuple[OutputModel, float]:
-    """Learn the logarithms of the heights above a base. Return the output, and its log odds against no structure.
+    """Learn the logarithms of the rewards' heights above a base (below it for sign -1). Return the output, and its log
+    odds against targets that don't depend on the inputs.
 
     The process is fitted to the samples with a reward, and to those without one that would contradict it. It is then
     conditioned on all samples of ``going``.

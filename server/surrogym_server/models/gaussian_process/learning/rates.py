@@ -35,7 +35,7 @@ def output_with_rates(
         target: targets (n,).
         inputs: features (n, d) of each candidate map.
         keep: (n,) bool, the samples to learn from.
-        keep_lead: (n,) bool, the samples to learn from if the best map reads the leading coordinate.
+        keep_lead: (n,) bool, the samples to learn from if the best map reads a lead.
         side: (n,) 1 for a sample that ended at the output's own upper limit, -1 at the lower, otherwise 0.
     """
     output = learner.output(name, target, inputs, keep, keep_lead, side)

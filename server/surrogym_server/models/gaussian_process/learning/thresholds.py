@@ -47,7 +47,7 @@ def explain(values: Floats, inside: Bools) -> Rules:
         return ()
     width = np.maximum(values.max(0) - values.min(0), 1e-300)
     outside = values[~inside].max(0)
-    reached = values[inside] > outside + SLACK * width  # (i, A)
+    reached = values[inside] > outside + SLACK * width  # (i, A) for each state inside and axis
     share = np.where(reached, (values[inside] - outside) / width, np.inf)
     axes = _cover(reached, share)
     if not axes:

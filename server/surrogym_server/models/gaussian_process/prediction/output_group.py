@@ -64,7 +64,7 @@ class OutputGroup:
             encoder: encoder of the features x.
             outputs: the outputs, each with its column.
             columns: number O of columns of a prediction.
-            lead: whether the outputs read the change of the leading coordinate.
+            lead: whether the outputs read the next values of leading coordinates.
             begin: index of the group's first weight in a sampled function.
             grown: those of the outputs that have rates.
         """

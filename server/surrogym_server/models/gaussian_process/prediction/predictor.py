@@ -166,7 +166,7 @@ class Predictor:
 
     @cached
     def _groups(self) -> tuple[OutputGroup, OutputGroup | None, OutputGroup | None]:
-        """Groups of outputs: those that read (q, u), those that also read the change of the leading coordinate, and a
+        """Groups of outputs: those that read (q, u), those that also read next values of leading coordinates, and a
         reward that reads the next state; None for an empty group."""
         after = self.reward.feature_map.after
         outputs = list(zip(self._columns, self.transitions, strict=True))

@@ -32,7 +32,7 @@ class Axes:
     There are A = 3 T axes.
     """
 
-    names: tuple[str, ...]  # (T,)
+    names: tuple[str, ...]  # (T,) names of the coordinates and observation entries
     terms: TermSet
 
     @classmethod

@@ -58,7 +58,7 @@ Bools = NDArray[np.bool_]
 
 # Columns of the matrix of outputs: constant, standard deviation of the noise, and stage.
 CENTRE, NOISE, STAGE = range(3)
-# Stages of a prediction: outputs that read (q, u), those that also read the change of the leading coordinate, and a
+# Stages of a prediction: outputs that read (q, u), those that also read next values of leading coordinates, and a
 # reward that reads the next state.
 FIRST, LED, AFTER = range(3)
 STAGES = 3
