@@ -110,7 +110,7 @@ class SeqConflict(Conflict):
 
 
 class ForeignLease(Conflict):
-    """The lease token was never given out for this query."""
+    """The lease token of a request is not that of a lease of the query."""
 
 
 class LeaseExpired(Conflict):

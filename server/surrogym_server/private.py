@@ -35,6 +35,6 @@ def _sqlite_file(url: str) -> Path | None:
     try:
         parsed = sa.make_url(url)
     except sa.exc.ArgumentError:
-        return None  # opening the database refuses this address
+        return None  # opening the database will report the invalid address
     is_file = parsed.get_backend_name() == "sqlite" and parsed.database not in (None, "", ":memory:")
     return Path(str(parsed.database)) if is_file else None

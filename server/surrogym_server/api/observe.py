@@ -76,7 +76,7 @@ class Observed:
         try:
             await self._app(scope, receive, identified)
         finally:
-            if scope["type"] == "http" or status != FAILED:  # a stream is only noted if it was refused
+            if scope["type"] == "http" or status != FAILED:  # a WebSocket is only logged if it was refused
                 self._note(scope, status, time.perf_counter() - started)
 
     def _note(self, scope: Scope, status: int, seconds: float) -> None:

@@ -111,7 +111,7 @@ class _Process:
     def __init__(self, method: Literal["fork", "spawn"] = "spawn") -> None:
         context = get_context(method)
         theirs, self._lifeline = context.Pipe(duplex=False)
-        ours = self._lifeline if method == "fork" else None  # a fork inherits this end, and has to close it
+        ours = self._lifeline if method == "fork" else None  # a fork inherits this end of the pipe, and must close it
         self.pool = ProcessPoolExecutor(1, mp_context=context, initializer=_live_with, initargs=(theirs, ours))
         self._closing = Lock()
         others = active_children()

@@ -83,17 +83,17 @@ class Session:
     versions: Versions  # (N,) model version of each lane's episode
     answer: Answer | None = None
     visited: Reservoir | None = None
-    opened_by: tuple[str, str] | None = None  # idempotency key and digest of the opening
+    opened_by: tuple[str, str] | None = None  # idempotency key and content hash of the request that opened the session
     surrogate_id: int = 0  # id of the surrogate in storage; 0 without a storage
 
     @property
     def nbytes(self) -> int:
-        """Approximate memory of the session's lanes and kept answer, in bytes."""
+        """Approximate memory of the session's lanes and its stored last answer, in bytes."""
         outcome = None if self.answer is None else self.answer.outcome
         return self.lanes.nbytes + self.answer_bytes(1 if outcome is None else steps_of(outcome))
 
     def answer_bytes(self, steps: int) -> int:
-        """Approximate memory of the kept answer to a number of steps, in bytes."""
+        """Return the approximate memory, in bytes, of the stored answer to a request with this number of steps."""
         lane = 8 * (len(self.definition.observation_names) + self.definition.action.size) + LANE_BYTES
         return steps * (RESULT_BYTES + self.settings.num_envs * lane)
 

@@ -29,8 +29,7 @@ from surrogym_shared.port import PolicyRollout
 logger = logging.getLogger(__name__)
 
 # Requests that are predicted to be shorter run in the event loop. A thread would add about 70 us, and several times
-# that
-# on a busy machine; two milliseconds hardly delay other sessions.
+# that on a busy machine; two milliseconds hardly delay other sessions.
 INLINE_SECONDS = 2e-3
 MEBIBYTE = 2**20
 REMEMBERED_EXPIRED = 10_000
@@ -72,8 +71,8 @@ class Limits:
     """Limits of all sessions of this process together."""
 
     sessions: int = 256
-    nbytes: int = 2048 * MEBIBYTE  # memory of all lanes and kept answers
-    requests: int = 1_024  # requests that run or wait
+    nbytes: int = 2048 * MEBIBYTE  # largest memory of all lanes and stored answers, in bytes
+    requests: int = 1_024  # largest number of requests that run or wait
 
 
 class LiveSessions:

@@ -85,7 +85,7 @@ class Tally:
         self._decayed = 0.0
         self._seq = 0
         self._pending: list[StepResult | PolicyRollout] = []
-        self._unfolded = 0  # steps in ``_pending``
+        self._unfolded = 0  # number of steps in ``_pending``
         self._sums: NDArray[np.float64] | None = None  # (2, N) reward and penalty of the running episodes
         self._steps = 0
         self._episodes = 0

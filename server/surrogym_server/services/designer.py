@@ -126,7 +126,7 @@ class Designer:
         self._settings = settings
         self._usual, self._passed = asyncio.Semaphore(settings.fit_workers), asyncio.Semaphore(MOST_PASSED)
         self._tasks: dict[str, asyncio.Task[None]] = {}  # running and waiting fits, by surrogate
-        self._unavailable: dict[str, int] = {}  # consecutive fits that lost their process or storage
+        self._unavailable: dict[str, int] = {}  # number of consecutive lost fits, by surrogate
 
     async def run(self) -> None:
         """Fit surrogates as they become due, until cancelled. A surrogate whose fit is cancelled stays due."""

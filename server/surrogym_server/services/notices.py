@@ -60,7 +60,7 @@ class Notices:
         self._loop = asyncio.get_running_loop()
         self._audiences: dict[str, Audience] = {}
         self._everything = Audience(0)
-        self._newest: dict[str, int | None] = {}  # id of the newest event, as last compared
+        self._newest: dict[str, int | None] = {}  # id of each surrogate's newest event at the last comparison
         self._count = 0
         self.closing = False
         self._announcements.listen(self._hear)

@@ -196,7 +196,7 @@ class SurrogateService:
         """
         for _ in range(READS):
             left = self._storage.designs.left(name)
-            summary = self._storage.surrogates.summary(name)  # read before the model, which then can't be the older one
+            summary = self._storage.surrogates.summary(name)  # read first, so that the model is not older
             try:
                 model = self._storage.models.get(name)
             except NoModel:

@@ -454,9 +454,10 @@ class Priors(ABC):
 
     @abstractmethod
     def put(self, name: str, blob: bytes, about: JSON) -> None:
-        """Store a prior, which replaces an earlier one. Adaptive queries without a real step so far are withdrawn, and
-        a
-        fit becomes due. ``about`` is the description of the prior."""
+        """Store a prior, which replaces an earlier one. ``about`` is its description.
+
+        Adaptive queries without a real step so far are withdrawn, and a fit becomes due.
+        """
 
     @abstractmethod
     def wait(self, name: str) -> None:

@@ -233,7 +233,7 @@ class SampleRecord(Sample):
     created_at: float
 
 
-# Ledger, lists and memory
+# Counts of real steps, entries of the list of surrogates, and other stored records
 
 
 @dataclass(frozen=True)

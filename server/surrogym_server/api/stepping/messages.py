@@ -68,7 +68,7 @@ class PromptMessages(WebSocketsSansIOProtocol):
             offers[EXTENSION] = self._take
 
     def data_received(self, data: bytes) -> None:
-        if not self.handshake_initiated or self._oversized:  # uvicorn passes the handshake on whole
+        if not self.handshake_initiated or self._oversized:  # the handshake and too large frames are passed on
             super().data_received(data)
             if not self.handshake_initiated:
                 self._refuse_handshake()

@@ -28,7 +28,7 @@ from surrogym_shared import frames
 
 logger = logging.getLogger(__name__)
 
-EXTENSION = "surrogym.prompt"  # ASGI extension: a function that takes a Prompt after the connection is accepted
+EXTENSION = "surrogym.prompt"  # name of an ASGI extension: a function to which the app gives its ``Prompt``
 Prompt = Callable[[bytes], bytes | None]  # returns the reply to a message; None to receive the message by ASGI
 
 

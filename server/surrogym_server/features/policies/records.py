@@ -33,7 +33,7 @@ class PolicyFile:
     bytes: int
     digest: str
     blob: str | None = None
-    main: bool = False  # the file with which the version was created
+    main: bool = False  # whether the policy was stored with this file
 
 
 @dataclass(frozen=True)

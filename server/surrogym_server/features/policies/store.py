@@ -67,7 +67,9 @@ class Policies:
         self._database = database
 
     def add(self, name: str, card: JSON, curve: list[JSON], file: PolicyFile) -> tuple[int, bool, Freed]:
-        """Store a policy whose ``file`` will be sent later. Return its version, whether it is new, and freed blobs.
+        """Store a policy whose ``file`` will be sent later. Return its version, and whether it is new.
+
+        Also returns the names of blobs that are no longer needed.
 
         A version never changes. A repeat with the same main file, card and curve returns the stored version. Beyond
         ``MAX_POLICIES`` policies, one without an alias is removed: the oldest of the token that stored most policies.
@@ -101,7 +103,7 @@ class Policies:
             return record
 
     def attach(self, name: str, version: int, file: PolicyFile, most: int) -> Freed:
-        """Store a file of a policy, and return the freed blobs.
+        """Store a file of a policy, and return the names of blobs that are no longer needed.
 
         If the files of the surrogate's policies then exceed ``most`` bytes together, files of policies without an alias
         are removed: the oldest of the token that stored most bytes. The policies themselves stay.
@@ -131,11 +133,11 @@ class Policies:
             return (*replaced, *freed)
 
     def evaluate(self, name: str, version: int, new: NewEvaluation, most: int) -> tuple[EvaluationRecord, bool, Freed]:
-        """Store an evaluation of a policy, once for each idempotency key. Return it, whether it is new, and freed
-        blobs.
+        """Store an evaluation of a policy, once for each idempotency key. Return it, and whether it is new.
 
-        Beyond ``MAX_EVALUATIONS`` of the policy, older ones are removed. If the files of the surrogate's policies then
-        exceed ``most`` bytes together, files of policies without an alias are removed.
+        Also returns the names of blobs that are no longer needed. Beyond ``MAX_EVALUATIONS`` of the policy, older ones
+        are removed. If the files of the surrogate's policies then exceed ``most`` bytes together, files of policies
+        without an alias are removed.
         """
         table = policy_evaluations
         with self._database.write() as connection:
@@ -158,9 +160,7 @@ class Policies:
             return _evaluation(row), True, (*gone, *freed)
 
     def drifts(self) -> Sequence[tuple[str, int, float]]:
-        """Return the policies with a report of drift: surrogate, version, and time of the latest report in seconds
-        since
-        1970."""
+        """Return the policies with a report of drift: surrogate, version, time of the latest report (s since 1970)."""
         rows = policy_evaluations.c
         statement = (
             sa.select(surrogates.c.name, rows.version, sa.func.max(rows.created_at))
@@ -194,8 +194,10 @@ class Policies:
             append_event(connection, held, "policy", what="alias", alias=alias)
 
     def delete(self, name: str, version: int) -> Freed:
-        """Delete a policy with its evaluations and aliases, and return the freed blobs. Its version is not used
-        again."""
+        """Delete a policy with its evaluations and aliases. Return the names of its blobs, which can be removed.
+
+        The version is not used again.
+        """
         with self._database.write() as connection:
             held = hold(connection, name)
             require_version(connection, held.id, name, version)
@@ -250,7 +252,7 @@ def _without_owner(card: JSON) -> JSON:
 def _make_place(connection: Connection, surrogate: int, version: int, name: str) -> Freed:
     """Remove policies without an alias, except ``version``, until the surrogate has ``MAX_POLICIES``.
 
-    Returns the freed blobs. Raises ``TooLarge`` if too many policies have aliases.
+    Returns the names of blobs that are no longer needed. Raises ``TooLarge`` if too many policies have aliases.
     """
     own = sa.select(policies.c.version).where(policies.c.surrogate_id == surrogate)
     counts = dict.fromkeys(connection.execute(own).scalars(), 1)
@@ -268,7 +270,7 @@ def _make_place(connection: Connection, surrogate: int, version: int, name: str)
 def _within(connection: Connection, surrogate: int, version: int, most: int, name: str) -> Freed:
     """Remove files of policies without an alias, except ``version``, until all files have at most ``most`` bytes.
 
-    Returns the freed blobs. Raises ``TooLarge`` if that is not enough.
+    Returns the names of blobs that are no longer needed. Raises ``TooLarge`` if that is not enough.
     """
     sizes = _sizes(connection, surrogate)
     beyond = sum(sizes.values()) - most

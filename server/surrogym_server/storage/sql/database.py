@@ -33,7 +33,7 @@ SQLSTATES = ("XX001", "XX002", "42P01", "42703")  # data corrupted, index corrup
 OTHER_SCHEMA = re.compile(
     r"no such (table|column)|has no column|already exists"
 )  # SQLite's messages about a wrong schema, which have no code
-UNDECODABLE = "Could not decode to UTF-8"  # in the message of SQLite's driver, which has no error class for this
+UNDECODABLE = "Could not decode to UTF-8"  # part of the message of SQLite's driver about damaged text
 
 
 def damaged(reason: object) -> Damaged:
@@ -81,7 +81,7 @@ class _Now(FunctionElement[float]):
 
 @compiles(_Now)
 def _now(_: _Now, compiler: SQLCompiler, **__: Any) -> str:
-    return CLOCKS.get(compiler.dialect.name, "now()")  # another dialect appears only in messages
+    return CLOCKS.get(compiler.dialect.name, "now()")  # other dialects are only used to print statements
 
 
 NOW = _Now()  # SQL expression of the database's clock, in seconds since 1970
@@ -293,7 +293,7 @@ def _sqlite(path: Path, synchronous: Synchronous) -> Database:
         )
     lock = FileLock(path)
     engine = sa.create_engine(URL.create("sqlite", database=str(path)), connect_args={"timeout": BUSY_SECONDS}, **POOL)
-    sa.event.listen(engine, "do_connect", lambda *_: lock.require_in_place())  # SQLite would create a missing file
+    sa.event.listen(engine, "do_connect", lambda *_: lock.require_in_place())  # else SQLite would create a missing file
     sa.event.listen(engine, "connect", partial(_prepare_sqlite, synchronous))
     sa.event.listen(engine, "begin", _begin_sqlite)
     sa.event.listen(engine, "before_cursor_execute", _require_storable)
@@ -333,9 +333,8 @@ def _postgresql(url: URL) -> Database:
     return Database(engine, way_out="restore a copy")
 
 
-# Errors of a database that can't be used now. They are compared by exact class, because subclasses of DatabaseError
-# such
-# as IntegrityError are bugs of this program.
+# Errors of a database that can't be used now. They are compared by exact class, because subclasses of DatabaseError,
+# such as IntegrityError, are bugs of this program.
 UNUSABLE = (sa.exc.OperationalError, sa.exc.InternalError, sa.exc.InterfaceError, sa.exc.DatabaseError)
 UNSTORABLE = (sa.exc.DataError, OverflowError, UnicodeEncodeError)
 

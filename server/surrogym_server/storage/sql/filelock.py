@@ -64,7 +64,7 @@ class FileLock:
         with _turn:
             if not path.exists():
                 self._require_own_log(b"")
-            if _identity(path) in _locked_files:  # closing it again would drop its locks
+            if _identity(path) in _locked_files:  # opening and closing it again would drop its locks
                 raise _unavailable(path)
             self._descriptors = [_lock_byte(path)] if WHOLE_DESCRIPTION else [_lock_beside(path), _open(path)]
             self._index_descriptor: int | None = None
@@ -211,7 +211,7 @@ def _open(path: Path) -> int:
     try:
         return os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
     except OSError as error:
-        raise Unavailable(f"the database {path} can't be opened for reading and writing: {error.strerror}") from None
+        raise Unavailable(f"expected a file to read and write as the database, got {path}: {error.strerror}") from None
 
 
 def _displaced(path: Path, way_out: str) -> Unavailable:

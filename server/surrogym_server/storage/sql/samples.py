@@ -239,7 +239,7 @@ def store_logged(
         old = next((place for place, link in enumerate(links) if link not in stored_ids), len(links))
         if old == len(links) or not _continued(connection, surrogate, chain[old]):
             break
-        before = chain[old + 1]  # equal logs that differ from the stored one at this sample start from this digest
+        before = chain[old + 1]  # equal logs that leave the stored log at this sample continue from this digest
         if after is not None:
             return AddedSamples((), 0, restart=before)
     new = [row | {"fingerprint": link} for row, link in zip(rows[old:], links[old:], strict=True)]

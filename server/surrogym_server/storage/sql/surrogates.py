@@ -380,7 +380,7 @@ def _interrupted(connection: Connection) -> list[int]:
 
 def _remove(database: Database, id: int) -> None:
     """Remove all rows of a deleted surrogate, given its id. A repeat does nothing."""
-    for table in reversed(metadata.sorted_tables):  # rows with a foreign key come before the rows they refer to
+    for table in reversed(metadata.sorted_tables):  # rows are removed before the rows to which they refer
         if "surrogate_id" in table.c:
             database.write_in_batches(partial(_remove_some, table, id))
     with database.write() as connection:

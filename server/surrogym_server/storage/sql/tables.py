@@ -75,9 +75,10 @@ class Json(sa.types.TypeDecorator[Any]):
 
 
 class Word(sa.types.TypeDecorator[str]):
-    """Column type of text that is one of the words of a ``Literal``. ``place`` is the name of table and column for
-    error
-    messages."""
+    """Column type of text that is one of the words of a ``Literal``.
+
+    ``place`` is the name of table and column for error messages.
+    """
 
     impl = sa.Text
     cache_ok = True
@@ -377,7 +378,7 @@ policy_evaluations = sa.Table(
     sa.Column("summary", Json("policy_evaluations.summary"), nullable=False),
     sa.Column("bytes", sa.BigInteger, nullable=False),
     sa.Column("digest", sa.Text, nullable=False),  # SHA-256 of the file of episodes
-    sa.Column("blob", sa.Text),  # NULL: no file is stored
+    sa.Column("blob", sa.Text),  # name of the blob with the episodes; NULL: not stored
     sa.UniqueConstraint("surrogate_id", "version", "key"),
     policy_key(),
     sqlite_autoincrement=True,
