@@ -24,7 +24,7 @@ class PartDefinition:
 
 @dataclass(frozen=True)
 class TermDefinition:
-    """Sum of parts, clipped to [low, high]."""
+    """Function of the coordinates: a sum of parts, clipped to [low, high]."""
 
     parts: tuple[PartDefinition, ...]
     low: float = -torch.inf
@@ -36,8 +36,8 @@ class TermSet:
     """T compiled terms over q (..., C): value = constant + [q, sin(q W), cos(q W)] A, clipped."""
 
     constant: Tensor  # (T,) constant of each term
-    frequencies: Tensor  # W (C, P)
-    coefficients: Tensor  # A^T (T, C + 2 P)
+    frequencies: Tensor  # W (C, P), weights of the coordinates in each sine and cosine
+    coefficients: Tensor  # A^T (T, C + 2 P), coefficients of coordinates, sines and cosines
     low: Tensor | None  # (T,) lower limits; None if no term is clipped
     high: Tensor | None  # (T,) upper limits
 

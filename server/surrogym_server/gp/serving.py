@@ -53,7 +53,7 @@ class _Process:
 
     span: slice  # columns of A that belong to the output
     inputs: Tensor  # columns of x that the process reads
-    inverse_lengthscale: Tensor  # (d,)
+    inverse_lengthscale: Tensor  # (d,) 1 / lengthscale
     scaled: Tensor  # (n, d) points in length scales, and their mirror images if there is a reflection: (2 n, d)
     factor: Tensor  # (n, n) lower Cholesky factor, L / sigma_f^2
     polynomial: Tensor | None  # (D, n) coefficients R of the polynomial covariances, over sigma_f^2

@@ -38,8 +38,8 @@ def from_bytes(definition: EnvironmentDefinition, data: bytes) -> DynamicsModel:
     """Read the model that ``to_bytes`` wrote.
 
     Raises:
-            InvalidInput: the bytes are not a model file, or a damaged one, or the model is of another family or of
-                other outputs than the definition's.
+        InvalidInput: the bytes are not a model file, or a damaged one, or the model is of another family or has other
+            outputs than the definition says.
     """
     header, tensors = _content(data)
     try:

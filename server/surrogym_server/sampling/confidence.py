@@ -62,7 +62,8 @@ def log_model_uncertainty(std: Tensor, tolerance: Tensor | float) -> Tensor:
 
 
 def log_uncertainty_index(log_model_uncertainty: Tensor, log_probability: Tensor) -> Tensor:
-    """Return the logarithm of the paper's uncertainty index U (eq. 12), from those of U_m and P_i."""
+    """Return the logarithm of the paper's uncertainty index U (eq. 12), from the logarithms of the model uncertainty
+    U_m and the input probability P_i."""
     return log_model_uncertainty + log_probability
 
 

@@ -94,8 +94,8 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
     # Lines 3, 4 and 12: fit the processes of all outputs, transitions and reward, to all samples.
     fit = learn(definition, samples, state.warm, request.prior)
 
-    # CI needs a tolerance for each output, (O,): the declared one, or else the preset's, which is 1 in "paper" and else
-    # 5 % of the output's standard deviation. Later rounds keep it, unless the range of the samples grows far.
+    # CI needs a tolerance for each output, (O,): the declared one, or a default, which is 1 in preset "paper" and 5 % of
+    # the output's standard deviation in others. Later rounds keep it, unless the range of the samples grows far.
     defaults = frozen_tolerances(definition, samples, state.defaults)
     tolerances = definition.tolerances_or(defaults.values)
 
@@ -124,19 +124,19 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
     # none, the least confident output alone.
     outputs = below_target(judgement.confidences, request.target)
 
-    # Lines 9 and 10: for each of these outputs the candidate that the acquisition values most, in preset "paper" by the
-    # uncertainty index U; or rollouts of several steps in all. Candidates that may end an episode are reserved for the
-    # first such query. The last rule does all this, and always applies. The rules before it choose queries that the
-    # paper does not have, such as repeats, which show what is noise; a rule that does not apply returns None. A design
-    # that has ended chooses none, or the ``request.extra`` steps that a person asked for.
+    # Lines 9 and 10: the first rule that does not return None chooses the queries. The last rule, which always applies,
+    # is that of the paper: for each of these outputs, query the candidate with the largest value of the acquisition (the
+    # uncertainty index U in preset "paper"), or plan rollouts; candidates that may end an episode are reserved for the
+    # first query. Earlier rules are not in the paper, such as repeats, which show what is noise. A design that has ended
+    # chooses no query, or as many steps as ``request.extra``.
     round = Round(state.round, fit.model, samples, request, judgement, tolerances, outputs, continues, testing)
     rules = STEP_RULES if definition.max_rollout is None else ROLLOUT_RULES
     queries = next(choice for rule in rules if (choice := rule(round)) is not None)
     if continues:
         verdict = _verdict_with(queries, round)
 
-    # Store what the next round needs; its caller adds the predictions of the new samples. A design with extra queries
-    # has not ended here, whatever its verdict. One that has ended may begin again, if the conditions change.
+    # Store what the next round needs; the caller of ``advance`` adds the predictions of the new samples. A design with
+    # extra queries has not ended, whatever its verdict. A design that has ended continues if the conditions change.
     ended = verdict != "continue" and not queries
     following = DesignState(
         round=state.round + 1,

@@ -23,9 +23,9 @@ class UncertaintyResult:
 
     mean: Array  # predicted change of each coordinate, or of each observation entry that the model moves; then reward
     std: Array  # latent standard deviation, in the output's unit
-    model_uncertainty: Array  # U_m (eq. 10)
-    input_probability: Array  # P_i (eq. 11)
-    log_uncertainty_index: Array  # log U (eq. 12)
+    model_uncertainty: Array  # model uncertainty U_m (eq. 10)
+    input_probability: Array  # input probability P_i (eq. 11)
+    log_uncertainty_index: Array  # logarithm of the uncertainty index U (eq. 12)
 
 
 def query_uncertainty(

@@ -303,7 +303,7 @@ def _advanced(
     elapsed = before.elapsed + 1
     cut = torch.zeros_like(moved.terminated) if settings.time_limit is None else elapsed >= settings.time_limit
     cut = cut if untrusted is None else cut | untrusted
-    phase = (moved.terminated | cut).to(torch.int8).add_(RUNNING)  # ENDED follows RUNNING
+    phase = (moved.terminated | cut).to(torch.int8).add_(RUNNING)  # RUNNING, or ENDED = RUNNING + 1
     return replace(before, elapsed=elapsed, phase=phase, q=moved.q, particles=moved.particles), cut
 
 

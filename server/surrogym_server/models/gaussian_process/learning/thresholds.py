@@ -123,7 +123,7 @@ def _rivals(inner: Floats, outside: Floats, width: Floats, own: Bools, axes: lis
 def _left_out(definition: EnvironmentDefinition, values: Floats, inside: Bools) -> float:
     """Return the leave-one-out log probability of the labels ``inside`` (n,), given axis values (n, A).
 
-    Of more than ``LEFT_OUT`` samples, that many at equal distances are left out and represent all.
+    Of more than ``LEFT_OUT`` samples, only that many, evenly spaced, are left out one by one, and represent all.
     """
     count, rows = len(inside), torch.from_numpy(values)
     picked = np.unique(np.linspace(0, count - 1, min(count, LEFT_OUT)).astype(int))

@@ -110,7 +110,7 @@ class ProcessAlongPaths(PathOutlook):
 
 
 def process_inputs(definition: EnvironmentDefinition, output: OutputModel, steps: PredictedSteps) -> Tensor:
-    """Return the inputs (..., d) of one output's process for the steps (...,)."""
+    """Return the inputs (..., d) that one output's process reads at the given steps."""
     state = steps.q_next if output.feature_map.after else steps.q
     return encode(definition, output.feature_map, state, steps.u, steps.q_next[..., leading(definition)])
 

@@ -68,8 +68,8 @@ class Cut:
     lie between ``outside`` and ``inside``."""
 
     axis: int
-    outside: float  # greatest value of a state seen outside
-    inside: float  # least value of a state seen inside
+    outside: float  # greatest value on the axis of a state seen outside
+    inside: float  # least value on the axis of a state seen inside
     weight: float  # probability of this axis among those that explain the same samples
 
 
