@@ -94,8 +94,8 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
     # Lines 3, 4 and 12: fit the processes of all outputs, transitions and reward, to all samples.
     fit = learn(definition, samples, state.warm, request.prior)
 
-    # CI needs a tolerance for each output, (O,): the declared one, or a default, which is 1 in preset "paper" and 5 % of
-    # the output's standard deviation in others. Later rounds keep it, unless the range of the samples grows far.
+    # CI needs a tolerance for each output, (O,): the declared one, or a default: 1 in preset "paper", 5 % of the output's
+    # standard deviation in others. Later rounds keep it, unless the range of the samples grows far.
     defaults = frozen_tolerances(definition, samples, state.defaults)
     tolerances = definition.tolerances_or(defaults.values)
 
@@ -125,10 +125,10 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
     outputs = below_target(judgement.confidences, request.target)
 
     # Lines 9 and 10: the first rule that does not return None chooses the queries. The last rule, which always applies,
-    # is that of the paper: for each of these outputs, query the candidate with the largest value of the acquisition (the
-    # uncertainty index U in preset "paper"), or plan rollouts; candidates that may end an episode are reserved for the
-    # first query. Earlier rules are not in the paper, such as repeats, which show what is noise. A design that has ended
-    # chooses no query, or as many steps as ``request.extra``.
+    # is that of the paper: for each of these outputs, query the candidate with the largest value of the acquisition
+    # (the uncertainty index U in preset "paper"), or plan rollouts; candidates that may end an episode are reserved for
+    # the first query. Earlier rules are not in the paper, such as repeats, which show what is noise. A design that has
+    # ended chooses no query, or as many steps as ``request.extra``.
     round = Round(state.round, fit.model, samples, request, judgement, tolerances, outputs, continues, testing)
     rules = STEP_RULES if definition.max_rollout is None else ROLLOUT_RULES
     queries = next(choice for rule in rules if (choice := rule(round)) is not None)
