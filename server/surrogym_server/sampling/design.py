@@ -94,8 +94,8 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
     # Lines 3, 4 and 12: fit the processes of all outputs, transitions and reward, to all samples.
     fit = learn(definition, samples, state.warm, request.prior)
 
-    # CI needs a tolerance for each output, (O,): the declared one, or a default: 1 in preset "paper", 5 % of the output's
-    # standard deviation in others. Later rounds keep it, unless the range of the samples grows far.
+    # CI needs a tolerance for each output, (O,): the declared one, or a default, which is 1 in preset "paper" and
+    # otherwise 5 % of the output's standard deviation. Later rounds keep it, unless the range of the samples grows far.
     defaults = frozen_tolerances(definition, samples, state.defaults)
     tolerances = definition.tolerances_or(defaults.values)
 
