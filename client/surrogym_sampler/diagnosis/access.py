@@ -215,7 +215,7 @@ class _Looking:
         """Return the largest difference between two lists of steps, in next states (share of the range) or rewards
         (relative)."""
         if len(ones) != len(others):
-            return 1.0  # one episode ended earlier
+            return 1.0  # one episode ended earlier, so the steps can't be compared
         states = [self._apart(a.next_coordinates, b.next_coordinates) for a, b in zip(ones, others, strict=True)]
         paid = [
             abs(float(a.reward) - float(b.reward)) / max(1.0, abs(float(a.reward)))

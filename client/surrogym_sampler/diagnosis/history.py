@@ -175,6 +175,6 @@ def _left_out_error(x: Array, y: Array) -> float:
     spread, size = x.std(0), y.std(0)
     z = np.hstack([np.ones((len(x), 1)), (x - x.mean(0)) / np.where(spread > 0, spread, 1.0)])
     gram = z.T @ z + RIDGE * len(z) * np.eye(z.shape[1])
-    hat = z @ np.linalg.solve(gram, z.T)  # (n, n)
-    off = (y - hat @ y) / np.clip(1 - hat.diagonal(), 1e-6, None)[:, None]  # PRESS residuals
+    hat = z @ np.linalg.solve(gram, z.T)  # hat matrix (n, n)
+    off = (y - hat @ y) / np.clip(1 - hat.diagonal(), 1e-6, None)[:, None]  # leave-one-out (PRESS) residuals
     return float((np.sqrt((off**2).mean(0)) / np.where(size > 0, size, 1.0)).max())

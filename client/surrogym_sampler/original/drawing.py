@@ -27,8 +27,10 @@ class Canvas:
     def __init__(self, width: int, height: int, scale: float) -> None:
         self._frame: Frame = np.full((height, width, 3), WHITE)
         self._scale = scale
-        self._x = (np.arange(width) + 0.5 - width / 2) / scale  # (width,)
-        self._y = (height / 2 - np.arange(height) - 0.5)[:, None] / scale  # (height, 1)
+        self._x = (np.arange(width) + 0.5 - width / 2) / scale  # horizontal position of each pixel column (width,)
+        self._y = (height / 2 - np.arange(height) - 0.5)[
+            :, None
+        ] / scale  # vertical position of each pixel row (height, 1)
 
     def stroke(self, start: Point, end: Point, thickness: float, colour: Colour) -> None:
         """Draw a line with round ends; if both ends are the same point, a disc."""

@@ -32,10 +32,10 @@ from surrogym_shared.terms import observe
 class Moment:
     """The result of a reset or of one step of an episode."""
 
-    observation: Array  # (D,)
+    observation: Array  # (D,) entries that a policy observes
     reward: float
     terminated: bool
-    coordinates: Array  # (C,)
+    coordinates: Array  # (C,) state after the step
     truncated: bool = False  # whether the environment itself ended the episode without termination
 
 

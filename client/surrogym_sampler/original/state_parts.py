@@ -133,7 +133,7 @@ class _Joint:
 
 def _is_driven(model: Native, joint: int) -> bool:
     """Return whether an actuator acts on the joint itself."""
-    on_joints = model.actuator_trntype == 0  # mjTRN_JOINT
+    on_joints = model.actuator_trntype == 0  # transmission type mjTRN_JOINT: the actuator acts on a joint
     return bool((on_joints & (model.actuator_trnid[:, 0] == joint)).any())
 
 

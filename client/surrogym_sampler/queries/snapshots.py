@@ -38,8 +38,8 @@ class Bounds:
 class _Kept:
     """What is known about a snapshot's file without reading its state."""
 
-    coordinates: tuple[float, ...]  # (C,)
-    size: int  # bytes
+    coordinates: tuple[float, ...]  # (C,) coordinates of the saved state
+    size: int  # size of the file in bytes
     made: int  # time at which the file was written, in nanoseconds
 
 

@@ -114,8 +114,8 @@ class Observed:
 class Dense:
     """A layer of the network: activation(x @ weights + bias)."""
 
-    weights: Array  # (I, O)
-    bias: Array  # (O,)
+    weights: Array  # (I, O) for I inputs and O outputs
+    bias: Array  # (O,) for O outputs
     activation: Activation
 
 
@@ -128,14 +128,14 @@ class Decision:
     tanh(y), or without the tanh if ``squash`` is false.
     """
 
-    mean: Array  # (D,)
-    deviation: Array  # (D,)
+    mean: Array  # (D,) mean of each observation entry
+    deviation: Array  # (D,) standard deviation of each observation entry
     clip: float  # largest absolute value of a standardised entry; infinite without a clip
     layers: tuple[Dense, ...]
     counts: tuple[int, ...]  # number of choices of each entry of a discrete action; empty for a continuous one
     squash: bool
-    centre: Array  # (F,); empty for a discrete action
-    reach: Array  # (F,); empty for a discrete action
+    centre: Array  # (F,) middle of a continuous action's range; empty for a discrete action
+    reach: Array  # (F,) half of a continuous action's range; empty for a discrete action
 
 
 @dataclass(frozen=True, eq=False)

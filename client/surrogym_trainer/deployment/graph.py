@@ -155,7 +155,9 @@ def _chosen(graph: _Graph, scores: str, controller: Controller) -> tuple[str, in
 
     counts, first, chosen = controller.decision.counts, 0, []
     for count in counts:
-        where = [np.array([i], dtype=np.int64) for i in (first, first + count, 1)]  # starts, ends, axes
+        where = [
+            np.array([i], dtype=np.int64) for i in (first, first + count, 1)
+        ]  # starts, ends and axes of ONNX's Slice
         group = graph.add("Slice", scores, *where)
         chosen.append(graph.add("ArgMax", group, axis=1, keepdims=1))
         first += count

@@ -31,18 +31,18 @@ TURN = 2 * np.pi
 class Memory:
     """The state of N controllers between two steps: the last coordinates and action."""
 
-    coordinates: Array  # (N, C)
-    action: Array  # (N, F)
-    acted: Bools  # (N,) whether there was a step before
-    measured: Bools  # (N,) whether the measurements of the step before had no fault
+    coordinates: Array  # (N, C) coordinates of the last step
+    action: Array  # (N, F) last action of N controllers
+    acted: Bools  # (N,) whether each controller has taken a step before
+    measured: Bools  # (N,) whether the measurements of the last step had no fault
 
 
 class Decided(NamedTuple):
     """The result of one decision of N controllers."""
 
     memory: Memory
-    action: Array  # (N, F)
-    status: Ints  # (N,) 0, or the bits of the faults
+    action: Array  # (N, F) decided action of N controllers
+    status: Ints  # (N,) bits of the faults of N controllers; 0 if there are none
 
 
 def begin(controller: Controller, number: int = 1) -> Memory:

@@ -45,7 +45,7 @@ class Checked:
     """The results of a controller and of its policy, from the same N starts."""
 
     returns: Array  # (N,) returns of the controller
-    policy_returns: Array  # (N,)
+    policy_returns: Array  # (N,) returns of the policy
     steps: int  # number of steps of the controller
     largest: float  # largest difference of both actions in states of the controller, as a share of the action's range
     different: int  # number of steps with another choice, or a difference above 1e-6 of the range (1e-4 in float)

@@ -23,11 +23,11 @@ STEADY = 2e-5  # share of an action's range by which rounding a measurement may 
 class Vector:
     """One step of a test, and the answer that the controller must give."""
 
-    first: bool  # whether an episode begins
-    measurement: Array  # (R,)
-    age: float  # s
+    first: bool  # whether this step begins an episode
+    measurement: Array  # (R,) measurements
+    age: float  # age of the measurements in seconds
     status: int
-    action: Array  # (F,)
+    action: Array  # (F,) expected action
 
 
 def vectors_of(controller: Controller, seed: int = 0) -> list[Vector]:

@@ -75,19 +75,19 @@ class EvaluationSettings:
 class Trace:
     """The record of one episode, step by step."""
 
-    coordinates: Array  # (T + 1, C)
-    action: Array  # (T, F)
-    reward: Array  # (T,)
-    terminated: bool = False  # whether its last step terminated it
+    coordinates: Array  # (T + 1, C) states, from the start to the end of T steps
+    action: Array  # (T, F) action of each step
+    reward: Array  # (T,) reward of each step
+    terminated: bool = False  # whether the last step terminated the episode
 
 
 @dataclass(frozen=True)
 class Evaluation:
     """The result of N real episodes."""
 
-    returns: Array  # (N,)
-    lengths: NDArray[np.int64]  # (N,)
-    success: NDArray[np.bool_] | None  # (N,); None if the specification has no success criterion
+    returns: Array  # (N,) return of each episode
+    lengths: NDArray[np.int64]  # (N,) number of steps of each episode
+    success: NDArray[np.bool_] | None  # (N,) whether each episode succeeded; None if the specification has no criterion
     traces: tuple[Trace, ...]  # one for each episode
     varied: tuple[str, ...] = ()  # names of constants of the specification that changed within an episode
     limit: int | None = None  # largest number of steps in an episode, by the specification or by the environment itself

@@ -17,9 +17,10 @@ from surrogym_shared.network import Network, bounds_of, counts_of
 from surrogym_shared.port import PolicyPort, PolicyRollout, StepResult, SurrogatePort
 
 DECLARED = {"start_box": 0.0, "start_visited": 0.0}  # session options with which all episodes begin as declared
-# without a trust limit, because a shortened episode would earn more if rewards are costs
+# session options of whole episodes: without a trust limit, because a shortened episode would earn more if rewards are costs
 WHOLE = {**DECLARED, "trust": None}
-# with the trust limit, because an episode that leaves the trusted range gets a penalty for its missing steps
+# session options if the specification pays for leaving the trusted range: an episode then gets a penalty for its
+# missing steps, so the trust limit stays
 PAID_OUTSIDE = DECLARED
 STATISTICS_LANES = 1_024
 STEPS_AT_ONCE = 1_000  # largest number of steps in one reply; an episode may be longer

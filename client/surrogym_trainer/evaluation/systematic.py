@@ -59,8 +59,8 @@ def columns(spec: EnvironmentSpec, q: Array, u: Array) -> Array:
 class Inputs(NamedTuple):
     """The standardisation of inputs, by their mean and standard deviation over the states that a policy visits."""
 
-    centre: Array  # (P,)
-    scale: Array  # (P,)
+    centre: Array  # (P,) mean of each input
+    scale: Array  # (P,) standard deviation of each input
 
     @classmethod
     def over(cls, spec: EnvironmentSpec, q: Array, u: Array) -> Self:

@@ -27,8 +27,8 @@ class Cut:
 
     across: int
     up: int
-    uncertainty: Array  # (S, S), in tolerances; the rows go upwards
-    occupancy: Array  # (S, S)
+    uncertainty: Array  # (S, S) standard deviation in tolerances; the rows go upwards
+    occupancy: Array  # (S, S) density of visited states
     log_index: Array  # (S, S) natural logarithm of the design's index
 
 

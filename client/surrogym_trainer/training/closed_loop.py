@@ -79,9 +79,8 @@ class ClosedLoop:
     trained: list[TrainResult] = field(default_factory=list, init=False)
     candidates: Candidates = field(default_factory=Candidates)
     _visited: int = field(default=0, init=False)  # number of virtual steps that collected visited states
-    _known: list[float | None] = field(
-        default_factory=list, init=False
-    )  # confidence index over each round's visited states
+    # confidence index over the states that the policy visited in each round
+    _known: list[float | None] = field(default_factory=list, init=False)
     _region_known: bool = field(default=False, init=False)
 
     def __post_init__(self) -> None:

@@ -47,11 +47,11 @@ from surrogym_trainer.policies.evidence import Audit, Promise
 from surrogym_trainer.policies.predict import Predict
 
 LEAST_AUDITED = 128  # number of real steps of audits that every surrogate may take
-MOST_AUDITS = 3  # largest number of audits in one training, which share these steps
+MOST_AUDITS = 3  # largest number of audits in one training
 WAY_LANES = 16  # number of virtual episodes from whose states an audit chooses
 MOST_OF_A_WAY = 200  # largest number of steps of an episode that are compared with a log
 ELSEWHERE = 4  # an audit of a ready design takes one of this many steps in a gap of the samples
-ANYWHERE = 1_024  # number of points of the sampling range from which such steps are chosen
+ANYWHERE = 1_024  # number of points of the sampling range from which an audit's steps in gaps are chosen
 WIDE = 0.5  # share of the gain over an untrained policy; a promise with a wider lower half is not trusted
 NO_SAMPLER = "no sampler is connected"
 
@@ -94,7 +94,9 @@ class Subject:
     name: str  # name of the surrogate
     port: SurrogatePort
     predict: Predict
-    session: dict[str, Any] = field(default_factory=dict)  # fields of ``OpenSession``
+    session: dict[str, Any] = field(
+        default_factory=dict
+    )  # session fields (of OpenSession) that the policy was trained with
     floor: float | None = None  # imagined return of an untrained policy
     seed: int = 0
 

@@ -50,9 +50,8 @@ class TrainSettings:
     prolong: bool | None = None  # whether to take cycles while they gain, and to refine; None lets prolongs decide
     threads: int = 1
     tracker: Tracker | None = None  # tracker of curves, for searches that log them
-    tensorboard: Path | None = (
-        None  # folder of TensorBoard's files; None takes one beside the policy, if the tracker has such files
-    )
+    # folder of TensorBoard's files; None takes one beside the policy, if the tracker has such files
+    tensorboard: Path | None = None
     session: dict[str, Any] = field(default_factory=dict)
     judge: dict[str, Any] | None = None  # session fields for comparing policies; None takes those of the training
     hyperparameters: dict[str, Any] = field(default_factory=dict)
@@ -142,9 +141,8 @@ class TrainProgress:
     imagined_return: float | None
     penalty_share: float  # sum of the penalties as a share of the sum of absolute rewards, since the last report
     episode_penalty: float | None = None  # mean penalty of the last 100 training episodes; None without a penalty
-    visited_confidence: float | None = (
-        None  # confidence index over the states that the policy visited in the last round
-    )
+    # confidence index over the states that the policy visited in the last round
+    visited_confidence: float | None = None
     stage: str | None = None  # name of the current stage, if the search has stages
 
 

@@ -40,7 +40,7 @@ class Region(NamedTuple):
     low: float
     high: float
     quarter: str
-    share: float  # of the sum of the squared errors
+    share: float  # share of the squared errors that is in this quarter
 
     def words(self) -> str:
         return (

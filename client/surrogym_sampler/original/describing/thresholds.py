@@ -267,7 +267,7 @@ def _ellipsoid(group: Sequence[Term], x: Array, elsewhere: Array) -> tuple[Quant
         return None
     if np.abs(others @ weights - 1).max() <= LEVEL:
         return None
-    scale = np.sqrt(a / (1 + (b**2 / (4 * a)).sum())) / reach  # 1 / r
+    scale = np.sqrt(a / (1 + (b**2 / (4 * a)).sum())) / reach  # 1 / r of each entry
     centre = middle - reach * b / (2 * a)
     return tuple(
         Quantity(term=float(s) * (term + Term.constant(-float(c))))

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import scipy.linalg.cython_blas  # noqa: F401  # numba calls it; loaded here, its threads can be limited before
+import scipy.linalg.cython_blas  # noqa: F401  # numba calls it; loaded now, its threads can be limited
 from numba import types
 from numpy.typing import NDArray
 

@@ -68,10 +68,10 @@ class Objective:
 class Batch:
     """Transitions to learn from, one in each of B rows."""
 
-    observations: Array  # (B, D) standardised
-    actions: Array  # (B, F)
-    log_probabilities: Array  # (B,) when the actions were taken
-    advantages: Array  # (B,)
+    observations: Array  # (B, D) standardised observations
+    actions: Array  # (B, F) actions taken
+    log_probabilities: Array  # (B,) of the actions when they were taken
+    advantages: Array  # (B,) estimated advantages
     returns: Array  # (B,) targets of the critic, from scaled rewards
 
     def at(self, rows: NDArray[np.int64] | slice) -> Batch:

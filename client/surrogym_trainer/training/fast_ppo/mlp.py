@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from surrogym_shared.acting import layers_of
 from surrogym_shared.network import Activation
 
-Array = NDArray[np.floating[Any]]  # float32
+Array = NDArray[np.floating[Any]]  # always float32
 
 
 class Mlp:

@@ -128,7 +128,7 @@ class _Training:
         self._rollout = self._num_envs * search.n_steps  # number of virtual steps in a rollout
         self._batch = search.batch_size or even_batch(self._rollout)
         self._objective = Objective(search.clip_range, search.vf_coef, search.max_grad_norm)
-        self._planned = max(task.steps // self._rollout, 1)  # rollouts
+        self._planned = max(task.steps // self._rollout, 1)  # number of planned rollouts
         self._cycle = max(self._planned // CYCLES, 1) if task.prolong else self._planned
         # number of rollouts left before the stage refine
         self._left = self._planned * (LEARNING if task.prolong else 1)

@@ -11,7 +11,7 @@ from surrogym_trainer.training.search import SearchTask
 from surrogym_trainer.training.settings import TrainSettings
 
 SHORTER = 5  # factor by which a training episode of the stage learn is shorter than the time limit
-SHORTEST = 40  # smallest number of steps in such an episode
+SHORTEST = 40  # smallest number of steps in a training episode of the stage learn
 SIGHT = 1 / 2  # discount horizon of short episodes, 1 / (1 - gamma), as a share of their length
 
 
@@ -20,7 +20,7 @@ class Stage:
     """One stage of a training."""
 
     name: str
-    settings: TrainSettings  # settings of its episodes
+    settings: TrainSettings  # settings of the stage's episodes
     gamma: float
 
 

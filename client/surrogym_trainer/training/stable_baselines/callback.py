@@ -35,9 +35,8 @@ class Checking(BaseCallback):
         super().__init__()
         self._total, self._progress, self._imagine = total, progress, imagine
         self.checks = Checks(imagine(untrained))
-        self._kept: tuple[BaseAlgorithm, dict[str, Any]] | None = (
-            None  # the best learner, and its parameters at the check
-        )
+        # the best learner, and its parameters at the check
+        self._kept: tuple[BaseAlgorithm, dict[str, Any]] | None = None
         self._penalty = self._size = 0.0
         self._penalties: deque[float] = deque(maxlen=100)  # penalties of the last episodes
         self._checked = 0  # number of checks that were due so far
