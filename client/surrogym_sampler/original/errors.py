@@ -30,7 +30,7 @@ RAISED = (Exception, SystemExit)
 
 
 class OriginalError(Exception):
-    """Base of this tree. ``str(error)`` is one sentence for a person."""
+    """Base class of all errors of an original environment; its text is one sentence for a person."""
 
 
 class UnknownEnvironment(OriginalError):
@@ -58,7 +58,7 @@ class QueryRefused(OriginalError):
 
 
 class SnapshotGone(OriginalError):
-    """A snapshot was dropped, is damaged, or can't be restored; no real step was taken."""
+    """A snapshot was deleted, is damaged, or can't be restored; no real step was taken."""
 
 
 class SnapshotNotKept(OriginalError):
@@ -90,11 +90,11 @@ class StepFailed(OriginalError):
 
 
 class StepTimedOut(StepFailed):
-    """The environment took longer than its limit."""
+    """A step, reset or other request took longer than the environment's time limit."""
 
 
 class EnvironmentDied(StepFailed):
-    """The environment's process ended."""
+    """The process of the environment ended during a request."""
 
 
 class StepRefused(StepFailed):

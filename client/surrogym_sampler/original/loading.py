@@ -161,7 +161,7 @@ def specification(name: str) -> EnvironmentSpec:
 
 def fits(noted: str, name: str) -> bool:
     """Return whether the specification of the environment ``noted`` may be used for the environment ``name``, which an
-    adapter opens: both are the same, and the adapter's name is known or has no specification of its own."""
+    adapter opens: both are the same environment, which is built in or has no specification of its own."""
     return is_same(noted, name) and (is_known(name) or not has_specification(name))
 
 

@@ -30,13 +30,18 @@ class OriginalEnvironment(Protocol):
     Examples:
         A cart on a rail that is pushed::
 
-            class Cart: def spec(self):
+            class Cart:
+                def spec(self):
                     return EnvironmentSpec.model_validate_json(Path("cart.json").read_text())
 
-                def step_from(self, coordinates, action): self.rail.move_to(*coordinates) self.rail.push(action[0])
-                    achieved = self.rail.read() return RealStep(coordinates, action, achieved, reward=-abs(achieved[0]))
+                def step_from(self, coordinates, action):
+                    self.rail.move_to(*coordinates)
+                    self.rail.push(action[0])
+                    achieved = self.rail.read()
+                    return RealStep(coordinates, action, achieved, reward=-abs(achieved[0]))
 
-                def close(self): self.rail.park()
+                def close(self):
+                    self.rail.park()
     """
 
     def spec(self) -> EnvironmentSpec:
@@ -62,17 +67,24 @@ class ResettableEnvironment(Protocol):
     Examples:
         A cart that finds its own way back::
 
-            class Cart: def spec(self):
+            class Cart:
+                def spec(self):
                     return EnvironmentSpec.model_validate_json(Path("cart.json").read_text())
 
-                def reset(self, *, seed=None): self.rail.home() return self.rail.read(), {}
+                def reset(self, *, seed=None):
+                    self.rail.home()
+                    return self.rail.read(), {}
 
-                def step(self, action): self.rail.push(action[0]) observation = self.rail.read() return observation,
-                    -abs(observation[0]), False, False, {}
+                def step(self, action):
+                    self.rail.push(action[0])
+                    observation = self.rail.read()
+                    return observation, -abs(observation[0]), False, False, {}
 
-                def coordinates(self, observation): return observation
+                def coordinates(self, observation):
+                    return observation
 
-                def close(self): self.rail.park()
+                def close(self):
+                    self.rail.park()
     """
 
     def spec(self) -> EnvironmentSpec:
@@ -125,10 +137,13 @@ class SnapshotEnvironment(Protocol):
     Examples:
         A simulator whose whole state is one number::
 
-            class SavedCart(Cart): def save(self):
+            class SavedCart(Cart):
+                def save(self):
                     return struct.pack("<d", self.rail.x)
 
-                def restore(self, snapshot): (self.rail.x,) = struct.unpack("<d", snapshot) return self.rail.read()
+                def restore(self, snapshot):
+                    (self.rail.x,) = struct.unpack("<d", snapshot)
+                    return self.rail.read()
     """
 
     def save(self) -> bytes:
@@ -148,7 +163,8 @@ def runs_in_parallel(environment: object) -> bool:
     Examples:
         A simulator sets the attribute; a machine leaves it out::
 
-            class SimulatedCart(Cart): parallel = True
+            class SimulatedCart(Cart):
+                parallel = True
     """
     return bool(getattr(environment, "parallel", False))
 

@@ -49,8 +49,8 @@ class CartPoleSwingUp(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     """The swing-up task as a Gymnasium environment.
 
     State: position, velocity, angle (0 if the pole hangs, counter-clockwise), angular velocity. Action: force in N.
-    Observation:
-    position, velocity, cosine and sine of the angle, angular velocity, and the horizontal position of the pole's tip.
+    Observation: position, velocity, cosine and sine of the angle, angular velocity, and the horizontal position of the
+    pole's tip.
 
     The reward depends on the state after the step: exp(-d^2 / (2 width^2)), where d is the distance of the pole's tip
     from its target, the position when the pole stands above the origin. No state ends an episode. Pictures mark the

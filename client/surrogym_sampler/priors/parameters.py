@@ -19,10 +19,13 @@ class Adjustable(Protocol):
     Examples:
         A class that computes something from its parameters defines the two methods itself::
 
-            class Cart: def parameters(self):
+            class Cart:
+                def parameters(self):
                     return {"mass": self.mass}
 
-                def set_parameters(self, values): self.mass = values["mass"] self.inverse = 1 / self.mass
+                def set_parameters(self, values):
+                    self.mass = values["mass"]
+                    self.inverse = 1 / self.mass
     """
 
     def parameters(self) -> Mapping[str, float]:

@@ -17,7 +17,8 @@ from surrogym_shared.network import Network, bounds_of, counts_of
 from surrogym_shared.port import PolicyPort, PolicyRollout, StepResult, SurrogatePort
 
 DECLARED = {"start_box": 0.0, "start_visited": 0.0}  # session options with which all episodes begin as declared
-# session options of whole episodes: without a trust limit, because a shortened episode would earn more if rewards are costs
+# session options of whole episodes, without a trust limit, because a shortened episode would earn more if rewards are
+# costs
 WHOLE = {**DECLARED, "trust": None}
 # session options if the specification pays for leaving the trusted range: an episode then gets a penalty for its
 # missing steps, so the trust limit stays

@@ -2,16 +2,16 @@
 
 The laws of a search, which ``surrogym_trainer.testing`` checks:
 
-1. The same surrogate, settings and seed give the same policy, bit for bit. 2. It takes at most ``task.steps`` virtual
-steps, rounded to whole units of its own work (a rollout, a generation), and
+1. The same surrogate, settings and seed give the same policy, bit for bit.
+2. It takes at most ``task.steps`` virtual steps, rounded to whole units of its own work (a rollout, a generation), and
    at least one unit. Steps that only compare policies are not counted.
-3. It reports progress with steps that never decrease and never exceed their total. 4. On Ctrl-C it returns the best
-policy so far, with ``whole=False``. It raises ``KeyboardInterrupt`` only if there is
+3. It reports progress with steps that never decrease and never exceed their total.
+4. On Ctrl-C it returns the best policy so far, with ``whole=False``. It raises ``KeyboardInterrupt`` only if there is
    no policy yet.
-5. It closes every session that it opens, also after errors. It writes no file; the policy's ``save`` does. 6.
-``load_policy`` reads the saved policy without trust, and the policy gives actions of the surrogate's action space. 7.
-Impossible settings raise ``ValueError`` with what was expected and what came, before the first virtual step. 8. It
-starts from the policy of ``settings.start_from`` if that is set. A search that can't has ``resumable = False``.
+5. It closes every session that it opens, also after errors. It writes no file; the policy's ``save`` does.
+6. ``load_policy`` reads the saved policy without trust, and the policy gives actions of the surrogate's action space.
+7. Impossible settings raise ``ValueError`` with what was expected and what came, before the first virtual step.
+8. It starts from the policy of ``settings.start_from`` if that is set. A search that can't has ``resumable = False``.
 """
 
 from __future__ import annotations

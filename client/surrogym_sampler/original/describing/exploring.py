@@ -148,8 +148,8 @@ def _far_from(counted: Counted, visited: Array, state: Array, rng: np.random.Gen
 
 
 def _actions(space: Action, number: int, count: int, rng: np.random.Generator) -> list[Array]:
-    """Return ``count`` random actions (F,) of one episode. By its number, they are new at each step, held for some
-    steps, or held at the ends of their range."""
+    """Return ``count`` random actions (F,) of one episode. The episode's number decides whether they are new at each
+    step, held for some steps, or held at the ends of their range."""
     longest = (1, LONGEST_HOLD, LONGEST_HOLD, 1)[number % 4]
     actions: list[Array] = []
     while len(actions) < count:

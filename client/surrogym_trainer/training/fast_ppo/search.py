@@ -67,13 +67,10 @@ class FastPpo(PolicySearch):
     with cycles in which the learning rate falls. The module ``stages`` describes their episodes, and the reasons.
 
     1. *learn*: short episodes with a small discount horizon. Another cycle follows if the second half of the previous
-    one gained.
-       A network that has learned nothing in its first cycle is replaced. The noise of every second network stays the
-           same for
-       ``HELD`` steps if actions are continuous, because a first success may need a steady push.
+       one gained. A network that has learned nothing in its first cycle is replaced. The noise of every second network
+       stays the same for ``HELD`` steps if actions are continuous, because a first success may need a steady push.
     2. *refine*: whole episodes from the declared starts, in one cycle. Inputs are standardised by the observations that
-    the policy
-       meets, and the critic is a new one.
+       the policy meets, and the critic is a new one.
 
     If the user chose the number of steps, they form one cycle of the first stage.
     """
