@@ -70,7 +70,8 @@ class UnknownModel(NotThere):
 
 
 class UnknownPolicy(NotThere):
-    """No policy with this version or alias, or it lacks the requested file or evaluation."""
+    """The surrogate has no policy of the requested version or alias, or this policy lacks the requested file or
+    evaluation."""
 
 
 class UnknownJob(NotThere):
@@ -134,7 +135,7 @@ class Unauthenticated(Refused):
 
 
 class Forbidden(Refused):
-    """The token's role does not allow this."""
+    """The role of the request's token does not allow the request."""
 
 
 class BeyondBudget(Refused):

@@ -60,7 +60,7 @@ class Cluster:
     Attributes:
         check: raises ``InvalidInput`` if this server can't use the cluster.
         connect: waits until the cluster is ready, and returns its engine.
-        fits: returns what computes the fits in the cluster; None if fits run in processes of this server.
+        fits: returns the object that computes fits in the cluster; None if fits run in processes of this server.
     """
 
     check: Callable[[Settings], None]

@@ -164,7 +164,8 @@ def validation_detail(found: Sequence[Any]) -> str:
 
 
 def shown(value: Any) -> str:
-    """Return a value as text for a message, at most ``SHOWN_CHARACTERS`` long. Only as much of it is converted."""
+    """Return a value as text for a message, cut after ``SHOWN_CHARACTERS``. The rest of a long value is not
+    converted."""
     text = ""
     for piece in ["nothing"] if value is None else _pieces(value):
         text += piece

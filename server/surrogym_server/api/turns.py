@@ -24,7 +24,7 @@ class Turns:
     ``waiting`` more wait."""
 
     def __init__(self, what: str, at_work: int, waiting: int) -> None:
-        """``what`` names the requests, for the message of a refusal."""
+        """Set the limits. ``what`` is the name of the requests in error messages."""
         self._what = what
         self._most = at_work + waiting
         self._inside = 0
@@ -54,7 +54,7 @@ class Waiting:
     """Limit on the requests of each token that wait for something to happen, because each takes memory."""
 
     def __init__(self, what: str, most: int = MAX_WAITING) -> None:
-        """``what`` names the requests, for the message of a refusal."""
+        """Set the limits. ``what`` is the name of the requests in error messages."""
         self._what = what
         self._most = most
         self._by_token = Counter[str | None]()

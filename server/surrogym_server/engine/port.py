@@ -133,7 +133,7 @@ class SessionEngine(ABC):
 
 
 class Compute(ABC):
-    """Interface of what computes the rounds of designs (a fit and the next queries), in other processes or machines.
+    """Interface of an object that computes rounds of designs (a fit and the next queries), in other processes.
 
     Laws: a result equals that of ``run_design_job``, bit for bit. Jobs run at the same time without waiting for each
     other. An error of a job affects no other job, and its exception has the error's text. A job can be cancelled at any

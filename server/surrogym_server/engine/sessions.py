@@ -68,7 +68,7 @@ class Threads:
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of all sessions of this process together."""
+    """Limits on the number, the memory and the requests of all sessions of this process together."""
 
     sessions: int = 256
     nbytes: int = 2048 * MEBIBYTE  # largest memory of all lanes and stored answers, in bytes

@@ -69,7 +69,7 @@ class QueryService:
         return leases
 
     def renew(self, name: str, query_id: int, token: str, lease_seconds: float) -> None:
-        """Extend the lease of a query by ``lease_seconds`` from now.
+        """Extend the lease of a query to ``lease_seconds`` from now.
 
         Raises ``UnknownQuery``, ``ForeignLease`` or ``LeaseExpired``.
         """

@@ -81,7 +81,10 @@ class SessionService:
         return len(visits.states), visits.confidence_index
 
     async def activity(self, surrogate: str) -> list[SessionActivity]:
-        """Return what each open session of a surrogate is doing, oldest first. Raises ``UnknownSurrogate``."""
+        """Return steps, returns and idle time of each open session of a surrogate, oldest first.
+
+        Raises ``UnknownSurrogate``.
+        """
         await asyncio.to_thread(self._storage.surrogates.get, surrogate)
         return await self._engine.activity(surrogate)
 

@@ -130,7 +130,8 @@ class Surrogates(ABC):
 
 
 class Designs(ABC):
-    """Part of the storage interface for designs. A server fits a surrogate under a lease, which only one can hold."""
+    """Part of the storage interface for designs. A server fits a surrogate under a lease, which only one server
+    holds."""
 
     @abstractmethod
     def improve(

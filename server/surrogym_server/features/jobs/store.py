@@ -118,7 +118,7 @@ class Jobs:
     def claim(
         self, name: str, worker: str, most_episodes: int, seconds: float, *, reference: bool = False
     ) -> LeasedJob | None:
-        """Lease the oldest queued job that a worker accepts to it for ``seconds``. Return None if there is none.
+        """Lease to a worker the oldest queued job that it accepts. Return None if there is none.
 
         Args:
             name: name of the surrogate.

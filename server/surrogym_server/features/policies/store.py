@@ -389,7 +389,7 @@ def _displaced(summaries: Mapping[int, JSON]) -> list[int]:
     """Return the ids of a policy's evaluations to remove, so that ``MAX_EVALUATIONS`` remain.
 
     There are three kinds: reports of drift, evaluations that can judge the promise, and others. The oldest of the most
-    frequent kind is removed first, so that many evaluations of one kind displace none of the others.
+    frequent kind is removed first, so that many evaluations of one kind do not displace those of another.
 
     Args:
         summaries: summaries of the evaluations by id, oldest first.

@@ -71,7 +71,8 @@ def connect(settings: Settings, storage: Storage) -> SessionEngine:
 
 
 def fits_of(settings: Settings, function: Callable[[DesignJob], DesignResult]) -> Compute | None:
-    """Return what computes fits in the connected cluster; None if the session hosts leave no CPU or too few GPUs."""
+    """Return the object that computes fits in the connected cluster; None if the session hosts leave no CPU or too few
+    GPUs for fits."""
     import ray
 
     from surrogym_server.features.ray.fits import RayFits
