@@ -28,7 +28,7 @@ Ints = NDArray[np.int64]
 # POLYNOMIALS (5 + 2 n, d): coefficients of x and x^2 in the mean, of x^2 and x^4 in the prior variance, of the mirror
 #   image's exponent, and of the polynomial covariances with the n points (first linear, then quadratic).
 # FACTOR (n, n): Cholesky factor L.
-# KEPT, TURNED (d, S): frequencies of posterior samples over the length scales, of the inputs whose sign a reflection
+# KEPT, TURNED (d, 256): frequencies of posterior samples over the length scales, of the inputs whose sign a reflection
 #   keeps and of those whose sign it changes.
 HEAD, INPUTS, POINTS, WEIGHTS, POLYNOMIALS, FACTOR, KEPT, TURNED = range(8)
 # Columns of HEAD: scale of the output, constant of the mean, constant of the prior variance, parity of the reflection

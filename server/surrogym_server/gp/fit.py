@@ -43,7 +43,7 @@ def fit(
     """Fit a process to inputs x (n, d) and targets y (n,), both standardised. Runs on the CPU.
 
     Args:
-        warm: theta of an earlier fit, tried as a start; None to start from the priors' means.
+        warm: theta of an earlier fit, from which to start as well; None for the default start only.
         reflection: symmetry of the functions to fit, or None.
 
     Raises:

@@ -67,9 +67,9 @@ def condition_many(
     """Condition a process on x (n, d) and y (n,); with more than ``MAX_EXACT`` points through inducing points.
 
     Up to ``MAX_EXACT`` points the result is exact, with the last hyperparameters. With more, all points select the
-    hyperparameters, because a fit to a subset may miss rare points: each point, and each ``censored`` one, is predicted
-    from the others. The predictive density selects the noise, since inducing points leave errors that the fitted noise
-    does not contain. Then the mean squared error selects the hyperparameters. R&W (2006), section 5.4.2.
+    hyperparameters, because a fit to a subset may miss rare points: each point is predicted from the others, and each
+    ``censored`` one as well. The predictive density selects the noise, since inducing points leave errors that the
+    fitted noise does not contain. Then the mean squared error selects the hyperparameters. R&W (2006), section 5.4.2.
 
     Args:
         hypers: candidates, the last one fitted to the most points.

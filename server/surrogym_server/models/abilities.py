@@ -139,8 +139,8 @@ class LearnedNoise(ABC):
 
     @property
     def possible_noise(self) -> tuple[float, ...]:
-        """Standard deviation of each output's noise in the noisiest explanation of the samples that is at least as
-        likely as the learned one, (O,). Equal to ``noise_stds`` in a family that looks for no other explanation."""
+        """Standard deviation of each output's noise in a noisier explanation of the samples, if one is at least as
+        likely as the learned one, (O,). Equal to ``noise_stds`` if the family finds or looks for none."""
         return self.noise_stds
 
 

@@ -150,8 +150,8 @@ def verdict_with_history(judgement: Judgement, state: DesignState, request: Requ
     """Correct the verdict on a model by how the design ended before, if it did.
 
     A design that was ready stays ready, unless a person has asked for more or later steps contradict the model: a fit
-    to more steps may lower the confidence index a little although the model had predicted all of them. A design that
-    has ended takes no further real steps because of audits or logs.
+    to more steps may lower the confidence index a little although the model had predicted all of them. Audits and
+    logs are no reason for an ended design to take further real steps.
 
     Args:
         judgement: judgement of the present model.

@@ -83,7 +83,7 @@ class Request:
 
     budget: int  # greatest number of real steps of the design
     target: float  # confidence index to reach
-    pending: tuple[Query, ...] = ()  # queries without an answer, which may still come or were set aside
+    pending: tuple[Query, ...] = ()  # queries whose answers may still come, or that were set aside
     refused: tuple[Query, ...] = ()  # queries that the environment refused
     extra: int = 0  # real steps to choose even if the design has ended
     states: Tensor | None = None  # (v, C) states that policies visited

@@ -34,7 +34,7 @@ BELOW = 10.0  # if few samples have a reward, the logarithm of the others is ass
 FEWEST = 3  # least number of samples with a reward that can predict the others
 EPS = 4 * torch.finfo(torch.float64).eps  # a reward within this share of the base equals the base
 RESOLUTION = 1e-3  # resolution at which explanations of the samples are compared, as a share of the largest reward
-GAIN = 3.0  # log odds for a process of the logarithms over no structure, below which it is not used
+GAIN = 3.0  # least log odds of a process of the logarithms over no structure, unless the spread alone decides
 
 
 def hides(reward: Tensor) -> bool:
