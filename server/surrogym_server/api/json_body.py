@@ -56,8 +56,11 @@ def parse(content: bytes) -> Any:
     try:
         parsed = jiter.from_json(content, catch_duplicate_keys=True)
     except ValueError as error:
-        expected = f"expected JSON in UTF-8 with each key once and at most {DEEPEST} levels"
-        raise HTTPException(400, f"the body: {expected}; parsing stopped: {error}") from None
+        raise HTTPException(
+            400,
+            f"the body: expected JSON in UTF-8 with each key once and at most {DEEPEST} levels; parsing stopped: "
+            f"{error}",
+        ) from None
     if isinstance(parsed, dict) and len(parsed) > MOST_FIELDS:
         raise HTTPException(400, f"the body: expected at most {MOST_FIELDS} fields, got {len(parsed)}")
     return parsed

@@ -62,7 +62,7 @@ def roll_policy(session: Session, run: PolicyRun, step: OneStep) -> tuple[Sessio
     if lanes * max(run.policy.units) > MAX_ACTIVATIONS:
         raise TooLarge(
             f"expected the widest layer of the policy to have at most {MAX_ACTIVATIONS} units times lanes, got "
-            f"{max(run.policy.units)} x {lanes}"
+            f"{max(run.policy.units)} x {lanes}: open fewer lanes, or take a smaller policy"
         )
     actor = _actor(len(definition.observation_names), definition.action, run)
     waiting = _lanes_without_an_end(run, lanes)

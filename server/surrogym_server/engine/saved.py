@@ -71,7 +71,9 @@ def session_from_bytes(definition: EnvironmentDefinition, data: bytes, surrogate
     try:
         return _read(definition, data, surrogate_id)
     except MALFORMED as error:
-        raise Damaged(f"expected a saved session, got {len(data)} bytes that can't be read as one: {error}") from error
+        raise Damaged(
+            f"expected a saved session, got {len(data)} bytes that can't be read as one: {error}; open a new session"
+        ) from error
 
 
 def _read(definition: EnvironmentDefinition, data: bytes, surrogate_id: int) -> Session:

@@ -121,7 +121,10 @@ def replay(session: Session, seq: int | None, request: Fingerprint) -> Answer | 
     if answer is not None and seq == answer.seq and request == answer.request:
         return answer
     repeated = " with another body" if answer is not None and seq == answer.seq else ""
-    raise SeqConflict(f"expected seq {session.seq + 1}, got {seq}{repeated}", expected=session.seq + 1)
+    raise SeqConflict(
+        f"expected seq {session.seq + 1}, got {seq}{repeated}: number the requests of a session one by one",
+        expected=session.seq + 1,
+    )
 
 
 def answered(session: Session, request: Fingerprint, outcome: Outcome) -> tuple[Session, Answer]:

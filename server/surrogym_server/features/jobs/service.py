@@ -132,9 +132,9 @@ class JobService:
             names, version, evaluation = self._storage.policy_names, result.version, result.evaluation
             names.version(name, str(version))
             if evaluation is not None and not names.has_evaluation(name, version, evaluation):
-                place = f"version {result.version} of {name!r}'s policies"
                 raise UnknownPolicy(
-                    f"expected the id of an evaluation of {place}, got {result.evaluation}, which does not exist"
+                    f"expected the id of an evaluation of version {result.version} of {name!r}'s policies, got "
+                    f"{result.evaluation}, which does not exist"
                 )
         return self._changed(name, self._jobs.finish(name, id, token, result))
 

@@ -263,8 +263,10 @@ def _require_room(connection: Connection, surrogate: int, name: str) -> None:
     own = jobs.c.surrogate_id == surrogate
     waiting = sa.select(sa.func.count()).select_from(jobs).where(own, OPEN)
     if connection.execute(waiting).scalar_one() >= MAX_OPEN:
-        most = f"expected at most {MAX_OPEN} queued and running jobs of {name!r}"
-        raise Overloaded(f"{most}, got one more job: cancel one, or wait until one has ended")
+        raise Overloaded(
+            f"expected at most {MAX_OPEN} queued and running jobs of {name!r}, got one more: cancel one, or wait until "
+            "one has ended"
+        )
     kept = sa.select(jobs.c.id).where(own, ~OPEN).order_by(jobs.c.id.desc()).limit(MAX_JOBS)
     connection.execute(sa.delete(jobs).where(own, ~OPEN, jobs.c.id.not_in(kept)))
 

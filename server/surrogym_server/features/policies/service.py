@@ -281,7 +281,7 @@ class PolicyService:
         assert blob is not None
         content = self._blobs.get(blob)
         if hashlib.sha256(content).hexdigest() != digest:
-            raise Damaged(f"{what} has changed since it was stored: its digest differs")
+            raise Damaged(f"{what} has changed since it was stored, as its digest shows: restore a copy of the files")
         return content
 
     def _is_own(self, name: str, environment: str) -> bool:

@@ -285,8 +285,10 @@ def _within(connection: Connection, surrogate: int, version: int, most: int, nam
         for table in OWNED:
             connection.execute(sa.update(table).where(_own(table, surrogate, oldest)).values(blob=None))
     if beyond > 0:
-        kept = f"the files of {name!r}'s policies to take at most {most} bytes"
-        raise TooLarge(f"expected {kept}, got {beyond} more: delete a policy, or remove an alias")
+        raise TooLarge(
+            f"expected the files of {name!r}'s policies to take at most {most} bytes, got {beyond} more: delete a "
+            "policy, or remove an alias"
+        )
     return tuple(freed)
 
 

@@ -33,8 +33,10 @@ class SqlOccupancy(port.Occupancy):
             connection.execute(sa.delete(occupancies).where(*own))
             others = sa.select(sa.func.count()).where(occupancies.c.surrogate_id == surrogate.id)
             if connection.execute(others).scalar_one() >= MAX_CHECKPOINTS:
-                beyond = f"expected at most {MAX_CHECKPOINTS} checkpoints of {name!r}, got one more"
-                raise TooLarge(f"{beyond}: reuse the name of one of them")
+                raise TooLarge(
+                    f"expected at most {MAX_CHECKPOINTS} checkpoints of {name!r}, got one more: reuse the name of "
+                    "one of them"
+                )
             connection.execute(
                 sa.insert(occupancies).values(
                     surrogate_id=surrogate.id,
