@@ -65,10 +65,12 @@ class Door:
         scope[BODY_LIMIT] = limit = most if own is None else min(own, most)
         announced = raw_header(scope, b"content-length")
         if announced.isdigit() and int(announced) > limit:
-            expected = f"expected a body of at most {limit} bytes as {media_type}"
             larger = [name for name, size in self.bodies.items() if size is None and name != media_type]
             instead = f"; send a larger body as {larger[0]}" if larger else ""
-            raise HTTPException(413, f"{expected}, got {announced.decode()} bytes{instead}")
+            raise HTTPException(
+                413,
+                f"expected a body of at most {limit} bytes as {media_type}, got {announced.decode()} bytes{instead}",
+            )
 
     def _media_type(self, scope: Scope) -> str:
         given = raw_header(scope, b"content-type").decode("latin-1").partition(";")[0].strip().lower()

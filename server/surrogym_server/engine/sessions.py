@@ -265,7 +265,7 @@ class LiveSessions:
                 f"expected a session and its reply to take at most {_mebibytes(most)} of memory, got "
                 f"{_mebibytes(nbytes)}: "
                 "open fewer lanes, take fewer steps in one request, or start the server with a larger "
-                "--max-sessions-mib"
+                "SURROGYM_MAX_SESSIONS_MIB"
             )
         if total + nbytes > most:
             raise Overloaded(
@@ -312,9 +312,8 @@ class LiveSessions:
     def _check_deadline(self, deadline: float | None, seconds: float) -> None:
         if deadline is not None and (left := deadline - self.clock()) < seconds:
             raise DeadlineExceeded(
-                f"the request would take {1e3 * seconds:.0f} ms, and {1e3 * max(left, 0):.0f} ms are left of the "
-                "time that it "
-                "allows: nothing was computed; allow more time"
+                f"the request would take {1e3 * seconds:.0f} ms, and {1e3 * max(left, 0):.0f} ms are left until its "
+                "deadline: nothing was computed; allow more time"
             )
 
 

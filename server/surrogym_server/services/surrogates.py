@@ -214,7 +214,7 @@ def check_same(name: str, had: Any, got: Any) -> None:
         where, old, new = difference(had, got)
         raise SpecConflict(
             f"{name!r} exists with another specification: {where} was created as {short(old)}, got "
-            f"{short(new)}; register this one under another name; surrogym change sets that one's budget and target"
+            f"{short(new)}; register the new one under another name, or set budget and target by surrogym change"
         )
 
 

@@ -173,7 +173,7 @@ class RayEngine(SessionEngine):
         host = _number(holder.owner)
         if host == asked:
             raise Unavailable(
-                f"session host {host} has ended, and another one takes session {session!r} in "
+                f"session host {host} has ended, and another one takes over session {session!r} in "
                 f"{holder.seconds_left:.1f} s: try again later"
             )
         return self._remember(session, host)
