@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from surrogym.cli.groups import PolicyReading
-    from surrogym_sampler.original.episodes import Episode
+    from surrogym_sampler.original.episode import Episode
     from surrogym_shared.spec import EnvironmentSpec
     from surrogym_shared.wire import Controller
     from surrogym_trainer.evaluation.evaluator import EvaluationSettings

@@ -16,7 +16,7 @@ from surrogym.cli.options import NAMES, SpecFile
 
 if TYPE_CHECKING:
     from surrogym_client.transport import Api
-    from surrogym_sampler.original.episodes import Episode
+    from surrogym_sampler.original.episode import Episode
     from surrogym_shared.spec import EnvironmentSpec
     from surrogym_trainer.deployment.controller import Choices, Controller
     from surrogym_trainer.deployment.running import Checked, Comparison

@@ -21,7 +21,7 @@ from surrogym.cli.pushing import push_or_say
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from surrogym_sampler.original.episodes import Episode
+    from surrogym_sampler.original.episode import Episode
     from surrogym_shared.spec import EnvironmentSpec
     from surrogym_shared.terminal import Update
     from surrogym_shared.wire import Controller
@@ -181,7 +181,8 @@ def command(
     summary |= {"promise_kept": None if elsewhere else _kept(expected, result)}
     summary |= {"version": version, "disagreements": found and found.as_json()}
     summary |= {} if filmed is None else {"video": str(filmed)}
-    more = [*elsewhere, *(found.in_words(card.spec) if found else [])]
+    more = [] if result.limits is None else [result.limits.words()]
+    more += [*elsewhere, *(found.in_words(card.spec) if found else [])]
     more += [*_why_not_judged(card, settings, result), *_unseeded(reports), *_repeated(result)]
     give(summary, lambda: "\n".join([_words(reports, None if elsewhere else promise), *more]), as_json=output.as_json)
     if steps is not None:

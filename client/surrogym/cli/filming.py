@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from surrogym_sampler.original.episodes import Episode
+    from surrogym_sampler.original.episode import Episode
     from surrogym_shared.spec import EnvironmentSpec
     from surrogym_trainer.evaluation.evaluator import Evaluation, EvaluationSettings
     from surrogym_trainer.policies.card import PolicyCard

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from surrogym_client.transport.api import Api
-    from surrogym_sampler.original.episodes import Episode
+    from surrogym_sampler.original.episode import Episode
     from surrogym_shared.spec import EnvironmentSpec
     from surrogym_shared.wire import AddedSamples, NewSample
     from surrogym_trainer.evaluation.evaluator import Evaluation

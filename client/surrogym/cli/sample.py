@@ -141,13 +141,13 @@ def command(
 
 def _sample_here(api: Api, plan: SamplerPlan, output: Output) -> None:
     from surrogym_client.runtime.lifetime import terminations
-    from surrogym_sampler.original.loading import isolated
+    from surrogym_sampler.original.loading import for_queries
     from surrogym_sampler.queries.on_ray import Line, line_of
     from surrogym_sampler.queries.worker import Sampler
     from surrogym_shared.terminal import on_interrupt, say
 
     with (
-        closing(isolated(plan.environment, plan.step_limit, plan.spec)) as environment,
+        closing(for_queries(plan.environment, plan.step_limit, plan.spec)) as environment,
         _telling(api, plan.surrogate, quiet=output.quiet) as tell,
     ):
 

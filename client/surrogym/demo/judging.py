@@ -11,7 +11,8 @@ from pathlib import Path
 from surrogym.demo.settings import DemoSettings
 from surrogym.demo.tasks import Outcome
 from surrogym_sampler.original import make
-from surrogym_sampler.original.episodes import Episode, open_episode
+from surrogym_sampler.original.episode import Episode
+from surrogym_sampler.original.episodes import open_episode
 from surrogym_shared.terminal import progress
 from surrogym_shared.wire import Controller
 from surrogym_shared.words import counted

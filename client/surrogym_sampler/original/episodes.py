@@ -5,12 +5,11 @@ Shapes: C coordinates, D observation entries, F action entries.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from surrogym_sampler.original.episode import Episode, Moment
 from surrogym_sampler.original.errors import NotPerturbable, NotSettable, StepFailed
 from surrogym_sampler.original.gymnasium import native_action, opens_task, shows_the_same, task_for, wrapped
 from surrogym_sampler.original.protocol import (
@@ -25,55 +24,6 @@ from surrogym_sampler.original.protocol import (
 from surrogym_sampler.original.rollouts import answering
 from surrogym_sampler.original.simulator import Simulated, random_factor
 from surrogym_shared.spec import EnvironmentSpec, Fixed, Normal, Uniform, limits
-from surrogym_shared.terms import observe
-
-
-@dataclass(frozen=True)
-class Moment:
-    """The result of a reset or of one step of an episode."""
-
-    observation: Array  # (D,) entries that a policy observes
-    reward: float
-    terminated: bool
-    coordinates: Array  # (C,) state after the step
-    truncated: bool = False  # whether the environment itself ended the episode without termination
-
-
-class Episode(ABC):
-    """The running episode of one instance of an environment.
-
-    To begin the next episode, call ``perturb`` if needed, then ``reset`` or ``place``, then ``step``.
-    """
-
-    parallel = False  # whether several instances may be open at once
-
-    def __init__(self, spec: EnvironmentSpec) -> None:
-        self.spec = spec
-
-    @abstractmethod
-    def reset(self, seed: int) -> Moment:
-        """Begin an episode by the environment's own reset, with a seed."""
-
-    @abstractmethod
-    def place(self, coordinates: Array) -> Moment:
-        """Begin an episode at coordinates (C,)."""
-
-    @abstractmethod
-    def step(self, action: Array) -> Moment:
-        """Apply an action (F,), and return the result."""
-
-    @abstractmethod
-    def perturb(self, rng: np.random.Generator, sigma: float) -> None:
-        """Multiply the physical attributes by normal factors with mean 1 and standard deviation ``sigma``."""
-
-    @abstractmethod
-    def close(self) -> None:
-        """Close the environment and release its resources."""
-
-    def _shown(self, coordinates: Array) -> Array:
-        """Return the declared observation (D,) of coordinates (C,)."""
-        shown: Array = observe(self.spec, coordinates[None])[0]
-        return shown
 
 
 class GymnasiumEpisode(Episode):
@@ -248,13 +198,22 @@ class SteppedEpisode(OwnEpisode):
 
 
 def open_episode(name: str, spec: EnvironmentSpec | None, factory: Factory) -> Episode:
-    """Open an episode of an environment.
+    """Open an episode of an environment, in which the limits of its specification are kept.
 
     Args:
         name: the environment's name.
         spec: a specification that replaces the environment's own; None keeps that.
         factory: makes the environment, unless the name is that of a built-in Gymnasium task.
     """
+    episode = _open(name, spec, factory)
+    if episode.spec.limits is None:
+        return episode
+    from surrogym_sampler.original.limits import GuardedEpisode
+
+    return GuardedEpisode(episode)
+
+
+def _open(name: str, spec: EnvironmentSpec | None, factory: Factory) -> Episode:
     if opens_task(name, spec):
         return GymnasiumEpisode(spec or factory().spec())
     made = factory()

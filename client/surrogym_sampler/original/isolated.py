@@ -25,7 +25,7 @@ from surrogym_sampler.original.errors import (
     sentence,
 )
 from surrogym_sampler.original.protocol import Array, Environment, Factory, RealStep
-from surrogym_sampler.original.rollouts import answering
+from surrogym_sampler.original.rollouts import answering, keeping_limits
 from surrogym_shared.spec import EnvironmentSpec
 
 START_LIMIT = 120.0  # seconds until the environment must be made; importing a simulator may take long
@@ -214,7 +214,7 @@ def _serve(pipe: Connection, factory: Factory, step_limit: float) -> None:
     working = _Ending()
     with working:
         try:
-            environment = answering(factory())
+            environment = keeping_limits(answering(factory()))
         except RAISED as error:
             pipe.send((False, sentence(error)))
             return

@@ -21,7 +21,7 @@ from surrogym_sampler.original.isolated import IsolatedEnvironment
 from surrogym_sampler.original.mujoco_tasks import SPECIFICATIONS
 from surrogym_sampler.original.periods import period_of, require_period
 from surrogym_sampler.original.protocol import LONGEST_EPISODE, Environment
-from surrogym_sampler.original.rollouts import answering
+from surrogym_sampler.original.rollouts import answering, keeping_limits
 from surrogym_sampler.original.simulator import Simulated
 from surrogym_shared.environments import is_name, is_same
 from surrogym_shared.presets import PresetName
@@ -98,6 +98,12 @@ def isolated(
         assert isinstance(made, Simulated)
         return made
     return IsolatedEnvironment(partial(make, name, spec=spec), step_limit)
+
+
+def for_queries(name: str, step_limit: float, spec: EnvironmentSpec | None = None) -> Environment:
+    """Build an original environment as ``isolated`` does, which also keeps the limits of its specification."""
+    made = isolated(name, step_limit, spec)
+    return made if isinstance(made, IsolatedEnvironment) else keeping_limits(made)  # the former keeps them by itself
 
 
 def is_own(name: str) -> bool:

@@ -8,7 +8,8 @@ from itertools import count
 import numpy as np
 
 from surrogym_sampler.original.actions import decode_actions
-from surrogym_sampler.original.episodes import Episode, Moment, draw
+from surrogym_sampler.original.episode import Episode, Moment
+from surrogym_sampler.original.episodes import draw
 from surrogym_sampler.original.errors import NotParallel
 from surrogym_sampler.original.protocol import LONGEST_EPISODE, Array
 from surrogym_shared.port import Bools, Floats, Ints, ResetResult, StepResult

@@ -9,7 +9,8 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from surrogym_client.environments.pictures import NotRenderable, Picture, Renderer, drawn_with, is_drawn_by_gymnasium
+from surrogym_client.environments.pictures import NotRenderable, Picture, Renderer
+from surrogym_client.environments.render_modes import drawn_with, is_drawn_by_gymnasium
 from surrogym_sampler.original.adapters.gymnasium_ids import settable
 from surrogym_sampler.original.classic import TASKS
 from surrogym_sampler.original.executables import is_executable

@@ -177,6 +177,15 @@ def answering(environment: object) -> Environment:
     return environment
 
 
+def keeping_limits(environment: Environment) -> Environment:
+    """Return an environment that keeps the limits of its specification, or the same one if it has none."""
+    if environment.spec().limits is None:
+        return environment
+    from surrogym_sampler.original.limits import guarded
+
+    return guarded(environment)
+
+
 def _missing(environment: object) -> str:
     """Return the names of the methods that an object lacks to be an environment of either kind. The kind of which
     fewest methods are missing is taken; of two such kinds, the one with more methods."""

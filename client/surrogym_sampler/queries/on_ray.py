@@ -15,7 +15,7 @@ from uuid import uuid4
 from surrogym_client.errors import SurrogymClientError
 from surrogym_client.transport.api import Api
 from surrogym_sampler.original.errors import OriginalError
-from surrogym_sampler.original.loading import isolated
+from surrogym_sampler.original.loading import for_queries
 from surrogym_sampler.queries.settings import Outcome, SamplerReport, SamplerSettings
 from surrogym_sampler.queries.worker import Sampler
 from surrogym_shared.spec import EnvironmentSpec
@@ -116,7 +116,7 @@ class SamplerActor:
         try:
             with (
                 Api(plan.url, plan.token) as api,
-                closing(isolated(plan.environment, plan.step_limit, plan.spec)) as environment,
+                closing(for_queries(plan.environment, plan.step_limit, plan.spec)) as environment,
             ):
                 self._sampler = Sampler(api, plan.surrogate, environment, plan.settings, self._note)
                 if self._stopped:

@@ -35,6 +35,11 @@ def check_environment(surrogate: str, asked: EnvironmentSpec, own: EnvironmentSp
             f"the environment does not fit surrogate {surrogate!r}: expected a step every {asked.sampling_period:g} s "
             f"(sampling_period), got {own.sampling_period:g} s; register it anew"
         )
+    if asked.limits is not None and asked.limits != own.limits:
+        raise UnknownEnvironment(
+            f"the environment does not fit surrogate {surrogate!r}: expected a specification with the surrogate's "
+            "limits, which the sampler keeps at the machine, got other limits or none; declare them in both"
+        )
     _check_ranges("actions", action_ranges(asked), action_ranges(own))
     _check_ranges("coordinates", [sampled(c.sampling) for c in asked.coordinates], _coordinate_ranges(own))
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from surrogym_sampler.original.actions import decode_actions
-from surrogym_sampler.original.episodes import Episode, Moment
+from surrogym_sampler.original.episode import Episode, Moment
 from surrogym_sampler.original.protocol import LONGEST_EPISODE
 from surrogym_trainer.deployment.controller import Array, Controller
 from surrogym_trainer.policies.predict import Predict

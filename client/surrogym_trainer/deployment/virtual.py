@@ -12,7 +12,7 @@ from surrogym_client.environments.lanes import Lanes, session_request
 from surrogym_client.errors import SurrogymClientError
 from surrogym_client.transport import Api
 from surrogym_client.transport.http_surrogate import HttpSurrogate
-from surrogym_sampler.original.episodes import Episode, Moment
+from surrogym_sampler.original.episode import Episode, Moment
 from surrogym_sampler.original.errors import NotPerturbable, NotSettable
 from surrogym_sampler.original.protocol import Array
 from surrogym_shared.network import bounds_of, counts_of

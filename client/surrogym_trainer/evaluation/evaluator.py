@@ -12,13 +12,15 @@ from numpy.typing import NDArray
 
 from surrogym_client.runtime.lifetime import signals_between_steps
 from surrogym_sampler.original.actions import decode_actions, explored
-from surrogym_sampler.original.episodes import Episode, Moment, draw
+from surrogym_sampler.original.episode import Episode, Moment
+from surrogym_sampler.original.episodes import draw
 from surrogym_sampler.original.errors import RAISED, EvaluationFailed, PolicyMisfit
 from surrogym_sampler.original.fitting import check_policy
 from surrogym_sampler.original.protocol import LONGEST_EPISODE
 from surrogym_shared.spec import Coordinate, EnvironmentSpec, Success, limits
 from surrogym_shared.terms import holds
 from surrogym_shared.wire import TraceRank
+from surrogym_trainer.evaluation.limits import LimitsKept, limits_kept
 from surrogym_trainer.policies.predict import Acting, PerEpisode
 
 Array = NDArray[np.float64]
@@ -92,6 +94,7 @@ class Evaluation:
     varied: tuple[str, ...] = ()  # names of constants of the specification that changed within an episode
     limit: int | None = None  # largest number of steps in an episode, by the specification or by the environment itself
     seeded: bool = True  # whether a second reset with the first seed began in the same state
+    limits: LimitsKept | None = None  # how the specification's limits were kept; None if it has none
 
     @property
     def trace(self) -> Trace:
@@ -134,6 +137,7 @@ class Evaluation:
             "equal": self.equal,
             "limit": self.limit,
             "seeded": self.seeded,
+            **({} if self.limits is None else {"limits": self.limits.summary()}),
             "per_episode": [float(r) for r in self.returns],
         }
 
@@ -240,6 +244,7 @@ class _Tally:
     total: float = 0.0
     length: int = 0
     held: int = 0  # number of last steps in a row that met the success criterion
+    fallbacks: int = 0  # number of steps in which the fallback acted in the place of the policy
     limit: int = field(init=False)
     path: list[Array] = field(default_factory=list)
     actions: list[Array] = field(default_factory=list)
@@ -266,7 +271,8 @@ class _Tally:
         self.length += 1
         self.held = self.held + 1 if _holds(self.episode.spec, moment.coordinates) else 0
         self.path.append(moment.coordinates)
-        self.actions.append(action)
+        self.fallbacks += moment.fallback is not None
+        self.actions.append(action if moment.fallback is None else moment.fallback)
         self.rewards.append(moment.reward)
 
 
@@ -390,7 +396,8 @@ def _limit(tallies: Sequence[_Tally]) -> int | None:
 
 def _account(tallies: Sequence[_Tally]) -> Evaluation:
     spec = tallies[0].episode.spec
-    criterion = spec.success
+    criterion, paths = spec.success, [np.stack(tally.path) for tally in tallies]
+    fallbacks = sum(tally.fallbacks for tally in tallies)
     return Evaluation(
         returns=np.array([t.total for t in tallies]),
         lengths=np.array([t.length for t in tallies], dtype=np.int64),
@@ -398,6 +405,7 @@ def _account(tallies: Sequence[_Tally]) -> Evaluation:
         traces=tuple(tally.trace for tally in tallies),
         varied=_varied(spec, tallies),
         limit=_limit(tallies),
+        limits=None if spec.limits is None else limits_kept(spec, paths, fallbacks),
     )
 
 

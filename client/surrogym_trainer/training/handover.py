@@ -209,6 +209,8 @@ def judge_episodes(subject: Subject, result: Evaluation) -> Handover:
     beside = compared(api, spec, view, steps, UNNOTICED * earned(before, subject.floor) / float(result.lengths.mean()))
     found = _consequence(subject, beside, before, view, Inputs.over(spec, q, u))
     audit = missed(judge(beside, before, before, subject.floor, found), result.returns, subject.floor)
+    if result.limits is not None and result.limits.broken:
+        audit = audit.model_copy(update={"passed": False, "faults": (result.limits.words(), *audit.faults)})
     about = {"steps": result.steps, "episodes": len(result.returns), "range_left": range_left(spec, q)}
     audit = audit.model_copy(update=about)
     trusted, reason = _verdict(audit, subject.floor)

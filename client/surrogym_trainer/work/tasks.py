@@ -10,7 +10,7 @@ from uuid import uuid4
 from surrogym_client.environments.pictures import NotRenderable
 from surrogym_client.transport import HttpSurrogate
 from surrogym_client.transport.api import Api
-from surrogym_sampler.original.episodes import Episode
+from surrogym_sampler.original.episode import Episode
 from surrogym_sampler.original.errors import EvaluationFailed
 from surrogym_shared import wire
 from surrogym_shared.spec import EnvironmentSpec

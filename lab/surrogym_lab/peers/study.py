@@ -17,7 +17,8 @@ from surrogym_lab.peers.port import BudgetSpent, Clock, NotApplicable, OutOfTime
 from surrogym_lab.peers.registry import METHODS, task_of
 from surrogym_lab.reproduce.rows import read_records, write_records
 from surrogym_sampler.original import make
-from surrogym_sampler.original.episodes import Episode, open_episode
+from surrogym_sampler.original.episode import Episode
+from surrogym_sampler.original.episodes import open_episode
 from surrogym_trainer.evaluation.evaluator import Evaluation, EvaluationSettings, evaluate
 from surrogym_trainer.policies.predict import Acting
 

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from surrogym_client.transport.api import Api
 from surrogym_lab.reproduce.paper_cases import ANYWHERE, Variation
 from surrogym_sampler.original import OriginalEnvironment, make
-from surrogym_sampler.original.episodes import GymnasiumEpisode, Moment, draw
+from surrogym_sampler.original.episode import Moment
+from surrogym_sampler.original.episodes import GymnasiumEpisode, draw
 from surrogym_sampler.original.protocol import RealStep
 from surrogym_sampler.original.simulator import SMALLEST_FACTOR
 from surrogym_shared.spec import BoxAction, DiscreteAction, EnvironmentSpec

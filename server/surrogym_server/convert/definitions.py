@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from surrogym_server.environment import conditions, declared_reward, distributions, terms
+from surrogym_server.environment import conditions, declared_reward, distributions, safety, terms
 from surrogym_server.environment import definition as core
 from surrogym_server.environment.observation_inverse import ObservationInverse
 from surrogym_server.errors import InvalidSpec
@@ -57,6 +57,7 @@ def stored_definition(spec: wire.EnvironmentSpec) -> core.EnvironmentDefinition:
         snapshots=spec.snapshots,
         starts=spec.starts,
         outside_reward=spec.outside_reward,
+        limits=None if spec.limits is None else _limits(spec.limits, names),
     )
     if definition.moves_observation:
         ObservationInverse.of(definition)
@@ -188,6 +189,14 @@ def _quantity(quantity: wire.Quantity, spec: wire.EnvironmentSpec) -> declared_r
 
 def _inequality(inequality: wire.Inequality, names: tuple[str, ...]) -> conditions.InequalityDefinition:
     return conditions.InequalityDefinition(_term(inequality.term, names), inequality.relation, inequality.value)
+
+
+def _limits(limits: wire.Limits, names: tuple[str, ...]) -> safety.LimitsDefinition:
+    keep = (
+        safety.LimitDefinition(_term(x.term, names), _or(x.low, -math.inf), _or(x.high, math.inf), x.margin)
+        for x in limits.keep
+    )
+    return safety.LimitsDefinition(tuple(keep), limits.probability)
 
 
 def _action(action: wire.BoxAction | wire.DiscreteAction | wire.MultiDiscreteAction) -> core.ActionDefinition:

@@ -22,6 +22,7 @@ from torch import Tensor
 from surrogym_server.environment.conditions import Conditions, InequalityDefinition
 from surrogym_server.environment.declared_reward import DeclaredRewardDefinition
 from surrogym_server.environment.distributions import Distribution
+from surrogym_server.environment.safety import Limits, LimitsDefinition
 from surrogym_server.environment.terms import TermDefinition, TermSet, compile_terms
 from surrogym_server.plugins import Choice
 from surrogym_server.tensors import CPU, cached, to_device
@@ -162,6 +163,7 @@ class EnvironmentDefinition:
     snapshots: bool = False  # whether such a query may begin at a saved state
     starts: tuple[tuple[float, ...], ...] = ()  # states at which episodes start; if empty, by their distributions
     outside_reward: float | None = None  # for each step that an episode misses after it left the sampling range
+    limits: LimitsDefinition | None = None  # limits that the original environment keeps
     device: torch.device = CPU  # device of its tensors, and of the states and actions that it is given
 
     def on(self, device: torch.device) -> EnvironmentDefinition:
@@ -302,6 +304,21 @@ class EnvironmentDefinition:
         if not self.termination_groups:
             return torch.zeros(q.shape[:-1], dtype=torch.bool, device=q.device)
         return self._termination(q).any(-1)
+
+    def falls_back(self, q: Tensor, q_next: Tensor) -> Tensor:
+        """Whether the fallback of the limits acts at q_next (..., C), which followed q (..., C): (...) bool."""
+        if self.limits is None:
+            return torch.zeros(q_next.shape[:-1], dtype=torch.bool, device=q_next.device)
+        return self._limits.falls_back(q, q_next)
+
+    def room(self, q: Tensor) -> Tensor:
+        """Distance from states q (..., C) to the nearer end of each limit, (..., L); negative beyond it."""
+        return self._limits.room(q)
+
+    @cached
+    def _limits(self) -> Limits:
+        assert self.limits is not None
+        return Limits.of(self.limits, len(self.coordinates), self.device)
 
     @cached
     def _termination(self) -> Conditions:

@@ -36,9 +36,11 @@ def candidates_of(model: DynamicsModel, points: Points, states: Tensor | None, r
 
     Few points of a set over the whole range lie where a policy goes, so visited states are added. The reference points
     are those of the Monte Carlo set, mixed with visited states if there are any. Visited states outside the sampling
-    range are left out: with a wrong model a policy can reach states to which the real system must not be set.
+    range, or within the margin of a limit, are left out: with a wrong model a policy can reach states to which the real
+    system must not be set.
     """
-    states = None if states is None else states[model.definition.in_range(states)]
+    definition = model.definition
+    states = None if states is None else states[definition.in_range(states) & ~definition.falls_back(states, states)]
     points = points[:MAX_CANDIDATES]
     reference, weights = points[:REFERENCE], points.q.new_ones(min(len(points), REFERENCE))
     if states is not None and len(states) and model.definition.design.visited_candidates:

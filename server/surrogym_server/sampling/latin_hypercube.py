@@ -38,14 +38,15 @@ def random_points(definition: EnvironmentDefinition, count: int, rng: np.random.
 def going_on(
     definition: EnvironmentDefinition, q: Tensor, u: Tensor, rng: np.random.Generator
 ) -> tuple[Tensor, Tensor]:
-    """Replace those of the points q (n, C), u (n, F) at which the declared termination holds by random other points.
+    """Replace those of the points q (n, C), u (n, F) at which the declared termination holds, or that lie within the
+    margin of a limit, by random other points.
 
-    No episode passes through a terminated state, so a query there would teach nothing. If the termination holds in the
-    whole range, the points stay.
+    No episode passes through a terminated state, so a query there would teach nothing, and the sampler refuses one
+    within a margin. If there is no other point in the whole range, the points stay.
     """
     q, u = q.clone(), u.clone()
     for _ in range(REDRAWS):
-        over = definition.terminated(q)
+        over = definition.terminated(q) | definition.falls_back(q, q)
         if not bool(over.any()):
             break
         q[over], u[over] = random_points(definition, int(over.sum()), rng)

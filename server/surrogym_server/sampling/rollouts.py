@@ -61,7 +61,7 @@ class Paths:
     q: Tensor  # (b, T, C) states before each step
     u: Tensor  # (b, T, F) actions
     q_next: Tensor  # (b, T, C) states after each step
-    running: Tensor  # (b, T) 1 for steps of a running episode, 0 after its end
+    running: Tensor  # (b, T) 1 for steps of a running episode, 0 after its end or after a limit was approached
     ended: Tensor  # (b, T) 1 from the step that ends the episode, 0 before
     drift: Tensor  # (b, T) predictive variance summed over the steps before, in variances of the sampling range
 
@@ -190,17 +190,39 @@ def random_sequences(definition: EnvironmentDefinition, count: int, length: int,
 
 def predict_paths(model: DynamicsModel, starts: Tensor, actions: Tensor) -> Paths:
     """Predict the path of the mean state from each start (b, C) under action sequences (b, T, F)."""
-    spread = [scaling(c.sampling)[1] for c in (model.definition.coordinates[i] for i in model.definition.moving)]
-    q, running, drift = starts, starts.new_ones(len(starts)), starts.new_zeros(len(starts))
+    definition = model.definition
+    spread = starts.new_tensor([scaling(definition.coordinates[i].sampling)[1] for i in definition.moving])
+    q, running, going = starts, starts.new_ones(len(starts)), starts.new_ones(len(starts))
+    drift, variance = starts.new_zeros(len(starts)), starts.new_zeros(len(starts), len(spread))
     steps: list[tuple[Tensor, ...]] = []
     for u in actions.unbind(1):
         step = model.transition(q, u, stds=True)
         assert step.std is not None
-        still = running * ~model.terminated(step.q_next)
-        steps.append((q, u, step.q_next, running, 1 - still, drift))
-        drift = drift + (step.std / starts.new_tensor(spread)).square().sum(-1)
-        q, running = step.q_next, still
+        going = going * ~model.terminated(step.q_next)
+        steps.append((q, u, step.q_next, running, 1 - going, drift))
+        drift, variance = drift + (step.std / spread).square().sum(-1), variance + step.std.square()
+        running = running * going * ~_may_leave_limits(definition, q, step.q_next, variance)
+        q = step.q_next
     return Paths(*(torch.stack(column, 1) for column in zip(*steps, strict=True)))
+
+
+def _may_leave_limits(definition: EnvironmentDefinition, q: Tensor, q_next: Tensor, variance: Tensor) -> Tensor:
+    """Whether (b,) paths that step from q (b, C) to q_next (b, C) approach a limit: the fallback would act, or the
+    limit may be left with more than the allowed probability.
+
+    ``variance`` (b, M) of the moving coordinates is that accumulated along the path.
+    """
+    if definition.limits is None or definition.moves_observation:
+        return definition.falls_back(q, q_next)
+    squares = q.new_zeros(())
+    for column, index in enumerate(definition.moving):
+        shift = torch.zeros_like(q_next)
+        shift[:, index] = variance[:, column].sqrt()
+        squares = squares + (definition.room(q_next + shift) - definition.room(q_next - shift)).square() / 4
+    sure = torch.special.ndtri(q.new_tensor(1 - definition.limits.probability))
+    unsafe = (definition.room(q_next) < sure * squares.sqrt()).any(-1)
+    approached: Tensor = unsafe | definition.falls_back(q, q_next)
+    return approached
 
 
 def path_values(model: DynamicsModel, aim: Aim, paths: Paths) -> Tensor:

@@ -152,7 +152,7 @@ def step(
         moved = with_residual(model, settings.residual, active, action, moved)
     moved = _doubted(model, settings, moved)
     untrusted = _untrusted(model, settings, moved)
-    left = _left(definition, moved, untrusted)
+    left = _left(definition, active.q, moved, untrusted)
     if left is not None:
         moved = _paid_outside(definition, settings, active, moved, left)
     active, cut = _advanced(settings, active, moved, untrusted)
@@ -270,13 +270,24 @@ def _untrusted(model: DynamicsModel, settings: VirtualSettings, moved: Moved) ->
     return (moved.std > settings.trust * model.scales).any(1)
 
 
-def _left(definition: EnvironmentDefinition, moved: Moved, untrusted: Tensor | None) -> Tensor | None:
-    """Return which lanes (N,) end because they left the sampling range or the trusted range; None if that does not end
-    an episode."""
-    if definition.outside_reward is None:
+def _left(definition: EnvironmentDefinition, q: Tensor, moved: Moved, untrusted: Tensor | None) -> Tensor | None:
+    """Return which lanes (N,), moved from q (N, C), end because they left the sampling range or the trusted range, or
+    because the fallback of the limits would act; None if none of these ends an episode."""
+    if definition.outside_reward is None and definition.limits is None:
         return None
-    left = ~definition.in_range(moved.q)
-    return (left if untrusted is None else left | untrusted) & ~moved.terminated
+    left = definition.falls_back(q, moved.q)
+    if definition.outside_reward is not None:
+        left = left | ~definition.in_range(moved.q)
+        left = left if untrusted is None else left | untrusted
+    return left & ~moved.terminated
+
+
+def paid_outside(definition: EnvironmentDefinition, settings: VirtualSettings) -> float:
+    """Return the reward of each step that an episode misses after it left: the declared outside reward, or else the
+    least that a virtual step can pay."""
+    if definition.outside_reward is not None:
+        return definition.outside_reward
+    return 0.0 if settings.reward_limits is None else settings.reward_limits[0]
 
 
 def _paid_outside(
@@ -289,7 +300,7 @@ def _paid_outside(
     lacking = torch.ones_like(moved.reward)
     if settings.time_limit is not None:
         lacking = (settings.time_limit - before.elapsed).clamp(min=1).to(moved.reward.dtype)
-    lost = (definition.outside_reward or 0.0) * lacking
+    lost = paid_outside(definition, settings) * lacking
     mean = torch.where(left, lost, moved.reward_mean)
     reward = mean if moved.reward is moved.reward_mean else torch.where(left, lost, moved.reward)
     return replace(moved, reward_mean=mean, reward=reward, terminated=moved.terminated | left)

@@ -15,6 +15,7 @@ from surrogym_shared.spec.base import MAX_DIMENSIONS, MAX_ROLLOUT_QUERY
 from surrogym_shared.spec.coordinates import Bounds, Coordinate, Fixed, Lag, Normal, Uniform, limits
 from surrogym_shared.spec.environment import Access, AcquisitionChoice, Choice, Design, EnvironmentSpec, ModelChoice
 from surrogym_shared.spec.rewards import DeclaredReward, Quantity, Reward, RewardTerm, Success
+from surrogym_shared.spec.safety import Limit, Limits
 from surrogym_shared.spec.terms import AllOf, Inequality, ObservationEntry, Part, Term
 
 if TYPE_CHECKING:
@@ -37,6 +38,8 @@ __all__ = [
     "Fixed",
     "Inequality",
     "Lag",
+    "Limit",
+    "Limits",
     "ModelChoice",
     "MultiDiscreteAction",
     "Normal",

@@ -15,6 +15,7 @@ from surrogym_shared.spec.actions import Action
 from surrogym_shared.spec.base import MAX_DIMENSIONS, MAX_ROLLOUT_QUERY, MAX_STARTS, REWARD, Frozen, Name
 from surrogym_shared.spec.coordinates import Coordinate, StartDistribution, limits
 from surrogym_shared.spec.rewards import AnyReward, DeclaredReward, Reward, Success
+from surrogym_shared.spec.safety import Limits
 from surrogym_shared.spec.terms import AllOf, ObservationEntry, Term, Termination
 
 Access = Literal["any", "snapshot", "reset"]
@@ -111,6 +112,9 @@ class EnvironmentSpec(Frozen):
         default=None,
         description="ends a virtual episode that leaves the sampling ranges, or what a session trusts, and pays this "
         "for each step up to the time limit that it lacks then; None: it goes on",
+    )
+    limits: Limits | None = Field(
+        default=None, description="what the machine must keep at every step, and how it falls back"
     )
     query: Literal["step", "rollout"] = Field(
         default="step",
@@ -224,6 +228,10 @@ class EnvironmentSpec(Frozen):
                 self.design.initial <= self.design.budget,
                 f"design: initial {self.design.initial} exceeds the budget {self.design.budget}",
             )
+        if self.limits is not None:
+            from surrogym_shared.limits import check_limits
+
+            check_limits(self)
         return self
 
     def _require_lags(self) -> None:

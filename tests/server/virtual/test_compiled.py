@@ -21,7 +21,7 @@ from surrogym_server.models.gaussian_process.model import GaussianProcessModel
 from surrogym_server.testing.cases import model_cases
 from surrogym_server.virtual import LaneState, LaneTransition, VirtualSettings, create, in_fastest_form, reset, step
 from surrogym_shared import compiled
-from surrogym_shared.spec import EnvironmentSpec
+from surrogym_shared.spec import EnvironmentSpec, Limit, Limits, Term
 
 needs_numba = pytest.mark.skipif(not compiled.available(), reason="numba is not installed, or switched off")
 LANES, STEPS = 7, 5
@@ -183,3 +183,26 @@ def test_compiled_steps_agree_with_torch_when_the_sampling_range_is_left(choice,
         require_agreement(made, step(model, replace(settings, compiled=False), lanes, u, stds=True))
         left, lanes = left + int(made[1].left.sum()), made[0]
     assert left >= 4
+
+
+@needs_numba
+@pytest.mark.parametrize("choice", ["mean", "penalty, same step", "drawn functions", "noise, trust, box"])
+def test_a_lane_that_approaches_a_limit_ends_alike_in_compiled_steps_and_in_torch(choice):
+    """It ends before the limit, where the fallback would act, and pays for the steps that it lacks."""
+    limit = Limit(name="speed", term=Term.linear(speed=1.0), low=-4.0, high=4.0, margin=0.5)
+    limits = Limits(keep=(limit,), fallback=(Term.constant(0.0),)).model_dump()
+    narrow = {name: {"kind": "uniform", "low": -0.1, "high": 0.1} for name in ("theta", "speed")}
+    spec = EnvironmentSpec.model_validate({**pendulum().model_dump(), "start": narrow, "limits": limits})
+    model = gaussian_processes(definition_from_spec(spec), random_steps(spec, 20, seed=0))
+    chosen = CHOICES[choice] | {"time_limit": 10, "autoreset_mode": "same_step", "reward_limits": (-17.0, 1.0)}
+    settings, u = compiled_settings(model, **chosen), np.zeros((LANES, 1))
+    lanes, _ = reset(model.definition, settings, create(model.definition, settings, 0))
+    fast = torch.tensor([[2.0, 3.3], [0.0, 0.0]], dtype=torch.float64).repeat(LANES, 1)[:LANES]
+    lanes = replace(lanes, q=fast)
+    made = step(model, settings, lanes, u, stds=True)
+    require_agreement(made, step(model, replace(settings, compiled=False), lanes, u, stds=True))
+    left = made[1].left
+    assert left is not None
+    assert left.tolist() == [lane % 2 == 0 for lane in range(LANES)]
+    assert made[1].terminated[left].all()
+    assert made[1].reward_mean[left].tolist() == [-170.0] * int(left.sum())

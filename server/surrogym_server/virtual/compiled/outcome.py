@@ -78,6 +78,7 @@ def _is_outside(q: Floats, inside: Floats) -> bool:
     types.float64[::1],
     types.float64[:, ::1],
     types.boolean[::1],
+    types.boolean[::1],
     types.float64[::1],
     types.float64,
     types.float64,
@@ -98,6 +99,7 @@ def conclude(
     pay: Floats,
     std: Floats,
     over: Bools,
+    fallen: Bools,
     scales: Floats,
     terminal_reward: float,
     penalty: float,
@@ -115,14 +117,14 @@ def conclude(
     """Complete the step of the moving lanes, given by the mask ``moving`` (N,). Change arrays in place.
 
     Args:
-        moving: lanes that move; row k of q_next, pay, std and over belongs to the k-th of these.
+        moving: lanes that move; row k of q_next, pay, std, over and fallen belongs to the k-th of these.
         q_next, pay, std, over: predicted coordinates, rewards, standard deviations and terminations of these lanes.
+        fallen: which of these lanes end because the fallback of the limits would act; (0,) if there are no limits.
         scales: (O,) standard deviation of each output over the samples.
         terminal_reward: reward that terminating steps pay in addition.
         penalty, trust, caution, time_limit: as in ``VirtualSettings``; trust is infinite and time_limit -1 for None.
-        inside: ends of the sampling range, (2, C). A lane outside of it has left. Not read if the next one is NaN.
-        outside_reward: what a lane that has left, or is untrusted, gets for this step and each missing one; NaN if such
-            a lane does not end.
+        inside: ends of the sampling range, (2, C). A lane outside of it has left. (0, 0) if such a lane does not end.
+        outside_reward: what a lane that has left, is untrusted or has fallen gets for this step and each missing one.
         q, elapsed, phase: state of all lanes, updated.
         rewards: (2, N) penalised rewards and mean rewards, written.
         ends: (5, N) terminated, truncated, untrusted, terminated or truncated, left; written.
@@ -139,7 +141,8 @@ def conclude(
             continue
         mean = pay[row] + terminal_reward if over[row] else pay[row]
         doubtful = trust < np.inf and _exceeds(std[row], trust, scales)
-        left = not (np.isnan(outside_reward) or over[row]) and (doubtful or _is_outside(q_next[row], inside))
+        left = len(inside) > 0 and (doubtful or _is_outside(q_next[row], inside))
+        left = not over[row] and (left or (len(fallen) > 0 and fallen[row]))
         rewards[1, n] = mean
         rewards[0, n] = _penalised(mean, std[row], penalty, caution, scales)
         if left:

@@ -19,7 +19,7 @@ from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.models.abilities import ArraySteps, ArrayTransition
 from surrogym_server.models.port import DynamicsModel
 from surrogym_server.virtual.compiled.outcome import conclude, observe
-from surrogym_server.virtual.environment import LaneTransition, VirtualSettings, chosen_lanes, divided
+from surrogym_server.virtual.environment import LaneTransition, VirtualSettings, chosen_lanes, divided, paid_outside
 from surrogym_server.virtual.lanes import EVERY, RUNNING, Chosen, LaneState
 from surrogym_server.virtual.noise import Purpose, normal_noise
 from surrogym_server.virtual.paths import with_paths
@@ -34,6 +34,7 @@ Ints = NDArray[np.int64]
 MODELS = 64  # number of models whose observation tables are cached
 ANYWHERE = np.zeros((0, 0))  # passed as the ends of the sampling range where these are not needed
 NO_LANES = np.zeros(0, dtype=np.int64)
+NO_FALLBACK = np.zeros(0, dtype=np.bool_)
 
 
 @dataclass(frozen=True)
@@ -73,7 +74,7 @@ def compiled_step(
     if settings.variant == "pathwise":
         lanes = lanes.put(moving, with_paths(model, lanes.take(moving), settings.functions))
     moved = _moved(model, move, settings, lanes, u, moving, stds)
-    ended = _concluded(model, settings, running, moved, changed)
+    ended = _concluded(model, settings, running, moved, changed, _fallen(definition, moving, lanes, moved))
     final_lanes = NO_LANES
     if settings.autoreset_mode == "same_step":
         beginning = changed.ends[3]
@@ -94,7 +95,7 @@ def compiled_step(
         reward_mean=changed.rewards[1],
         std=_scattered(running, moved.std) if stds else None,
         untrusted=None if settings.trust is None else changed.ends[2],
-        left=None if definition.outside_reward is None else changed.ends[4],
+        left=None if definition.outside_reward is None and definition.limits is None else changed.ends[4],
     )
 
 
@@ -144,8 +145,21 @@ def _rows(moving: Chosen, values: NDArray[Any]) -> NDArray[Any]:
     return np.ascontiguousarray(values if isinstance(moving, slice) else values[moving.numpy()])
 
 
+def _fallen(definition: EnvironmentDefinition, moving: Chosen, lanes: LaneState, moved: ArrayTransition) -> Bools:
+    """Which moving lanes (K,) come to where the fallback of the limits acts; (0,) if there are no limits."""
+    if definition.limits is None:
+        return NO_FALLBACK
+    fallen: Bools = definition.falls_back(lanes.take(moving).q, torch.from_numpy(moved.q_next)).numpy()
+    return fallen
+
+
 def _concluded(
-    model: DynamicsModel, settings: VirtualSettings, moving: Bools, moved: ArrayTransition, changed: _Changed
+    model: DynamicsModel,
+    settings: VirtualSettings,
+    moving: Bools,
+    moved: ArrayTransition,
+    changed: _Changed,
+    fallen: Bools,
 ) -> int:
     """Complete the step of the moving lanes in ``changed``, and return the number of lanes that ended."""
     trust, limit, outside = settings.trust, settings.time_limit, model.definition.outside_reward
@@ -156,6 +170,7 @@ def _concluded(
         moved.reward,
         moved.std,
         moved.terminated,
+        fallen,
         scales,
         model.terminal_reward,
         settings.penalty,
@@ -163,7 +178,7 @@ def _concluded(
         settings.caution,
         -1 if limit is None else limit,
         ANYWHERE if outside is None else torch.stack(model.definition.sampled).numpy(),
-        np.nan if outside is None else outside,
+        paid_outside(model.definition, settings),
         changed.q,
         changed.elapsed,
         changed.phase,

@@ -1,0 +1,66 @@
+"""Episodes of a policy that keep declared limits."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from surrogym_sampler.original.episode import Episode, Moment
+from surrogym_sampler.original.limits.guard import Guard, Watchdog
+from surrogym_sampler.original.protocol import Array
+
+
+class GuardedEpisode(Episode):
+    """An episode in which the fallback acts in the place of the policy, shortly before a limit would be left, and when
+    no action comes for a sampling period."""
+
+    def __init__(self, episode: Episode) -> None:
+        super().__init__(episode.spec)
+        self.parallel = episode.parallel
+        self._episode = episode
+        self._guard = Guard(episode.spec)
+        self._watchdog = Watchdog(episode.spec, self._guard, self._fall, waits=self.parallel)
+
+    def reset(self, seed: int) -> Moment:
+        with self._watchdog:
+            return self._started(self._episode.reset(seed))
+
+    def place(self, coordinates: Array) -> Moment:
+        with self._watchdog:
+            return self._started(self._episode.place(coordinates))
+
+    def step(self, action: Array) -> Moment:
+        """Apply the action (F,), or the fallback's, which the moment then names.
+
+        Raises:
+            StepFailed: the watchdog has ended the episode.
+        """
+        with self._watchdog:
+            self._watchdog.check()
+            self._watchdog.over()  # while the environment steps
+            chosen, fallen = self._guard.choose(action)
+            moment = self._episode.step(chosen)
+            self._guard.reached(moment.coordinates)
+            if not (moment.terminated or moment.truncated):
+                self._watchdog.running()
+            return replace(moment, fallback=chosen) if fallen else moment
+
+    def perturb(self, rng: np.random.Generator, sigma: float) -> None:
+        self._episode.perturb(rng, sigma)
+
+    def close(self) -> None:
+        try:
+            self._watchdog.close("the episode's environment is closed")
+        finally:
+            self._episode.close()
+
+    def _started(self, moment: Moment) -> Moment:
+        self._guard.begin(moment.coordinates)
+        self._watchdog.reset()
+        return moment
+
+    def _fall(self, action: Array) -> bool:
+        moment = self._episode.step(action)
+        self._guard.reached(moment.coordinates)
+        return not (moment.terminated or moment.truncated)

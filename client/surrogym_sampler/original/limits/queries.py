@@ -1,0 +1,130 @@
+"""Environments whose queries keep declared limits."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogym_sampler.original.errors import StepRefused
+from surrogym_sampler.original.limits.guard import Guard, Watchdog
+from surrogym_sampler.original.protocol import (
+    Environment,
+    OriginalEnvironment,
+    RealStep,
+    RolloutEnvironment,
+    runs_in_parallel,
+)
+from surrogym_shared.limits import falls_back, nearest
+from surrogym_shared.spec import EnvironmentSpec
+
+Array = NDArray[np.float64]
+ENDS = "the environment is closed"
+
+
+def guarded(environment: Environment) -> Environment:
+    """Return an environment that keeps its specification's limits."""
+    if isinstance(environment, OriginalEnvironment) and environment.spec().query == "step":
+        return GuardedSteps(environment)
+    assert isinstance(environment, RolloutEnvironment)
+    return GuardedRollouts(environment)
+
+
+class GuardedSteps:
+    """Refuses to set an environment to a state within the margin of a limit."""
+
+    def __init__(self, environment: OriginalEnvironment) -> None:
+        self._environment, self._spec = environment, environment.spec()
+        self.parallel = runs_in_parallel(environment)
+
+    def spec(self) -> EnvironmentSpec:
+        return self._spec
+
+    def step_from(self, coordinates: Array, action: Array) -> RealStep:
+        """Take a real step.
+
+        Raises:
+            StepRefused: the state lies beyond a limit, or within its margin.
+        """
+        at = np.asarray(coordinates, dtype=np.float64)[None]
+        if bool(falls_back(self._spec, at, at)[0]):
+            limit, left = nearest(self._spec, at[0])
+            raise StepRefused(
+                f"expected a state at least the margin of {limit.margin:g} inside the limit {limit.name!r}, got one "
+                f"with {left:.4g}"
+            )
+        return self._environment.step_from(coordinates, action)
+
+    def close(self) -> None:
+        self._environment.close()
+
+
+class GuardedRollouts:
+    """Applies the fallback's action in the place of a requested one, shortly before a limit would be left.
+
+    If no action comes for a sampling period, or the environment is closed while an episode runs, the fallback brings
+    the machine to rest, and the episode ends. Returned steps have the action that was applied.
+    """
+
+    def __init__(self, environment: RolloutEnvironment) -> None:
+        self._environment: Any = environment  # save and restore need not exist
+        self._spec = environment.spec()
+        self.parallel = runs_in_parallel(environment)
+        self._guard = Guard(self._spec)
+        self._watchdog = Watchdog(self._spec, self._guard, self._fall, waits=self.parallel)
+
+    def spec(self) -> EnvironmentSpec:
+        return self._spec
+
+    def begin(self, seed: int | None = None) -> Array:
+        with self._watchdog:
+            return self._started(self._environment.begin(seed))
+
+    def act(self, action: Array) -> RealStep:
+        """Apply the action (F,), or the fallback's.
+
+        Raises:
+            StepFailed: the watchdog has ended the episode.
+        """
+        with self._watchdog:
+            self._watchdog.check()
+            self._watchdog.over()  # while the environment steps
+            return self._acted(self._guard.choose(action)[0])
+
+    def save(self) -> bytes:
+        with self._watchdog:
+            self._watchdog.check()
+            snapshot: bytes = self._environment.save()
+            return snapshot
+
+    def restore(self, snapshot: bytes) -> Array:
+        with self._watchdog:
+            return self._started(self._environment.restore(snapshot))
+
+    def close(self) -> None:
+        try:
+            self._watchdog.close(ENDS)
+        finally:
+            self._environment.close()
+
+    def _started(self, coordinates: Any) -> Array:
+        start = np.asarray(coordinates, dtype=np.float64)
+        self._guard.begin(start)
+        self._watchdog.reset()
+        return start
+
+    def _acted(self, action: Array) -> RealStep:
+        step: RealStep = self._environment.act(action)
+        self._guard.reached(np.asarray(step.next_coordinates, dtype=np.float64))
+        if step.terminated or step.truncated:
+            self._watchdog.over()
+        else:
+            self._watchdog.running()
+        return step
+
+    def _fall(self, action: Array) -> bool:
+        """Take a step of the fallback, and return whether the episode goes on."""
+        step: RealStep = self._environment.act(action)
+        self._guard.reached(np.asarray(step.next_coordinates, dtype=np.float64))
+        return not (step.terminated or step.truncated)

@@ -1,0 +1,80 @@
+"""How real episodes kept the limits of their specification."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import binomtest
+
+from surrogym_shared.limits import limits_of, past, room
+from surrogym_shared.spec import EnvironmentSpec
+
+LEVEL = 0.05  # probability that kept limits count as broken
+
+
+@dataclass(frozen=True)
+class LimitsKept:
+    """How N real episodes kept the limits of their specification.
+
+    Attributes:
+        episodes: number of episodes.
+        violations: number of episodes that left a limit.
+        fallbacks: number of steps in which the fallback acted in the place of the policy.
+        steps: number of all steps.
+        least_room: smallest distance to an end of each limit, by its name; negative beyond it.
+        probability: declared share of episodes that may leave a limit.
+    """
+
+    episodes: int
+    violations: int
+    fallbacks: int
+    steps: int
+    least_room: dict[str, float]
+    probability: float
+
+    def interval(self) -> tuple[float, float]:
+        """Return the exact 95 % interval (Clopper and Pearson) of the share of episodes that leave a limit."""
+        found = binomtest(self.violations, self.episodes).proportion_ci(method="exact")
+        return float(found.low), float(found.high)
+
+    @property
+    def broken(self) -> bool:
+        """Whether more episodes left a limit than the declared probability explains, at a level of 5 %."""
+        found = binomtest(self.violations, self.episodes, self.probability, alternative="greater")
+        return self.violations > 0 and bool(found.pvalue < LEVEL)
+
+    def summary(self) -> dict[str, Any]:
+        """Return the counts and the interval, as JSON."""
+        return {**asdict(self), "interval": list(self.interval())}
+
+    def words(self) -> str:
+        """Describe in a sentence how the limits were kept."""
+        low, high = self.interval()
+        return (
+            f"{self.violations} of {self.episodes} episodes left a limit (95 % interval {100 * low:.2g} to "
+            f"{100 * high:.2g} %, allowed {100 * self.probability:g} %); the fallback acted in {self.fallbacks} of "
+            f"{self.steps} steps"
+        )
+
+
+def limits_kept(spec: EnvironmentSpec, paths: Sequence[NDArray[np.float64]], fallbacks: int) -> LimitsKept:
+    """Count the episodes that left a limit.
+
+    Args:
+        spec: specification with limits.
+        paths: states (T + 1, C) of each episode, at least one.
+        fallbacks: number of steps of all episodes in which the fallback acted.
+    """
+    least = np.min([room(spec, path).min(axis=0) for path in paths], axis=0)
+    return LimitsKept(
+        episodes=len(paths),
+        violations=sum(bool(past(spec, path).any()) for path in paths),
+        fallbacks=fallbacks,
+        steps=sum(len(path) - 1 for path in paths),
+        least_room=dict(zip((limit.name for limit in limits_of(spec).keep), least.tolist(), strict=True)),
+        probability=limits_of(spec).probability,
+    )

@@ -1,0 +1,167 @@
+"""Limits of a specification, evaluated on states: how much room there is, and what the fallback does.
+
+Shapes: n states, C coordinates, L limits, F action entries.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogym_shared.checks import require, require_known, require_unique
+from surrogym_shared.spec import BoxAction, DiscreteAction, EnvironmentSpec, limits
+from surrogym_shared.spec.safety import Limit, Limits
+from surrogym_shared.terms import evaluate
+
+Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+CORNERS = 10  # most coordinates of which every corner of the start is checked
+STARTS = 1_000  # random states of the start that are checked
+
+
+def limits_of(spec: EnvironmentSpec) -> Limits:
+    """Return the limits of a specification that has some."""
+    assert spec.limits is not None
+    return spec.limits
+
+
+def room(spec: EnvironmentSpec, coordinates: Array) -> Array:
+    """Distance (n, L) from coordinates (n, C) to the nearer end of each limit, in the limit's unit; negative beyond."""
+    columns = []
+    for limit in limits_of(spec).keep:
+        value = evaluate(spec, limit.term, coordinates)
+        below = np.inf if limit.low is None else value - limit.low
+        above = np.inf if limit.high is None else limit.high - value
+        columns.append(np.minimum(below, above))
+    return np.stack(columns, axis=1)
+
+
+def past(spec: EnvironmentSpec, coordinates: Array) -> Bools:
+    """Whether (n,) coordinates (n, C) lie beyond a limit."""
+    return np.asarray((room(spec, coordinates) < 0).any(axis=1))
+
+
+def falls_back(spec: EnvironmentSpec, before: Array, coordinates: Array) -> Bools:
+    """Whether (n,) the fallback acts at coordinates (n, C), which followed ``before`` (n, C) by one step.
+
+    It acts if the room of a limit is below its margin, now or after one more step with the same change.
+    """
+    now = room(spec, coordinates)
+    soon = 2 * now - room(spec, before)
+    margins = np.array([limit.margin for limit in limits_of(spec).keep])
+    with np.errstate(invalid="ignore"):  # a side without an end has infinite room
+        return np.asarray((np.fmin(now, soon) < margins).any(axis=1))
+
+
+def fallback_action(spec: EnvironmentSpec, coordinates: Array) -> Array:
+    """Action (F,) of the fallback at coordinates (C,)."""
+    values = [float(evaluate(spec, term, coordinates[None])[0]) for term in limits_of(spec).fallback]
+    low, high = np.array(_action_ranges(spec)).T
+    return np.asarray(np.clip(values, low, high))
+
+
+def nearest(spec: EnvironmentSpec, coordinates: Array) -> tuple[Limit, float]:
+    """Return the limit with the least room at coordinates (C,), in units of its margin if it has one, and the room."""
+    every = room(spec, coordinates[None])[0]
+    index = int(np.argmin([r / (limit.margin or 1.0) for r, limit in zip(every, limits_of(spec).keep, strict=True)]))
+    return limits_of(spec).keep[index], float(every[index])
+
+
+def check_limits(spec: EnvironmentSpec) -> None:
+    """Check the limits of a specification against the rest of it.
+
+    Raises:
+        ValueError: a limit names an unknown coordinate, other units, or an angle that jumps; limits contradict each
+            other; an episode may start within a margin; the fallback is no action; or a period or a time limit is
+            missing.
+    """
+    declared = limits_of(spec)
+    require_unique("limit", (limit.name for limit in declared.keep))
+    require(
+        spec.sampling_period is not None,
+        "limits: expected a sampling_period, because the fallback acts when no action came for one, got none",
+    )
+    require(
+        spec.time_limit is not None,
+        "limits: expected a time_limit, because a virtual episode pays for the steps that it lacks, got none",
+    )
+    for limit in declared.keep:
+        _check_term(spec, limit)
+    _check_pairs(declared)
+    _check_fallback(spec, declared)
+    for states in _starts(spec):
+        inside = room(spec, states) - np.array([limit.margin for limit in declared.keep])
+        row, column = np.unravel_index(int(np.argmin(inside)), inside.shape)
+        limit = declared.keep[int(column)]
+        require(
+            inside[row, column] >= 0,
+            f"limit {limit.name!r}: expected every start to lie at least its margin of {limit.margin:g} inside, got "
+            f"{dict(zip(spec.coordinate_names, states[row].round(6).tolist(), strict=True))}",
+        )
+
+
+def _check_term(spec: EnvironmentSpec, limit: Limit) -> None:
+    where, kinds = f"limit {limit.name!r}", {c.name: c for c in spec.coordinates}
+    for part in limit.term.parts:
+        require_known(f"{where}: term", part.weights, spec.coordinate_names)
+        angles = [name for name in part.weights if kinds[name].kind == "angle"] if part.function == "linear" else []
+        require(
+            not angles,
+            f"{where}: the angle {angles} jumps from pi to -pi: expected its sine or cosine, or a coordinate of kind "
+            "'linear'",
+        )
+    parts = [part for part in limit.term.parts if part.function != "one"]
+    if limit.unit and len(parts) == 1 and parts[0].function == "linear" and len(parts[0].weights) == 1:
+        own = kinds[next(iter(parts[0].weights))].unit
+        require(not own or own == limit.unit, f"{where}: expected the coordinate's unit {own!r}, got {limit.unit!r}")
+
+
+def _check_pairs(declared: Limits) -> None:
+    """Check that limits of the same term leave room between them."""
+    for one, other in product(declared.keep, repeat=2):
+        if one.term == other.term and one.low is not None and other.high is not None:
+            require(
+                one.low + one.margin < other.high - other.margin,
+                f"limits {one.name!r} and {other.name!r} contradict each other: expected room between {one.low:g} and "
+                f"{other.high:g} less their margins, got none",
+            )
+
+
+def _check_fallback(spec: EnvironmentSpec, declared: Limits) -> None:
+    size = spec.action.size
+    require(
+        len(declared.fallback) == size,
+        f"limits: expected a fallback of {size} terms, one for each entry of the action, got {len(declared.fallback)}",
+    )
+    for number, (term, (low, high)) in enumerate(zip(declared.fallback, _action_ranges(spec), strict=True)):
+        for part in term.parts:
+            require_known(f"limits: fallback {number}", part.weights, spec.coordinate_names)
+        constant = all(part.function == "one" for part in term.parts)
+        value = sum(part.coefficient for part in term.parts)
+        whole = isinstance(spec.action, BoxAction) or (constant and float(value).is_integer())
+        require(whole, f"limits: expected the number of a discrete action as fallback {number}, got {value:g}")
+        require(
+            not constant or low <= value <= high,
+            f"limits: fallback {number} leaves the action's range: expected {low:g} to {high:g}, got {value:g}",
+        )
+
+
+def _action_ranges(spec: EnvironmentSpec) -> list[tuple[float, float]]:
+    action = spec.action
+    if isinstance(action, BoxAction):
+        return list(zip(action.low, action.high, strict=True))
+    return [(0, n - 1) for n in ((action.n,) if isinstance(action, DiscreteAction) else action.nvec)]
+
+
+def _starts(spec: EnvironmentSpec) -> Iterator[Array]:
+    """Yield states (n, C) at which episodes may start: the listed ones, or corners and random ones of the ranges."""
+    if spec.starts:
+        yield np.array(spec.starts)
+        return
+    ends = np.array([limits(spec.start[c.name]) for c in spec.coordinates])
+    if len(ends) <= CORNERS:
+        yield np.array(list(product(*ends)))
+    yield np.random.default_rng(0).uniform(ends[:, 0], ends[:, 1], (STARTS, len(ends)))

@@ -1,0 +1,54 @@
+"""Limits that a machine must keep at every step, and the fallback that brings it back."""
+
+from __future__ import annotations
+
+from typing import Annotated, Self
+
+from pydantic import Field, model_validator
+
+from surrogym_shared.checks import Number, require
+from surrogym_shared.spec.base import MAX_DIMENSIONS, MAX_INEQUALITIES, Frozen, Name
+from surrogym_shared.spec.terms import Term
+
+
+class Limit(Frozen):
+    """Range of a term of the state that must never be left, such as the angle of an arm between its stops.
+
+    ``margin``: distance from ``low`` and ``high``, in the term's unit, within which the fallback acts. It has to be
+    larger than what one step can add to the change of the step before.
+
+    ``unit``: of ``low``, ``high`` and ``margin``; of a single coordinate it has to be the coordinate's own.
+    """
+
+    name: Name
+    term: Term
+    low: Number | None = None
+    high: Number | None = None
+    margin: Annotated[Number, Field(ge=0)] = 0.0
+    unit: str = Field(default="", max_length=64)
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        low, high = self.low, self.high
+        require(low is not None or high is not None, f"limit {self.name!r}: expected low, high or both, got neither")
+        if low is not None and high is not None:
+            require(
+                low + self.margin < high - self.margin,
+                f"limit {self.name!r}: expected room between low and high less the margin on each side, got "
+                f"[{low}, {high}] and a margin of {self.margin}",
+            )
+        return self
+
+
+class Limits(Frozen):
+    """Limits that the sampler, audits and evaluations keep.
+
+    ``fallback``: a term of the state for each entry of the action, such as a constant or a linear feedback. Its value
+    is clipped to the action's range.
+
+    ``probability``: share of episodes that may leave a limit.
+    """
+
+    keep: tuple[Limit, ...] = Field(min_length=1, max_length=MAX_INEQUALITIES)
+    fallback: tuple[Term, ...] = Field(min_length=1, max_length=MAX_DIMENSIONS)
+    probability: Annotated[float, Field(gt=0, le=0.5, strict=True)] = 0.01

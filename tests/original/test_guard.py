@@ -1,0 +1,174 @@
+"""The guard of an environment with limits: no action leaves them, and without an action the fallback acts."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from support.limited import DIARY, SPEC, Cart, PatientCart, with_limits
+from support.noting import until
+from surrogym_sampler.original.episodes import open_episode
+from surrogym_sampler.original.errors import StepFailed, StepRefused
+from surrogym_sampler.original.isolated import IsolatedEnvironment
+from surrogym_sampler.original.limits.queries import GuardedRollouts, GuardedSteps
+from surrogym_sampler.original.protocol import RealStep
+from surrogym_sampler.original.rollouts import answering, keeping_limits
+from surrogym_shared.limits import past
+
+RIGHT = np.array([1.0])
+KILLED = """
+import sys, time
+import numpy as np
+from support.limited import Cart
+from surrogym_sampler.original.isolated import IsolatedEnvironment
+
+if __name__ == "__main__":
+    environment = IsolatedEnvironment(Cart)
+    environment.begin(0)
+    for _ in range(3):
+        environment.act(np.array([1.0]))
+    print("moving", flush=True)
+    time.sleep(60 if sys.argv[1] == "wait" else 0)
+    environment.close()
+"""
+
+
+@pytest.fixture
+def diary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv(DIARY, str(tmp_path / "diary"))
+    return tmp_path / "diary"
+
+
+@pytest.fixture
+def cart() -> Iterator[GuardedRollouts]:
+    """A cart that does not wait for its actions."""
+    environment = keeping_limits(answering(Cart()))
+    assert isinstance(environment, GuardedRollouts)
+    yield environment
+    environment.close()
+
+
+def pushed(environment: GuardedRollouts, steps: int, action: np.ndarray = RIGHT) -> list[RealStep]:
+    environment.begin(0)
+    return [environment.act(action) for _ in range(steps)]
+
+
+def states(diary: Path) -> np.ndarray:
+    """Action, position and speed of each noted step."""
+    rows = [line.split() for line in diary.read_text().splitlines() if line != "close"]
+    return np.array(rows, dtype=np.float64).reshape(-1, 3)
+
+
+def test_no_action_takes_the_cart_off_its_rail() -> None:
+    free = answering(Cart(with_limits(None)))
+    free.begin(0)  # type: ignore[union-attr]
+    reached = [free.act(RIGHT).next_coordinates for _ in range(30)]  # type: ignore[union-attr]
+    assert past(SPEC, np.array(reached)).any()
+    assert np.abs(np.array(reached)[:, 0]).max() > 1
+    guarded = keeping_limits(answering(PatientCart()))
+    assert isinstance(guarded, GuardedRollouts)
+    for action in (RIGHT, -RIGHT):
+        steps = pushed(guarded, 30, action)
+        assert not past(SPEC, np.array([step.next_coordinates for step in steps])).any()
+
+
+def test_a_step_of_the_fallback_has_the_action_that_was_applied() -> None:
+    guarded = keeping_limits(answering(PatientCart()))
+    assert isinstance(guarded, GuardedRollouts)
+    steps = pushed(guarded, 30)
+    replaced = [step for step in steps if np.asarray(step.action)[0] != 1.0]
+    assert 0 < len(replaced) < len(steps)
+    for step in replaced:
+        x, v = np.asarray(step.coordinates)
+        assert np.asarray(step.action)[0] == pytest.approx(np.clip(-0.5 * x - 1.6 * v, -1, 1))
+
+
+def test_without_an_action_for_a_period_the_fallback_stops_the_cart(cart: GuardedRollouts, diary: Path) -> None:
+    pushed(cart, 3)
+    until(lambda: len(states(diary)) > 3 and abs(states(diary)[-1, 2]) < 0.1)
+    with pytest.raises(StepFailed, match="no action came"):
+        cart.act(RIGHT)
+    cart.begin(1)
+    assert np.asarray(cart.act(RIGHT).action)[0] == 1.0
+
+
+def test_a_simulator_waits_for_its_actions(diary: Path) -> None:
+    simulator = keeping_limits(answering(PatientCart()))
+    assert isinstance(simulator, GuardedRollouts)
+    pushed(simulator, 3)
+    time.sleep(3 * (SPEC.sampling_period or 0))
+    assert len(states(diary)) == 3
+    simulator.act(RIGHT)
+
+
+def test_the_fallback_acts_before_the_environment_closes(cart: GuardedRollouts, diary: Path) -> None:
+    pushed(cart, 3)
+    cart.close()
+    lines = diary.read_text().splitlines()
+    assert lines[-1] == "close"
+    assert len(lines) > 4
+    assert abs(states(diary)[-1, 2]) < 0.1
+
+
+@pytest.mark.parametrize("ends", ["kill", "term", "close"])
+def test_the_fallback_acts_when_the_sampler_is_killed_or_ends(tmp_path: Path, diary: Path, ends: str) -> None:
+    program = tmp_path / "program.py"
+    program.write_text(KILLED)
+    path = os.pathsep.join(map(str, ("tests", os.environ.get("PYTHONPATH", ""))))
+    with subprocess.Popen(
+        [sys.executable, str(program), "end" if ends == "close" else "wait"],
+        stdout=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONPATH": path},
+    ) as child:
+        assert child.stdout is not None
+        assert child.stdout.readline().strip() == "moving"
+        if ends != "close":
+            child.send_signal(signal.SIGKILL if ends == "kill" else signal.SIGTERM)
+        child.wait()
+    until(lambda: diary.read_text().endswith("close\n"))
+    assert len(states(diary)) > 3
+    assert abs(states(diary)[-1, 2]) < 0.1
+
+
+def test_an_isolated_environment_keeps_its_limits() -> None:
+    with IsolatedEnvironment(PatientCart) as environment:
+        environment.begin(0)
+        reached = [environment.act(RIGHT).next_coordinates for _ in range(30)]
+    assert not past(SPEC, np.array(reached)).any()
+
+
+def test_a_state_within_a_margin_is_not_set() -> None:
+    class Settable:
+        def spec(self):
+            return SPEC.model_copy(update={"query": "step"})
+
+        def step_from(self, coordinates, action):
+            return RealStep(coordinates, action, coordinates, 0.0)
+
+        def close(self):
+            pass
+
+    environment = keeping_limits(Settable())
+    assert isinstance(environment, GuardedSteps)
+    assert environment.step_from(np.zeros(2), RIGHT).reward == 0.0
+    with pytest.raises(StepRefused, match="limit 'rail'"):
+        environment.step_from(np.array([0.95, 0.0]), RIGHT)
+
+
+def test_an_episode_names_the_fallback_that_replaced_an_action() -> None:
+    episode = open_episode("cart:Cart", None, PatientCart)
+    episode.reset(0)
+    moments = [episode.step(RIGHT) for _ in range(30)]
+    episode.close()
+    assert not past(SPEC, np.array([moment.coordinates for moment in moments])).any()
+    assert any(moment.fallback is not None for moment in moments)
+    assert moments[0].fallback is None

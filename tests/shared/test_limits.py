@@ -1,0 +1,106 @@
+"""Limits of a specification: what contradicts the rest of it is refused, and where the fallback acts."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from support.limited import BRAKE, LIMITS, RAIL, SPEC, with_limits
+from surrogym_shared.limits import fallback_action, falls_back, nearest, past, room
+from surrogym_shared.spec import DiscreteAction, EnvironmentSpec, Limit, Limits, Term
+
+X = Term.linear(x=1.0)
+STILL = (Term.constant(0.0),)
+
+
+def limit(**changed: Any) -> Limit:
+    return Limit.model_validate({"name": "rail", "term": X, "low": -1.0, "high": 1.0, **changed})
+
+
+def spec_with(**changed: Any) -> EnvironmentSpec:
+    return EnvironmentSpec.model_validate({**SPEC.model_dump(), **changed})
+
+
+def test_a_limit_needs_an_end_and_room_between_its_margins() -> None:
+    with pytest.raises(ValidationError, match="expected low, high or both"):
+        limit(low=None, high=None)
+    with pytest.raises(ValidationError, match="expected room between"):
+        limit(margin=1.0)
+
+
+@pytest.mark.parametrize(
+    ("keep", "fallback", "said"),
+    [
+        ((limit(term=Term.linear(y=1.0)),), STILL, "names unknown ['y']"),
+        ((limit(), limit()), STILL, "given twice"),
+        ((limit(unit="cm"),), STILL, "expected the coordinate's unit 'm'"),
+        ((limit(low=0.05),), STILL, "every start"),
+        ((limit(margin=0.95),), STILL, "every start"),
+        ((limit(high=None), limit(name="left", low=None, high=-1.0)), STILL, "contradict each other"),
+        ((limit(),), (*STILL, *STILL), "a fallback of 1 terms"),
+        ((limit(),), (Term.constant(2.0),), "expected -1 to 1, got 2"),
+        ((limit(),), (Term.linear(w=1.0),), "names unknown ['w']"),
+    ],
+)
+def test_limits_that_do_not_fit_the_environment_are_refused(keep: Any, fallback: Any, said: str) -> None:
+    with pytest.raises(ValidationError) as refused:
+        with_limits(Limits(keep=keep, fallback=fallback))
+    assert said in str(refused.value)
+
+
+def test_limits_without_a_period_or_a_time_limit_are_refused() -> None:
+    with pytest.raises(ValidationError, match="sampling_period"):
+        spec_with(sampling_period=None)
+    with pytest.raises(ValidationError, match="time_limit"):
+        spec_with(time_limit=None)
+
+
+def test_a_limit_on_a_wrapped_angle_is_refused_and_on_its_sine_accepted() -> None:
+    coordinates = SPEC.model_dump()["coordinates"]
+    coordinates[0]["kind"] = "angle"
+    coordinates[0]["sampling"] = {"kind": "uniform", "low": -3.0, "high": 3.0}
+    with pytest.raises(ValidationError, match="jumps from pi to -pi"):
+        spec_with(coordinates=coordinates, limits=Limits(keep=(limit(),), fallback=STILL).model_dump())
+    sine = limit(term=Term.sin(x=1.0), low=-0.5, high=0.5)
+    assert spec_with(coordinates=coordinates, limits=Limits(keep=(sine,), fallback=STILL).model_dump()).limits
+
+
+def test_a_discrete_fallback_is_the_number_of_an_action() -> None:
+    discrete = DiscreteAction(n=3).model_dump()
+    for fallback, accepted in ((Term.constant(1.0), True), (Term.constant(0.5), False), (BRAKE, False)):
+        limits = Limits(keep=(limit(),), fallback=(fallback,)).model_dump()
+        if accepted:
+            assert fallback_action(spec_with(action=discrete, limits=limits), np.zeros(2)).tolist() == [1.0]
+        else:
+            with pytest.raises(ValidationError, match="number of a discrete action"):
+                spec_with(action=discrete, limits=limits)
+
+
+def test_room_is_the_distance_to_the_nearer_end() -> None:
+    q = np.array([[0.5, 0.0], [-0.5, -1.0], [1.2, 0.0]])
+    np.testing.assert_allclose(room(SPEC, q)[:, 0], [0.5, 0.2, -0.2])
+    assert past(SPEC, q).tolist() == [False, False, True]
+    assert nearest(SPEC, q[1]) == (RAIL, pytest.approx(0.2))
+
+
+def test_the_fallback_acts_within_the_margin_and_one_step_before_it() -> None:
+    far, near = np.array([[0.0, 0.0]]), np.array([[0.65, 0.0]])
+    assert falls_back(SPEC, near, near).all()
+    assert not falls_back(SPEC, far, far).any()
+    moving = np.array([[0.4, 0.0]])
+    assert falls_back(SPEC, far, moving).all(), "another step of 0.4 would reach the margin"
+    assert not falls_back(SPEC, moving, far).any(), "it moves away"
+
+
+def test_the_fallback_is_clipped_to_the_range_of_the_action() -> None:
+    np.testing.assert_allclose(fallback_action(SPEC, np.array([0.1, 0.1])), [-0.21])
+    np.testing.assert_allclose(fallback_action(SPEC, np.array([0.0, 3.0])), [-1.0])
+
+
+def test_a_limit_with_one_end_has_infinite_room_on_the_other_side() -> None:
+    one = with_limits(LIMITS.model_copy(update={"keep": (limit(low=None),)}))
+    assert room(one, np.array([[-1e6, 0.0]]))[0, 0] == pytest.approx(1e6 + 1)
+    assert not falls_back(one, np.array([[-1.0, 0.0]]), np.array([[-1e6, 0.0]])).any()
