@@ -86,7 +86,6 @@ OTHERWISE = {
     "docs/how-to/executables.md": "tests/original/test_executables.py runs its program",
     "docs/how-to/deploy.md": "tests/deployment runs its commands and compiles its controllers",
     "docs/how-to/controller-c.md": "tests/deployment compiles its program and runs the vectors",
-    "docs/how-to/limits.md": "tests/original/test_guard.py and tests/shared/test_limits.py keep what it says",
     "docs/how-to/priors.md": "tests/docs/test_how_to.py runs its programs, tests/cli/test_prior.py the command",
     "docs/how-to/history.md": "tests/docs/test_how_to.py runs its programs",
     "docs/how-to/trust.md": "tests/training/test_handover.py audits beside a sampler that stays",
