@@ -190,7 +190,8 @@ class OutputOutlook(ABC):
 
 
 class PathOutlook(ABC):
-    """Forecast of one output along b predicted paths of T steps."""
+    """Forecast of one output along b predicted paths of T steps: its standard deviations, and the information that
+    real steps there would give."""
 
     learns: Tensor  # (b, T) bool: whether a real step at that point of a path would improve this output
 

@@ -45,7 +45,14 @@ def judge_model(
     request: Request,
     state: DesignState,
 ) -> Judgement:
-    """Judge a model by the tolerances (O,) of its outputs, in their units.
+    """Compute a model's confidences, its verdict, and the candidates for the next queries.
+
+    Args:
+        model: the model of this round.
+        samples: the samples that it has learned from.
+        tolerances: tolerance of each output (O,), in its unit.
+        request: budget and target of the design.
+        state: result of the previous round.
 
     Raises:
         PluginFailed: code of the model's family failed.

@@ -131,7 +131,7 @@ def _refuted(differences: Repeats, model_noise: Tensor) -> Tensor:
 
 
 def widened_by(noise: Tensor, tolerances: Sequence[float]) -> tuple[float, ...]:
-    """Widen the tolerances (O,) by the established noise (O,), because a noisy output can't be known better than its
+    """Widen the tolerances (O,) by the confirmed noise (O,), because a noisy output can't be known better than its
     noise."""
     return tuple(math.hypot(tolerance, float(one)) for tolerance, one in zip(tolerances, noise, strict=True))
 

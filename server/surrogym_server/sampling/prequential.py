@@ -37,7 +37,10 @@ Predictions = tuple[tuple[Prediction, ...], ...]  # the predictions of each outp
 
 @dataclass(frozen=True)
 class PrequentialScores:
-    """Prequential scores of one output. An error within the tolerance counts as inside every interval."""
+    """Scores of one output's predictions, each made before the model learned from the sample.
+
+    An error within the tolerance counts as inside every interval.
+    """
 
     predictions: int
     within_50: float  # share of the samples in the central 50 % interval, or within the tolerance

@@ -114,7 +114,8 @@ def best_rollout(
     snapshots: Mapping[str, Vector],
     rng: np.random.Generator,
 ) -> Query:
-    """Search for the best sequence of at most ``longest`` actions, from a reset or from one of the snapshots."""
+    """Search for the sequence of at most ``longest`` actions, from a reset or a snapshot, that the function ``worth``
+    rates best."""
     starts = start_points(definition, STARTS, rng)[None]
     actions, _, value = _search(definition, worth, longest, starts, POPULATION, rng)
     if snapshots:

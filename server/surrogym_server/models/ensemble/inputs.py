@@ -14,7 +14,7 @@ from surrogym_server.tensors import cached
 
 @dataclass(frozen=True)
 class Inputs:
-    """Features of states and actions of one environment."""
+    """Encodings of states and actions as inputs of the networks of one environment."""
 
     definition: EnvironmentDefinition
 

@@ -20,7 +20,7 @@ MOST = subsets.FEW  # greatest number of own and shared samples of an output; be
 
 @dataclass(frozen=True)
 class _Candidate:
-    """An output that may share samples."""
+    """Output that may share samples with others, with what is needed to pool it."""
 
     place: int  # index of the output in the model
     output: OutputModel

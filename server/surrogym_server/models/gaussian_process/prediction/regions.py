@@ -164,7 +164,7 @@ class Region:
 
     @property
     def description(self) -> dict[str, Any]:
-        """Every form in words, with its score."""
+        """All forms of the region in words, with their scores, for display."""
         forms = [{"weight": weight, **form.description} for weight, form in self.forms]
         return {"forms": forms, "scores": dict(self.scores)}
 
