@@ -73,8 +73,10 @@ class Comparison:
         self._faults = 0
 
     def over(self, seeds: range, progress: Callable[[float], None]) -> Checked:
-        """Run one episode of each for every reset seed. ``progress`` is called with the share of episodes that are
-        done."""
+        """Run an episode of the controller and one of the policy for every reset seed.
+
+        ``progress`` is called with the share of episodes that are done.
+        """
         returns: list[tuple[float, float]] = []
         for seed in seeds:
             returns.append((self._run(seed, deployed=False), self._run(seed, deployed=True)))

@@ -106,8 +106,7 @@ def effects_of(
 
     Returns:
         The effects, and the contribution of each step to them (n,): the sum of its errors that they explain, each
-            divided by
-        the error on left-out samples.
+        divided by the error on left-out samples.
     """
     shifted = compared.together(spec, Inputs.over(spec, compared.states, compared.actions))
     weights, outputs = shifted.expected(), np.flatnonzero(shifted.chances > CERTAIN).tolist()

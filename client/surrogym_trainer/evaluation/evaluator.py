@@ -182,8 +182,7 @@ def evaluate(
 
     Returns:
         The returns and successes of the episodes, in the order of their seeds. The number of instances has an effect
-            only
-        if the policy answers a batch of observations differently from single ones, usually in the last bits.
+        only if the policy answers a batch of observations differently from single ones, usually in the last bits.
 
     Raises:
         PolicyMisfit: the policy was trained for another environment, which was then not even reset; or it gave actions

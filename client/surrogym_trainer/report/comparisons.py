@@ -62,7 +62,7 @@ def in_short(real: EvaluationDetail, other: EvaluationDetail) -> str:
 
 
 def beside(known: Known) -> str:
-    """Return the section as HTML."""
+    """Return the report's section that compares episodes with and without the controller, as HTML."""
     real, title = known.real, "With and without the controller"
     if real is None:
         return section(title, paragraph("There is nothing to compare yet."))

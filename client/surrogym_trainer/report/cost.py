@@ -17,7 +17,7 @@ ACTING: dict[Controller, str] = {
 
 
 def cost(known: Known) -> str:
-    """Return the section as HTML."""
+    """Return the report's section about the number of real steps, as HTML."""
     ledger, policy = known.view.ledger, known.policy
     counted = [(name, count) for name, count in purposes(known) if count]
     rows = [*counted, ("all together", sum(count for _, count in counted))]

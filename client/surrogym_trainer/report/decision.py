@@ -36,7 +36,10 @@ RETURN = "The return of an episode is the sum of its rewards. Higher is better."
 
 
 def decision(known: Known, cuts: Sequence[Cut]) -> str:
-    """Return all sections of this part as HTML; ``cuts`` are the maps of the model's uncertainty."""
+    """Return all sections of the report's first part, for decisions, as HTML.
+
+    ``cuts`` are the maps of the model's uncertainty.
+    """
     parts = [
         _in_short(known),
         cost(known),

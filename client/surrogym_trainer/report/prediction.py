@@ -47,7 +47,7 @@ def outcome_of(known: Known) -> Outcome | None:
 
 
 def prediction(known: Known) -> str:
-    """Return the section as HTML."""
+    """Return the report's section that compares the policy's promise with its evaluation, as HTML."""
     policy, real, title = known.policy, known.real, "Was it predicted?"
     promise = None if policy is None else policy.promise
     if policy is None or promise is None:

@@ -100,7 +100,10 @@ class PolicySearch(ABC):
 
     @abstractmethod
     def search(self, task: SearchTask) -> Found:
-        """Find a policy by the task's virtual steps. The module docstring lists the laws that a search must keep."""
+        """Find a policy within the task's number of virtual steps.
+
+        The module docstring lists the laws that a search must keep.
+        """
 
     def explorer(self, policy: Path, algorithm: str, num_envs: int) -> Predict:  # noqa: ARG002  for those that have noise
         """Load a saved policy that explores as in training; a policy without noise takes its most probable actions."""

@@ -17,11 +17,11 @@ SIGHT = 1 / 2  # discount horizon of short episodes, 1 / (1 - gamma), as a share
 
 @dataclass(frozen=True)
 class Stage:
-    """One stage of a training."""
+    """One stage of a training by FastPpo: its name, the settings of its episodes and their discount factor."""
 
     name: str
     settings: TrainSettings  # settings of the stage's episodes
-    gamma: float
+    gamma: float  # discount factor
 
 
 def learn(task: SearchTask) -> Stage:
