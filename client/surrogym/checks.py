@@ -84,7 +84,9 @@ def real_step(definition: EnvironmentDefinition, step: RealStep) -> RealStep:
     u = model_actions(definition.action, _row("action", step.action))
     reward = _numbers("reward", step.reward)
     if reward.shape != () or not np.isfinite(reward) or abs(reward) > LARGEST:
-        raise InvalidInput(f"reward: expected a finite number within {LARGEST:g}, got {_shown(step.reward)}")
+        raise InvalidInput(
+            f"reward: expected a finite number of at most {LARGEST:g} in size, got {_shown(step.reward)}"
+        )
     ends = (_truth("terminated", step.terminated), _truth("truncated", step.truncated))
     return RealStep(q[0], u[0], q_next[0], float(reward), *ends)
 

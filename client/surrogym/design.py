@@ -186,7 +186,7 @@ class Design:
         if query is not None:
             self._require_open(query)
         if not taken or (query is not None and len(taken) > query.steps):
-            raise InvalidInput(f"expected {_count_of(query)}, got {len(taken)}")
+            raise InvalidInput(f"steps: expected {_count_of(query)}, got {len(taken)}")
         if snapshots and len(snapshots) != len(taken):
             raise InvalidInput(f"snapshots: expected one entry for each of {len(taken)} steps, got {len(snapshots)}")
         told = [checks.real_step(self._definition, step) for step in taken]
@@ -352,7 +352,7 @@ class Design:
 
     def _require_open(self, query: Query) -> None:
         if not isinstance(query, Query):
-            raise InvalidInput(f"expected a Query that was asked, got {type(query).__name__}")
+            raise InvalidInput(f"expected a Query that ask() returned, got {type(query).__name__}")
         if self._open.get(query.id) == query:
             return
         why = "was answered already" if query in self._answered else "belongs to another design"

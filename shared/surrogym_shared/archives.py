@@ -114,7 +114,7 @@ def _require_once(names: list[str]) -> None:
     """Raise ValueError if two entries have the same name: one reader would take the first, another the last."""
     if len(names) > len(set(names)):
         twice = next(name for name, count in Counter(names).items() if count > 1)
-        raise ValueError(f"expected each entry once, got {twice[:SHOWN]!r} twice")
+        raise ValueError(f"expected different names of the entries in a zip file, got {twice[:SHOWN]!r} twice")
 
 
 def _stream(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> IO[bytes]:
@@ -128,7 +128,9 @@ def _content(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> bytes:
     with _stream(archive, entry) as file:
         content = file.read(entry.file_size)
     if len(content) != entry.file_size:
-        raise ValueError(f"expected {entry.file_size} bytes of {entry.filename!r}, got {len(content)}")
+        raise ValueError(
+            f"expected {entry.file_size} bytes of {entry.filename!r}, got {len(content)}: the file is damaged"
+        )
     return content
 
 
@@ -146,7 +148,7 @@ def _header(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, name: str) -> Head
             ) from error
         declared, came = math.prod(shape) * dtype.itemsize, entry.file_size - file.tell()
     if dtype.hasobject or min(shape, default=0) < 0 or declared != came:
-        raise ValueError(f"expected an array {name!r} of numbers in {declared} bytes, got {dtype} in {came} bytes")
+        raise ValueError(f"array {name!r}: expected numbers in {declared} bytes, got {dtype} in {came} bytes")
     return Header(shape, dtype)
 
 
@@ -156,4 +158,4 @@ def _array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, name: str) -> NDArr
         try:
             return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
         except ValueError as error:
-            raise ValueError(f"expected {entry.file_size} bytes of the array {name!r}, got fewer") from error
+            raise ValueError(f"expected {entry.file_size} bytes of {name!r}, got fewer: the file is damaged") from error

@@ -39,7 +39,7 @@ def c_compiler() -> tuple[str, ...] | None:
 def require_c_compiler() -> tuple[str, ...]:
     """Return the command of the C compiler. Raises ``CannotCompile`` if there is none."""
     if (command := c_compiler()) is None:
-        raise CannotCompile(f"expected a C compiler ({', '.join(COMPILERS)}) on the search path, or the variable CC")
+        raise CannotCompile(f"expected a C compiler ({', '.join(COMPILERS)}) on the search path, got none: install one")
     return command
 
 
@@ -60,7 +60,9 @@ def compile_c(command: Sequence[str], flags: Sequence[str], sources: Sequence[st
     try:
         process = subprocess.run(whole, cwd=folder, capture_output=True, text=True, timeout=SECONDS, check=False)
     except (OSError, subprocess.TimeoutExpired) as error:
-        raise CannotCompile(f"expected a C compiler, got {command[0]!r}: {error}") from error
+        raise CannotCompile(
+            f"the C compiler {command[0]!r} can't be run: {error}; set the variable CC to another"
+        ) from error
     if process.returncode:
         message = process.stderr[:SHOWN].strip() or f"exit status {process.returncode}"
         raise CannotCompile(f"{command[0]} refused the sources: {message}")

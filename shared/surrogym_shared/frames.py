@@ -438,7 +438,9 @@ def _final_steps(reply: PolicyReply, steps: int, count: int) -> Array:
         "final_steps", memoryview(b"") if reply.final_steps is None else reply.final_steps, INT64, (count,)
     )
     if count and (final_steps[0] < 0 or final_steps[-1] >= steps or (np.diff(final_steps) < 0).any()):
-        raise FrameError(f"final_steps: expected some of 0..{steps - 1} in order, got {final_steps[:8].tolist()}")
+        raise FrameError(
+            f"final_steps: expected numbers from 0 to {steps - 1} in order, got {final_steps[:8].tolist()}"
+        )
     return final_steps
 
 
@@ -451,7 +453,7 @@ def _final(step: Step | PolicyReply, shape: Shape) -> tuple[Array, Array]:
     count = step.final_lanes.nbytes // INT64.itemsize
     lanes = _own("final_lanes", step.final_lanes, INT64, (count,))
     if count == 0 or lanes.min() < 0 or lanes.max() >= shape.lanes:
-        raise FrameError(f"final_lanes: expected some of 0..{shape.lanes - 1}, got {lanes[:8].tolist()}")
+        raise FrameError(f"final_lanes: expected numbers from 0 to {shape.lanes - 1}, got {lanes[:8].tolist()}")
     return lanes, _own("final_observation", step.final_observation, FLOAT32, (count, shape.observation))
 
 

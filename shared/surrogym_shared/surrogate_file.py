@@ -207,9 +207,9 @@ def _array(entry: Any, body: bytes) -> NDArray[Any]:
     """Return the array that an entry of the header describes. Raises an error in ``UNREADABLE`` if it is invalid."""
     dtype, shape, (start, stop) = DTYPES[entry["dtype"]], [int(n) for n in entry["shape"]], entry["data_offsets"]
     if min(shape, default=0) < 0 or not 0 <= start <= stop <= len(body):
-        raise ValueError(f"an array of shape {shape} from byte {start} to {stop}, where the file has {len(body)}")
+        raise ValueError(f"expected an array within {len(body)} bytes, got one from byte {start} to {stop}")
     if math.prod(shape) * dtype.itemsize != stop - start:
-        raise ValueError(f"an array of shape {shape}, which needs other than its {stop - start} bytes")
+        raise ValueError(f"expected an array of shape {shape} to fill its bytes, got {stop - start} bytes")
     raw = np.frombuffer(body[start:stop], dtype=np.uint8 if dtype == np.bool_ else dtype).reshape(shape)
     return raw.astype(np.bool_ if dtype == np.bool_ else np.float64)
 
@@ -218,7 +218,7 @@ def _pair(pair: Any) -> list[float]:
     """Return [error, standard deviation] of a prediction. Raises an error of ``UNREADABLE`` if they are invalid."""
     error, std = (float(one) for one in pair)
     if not math.isfinite(error) or not 0 <= std < math.inf:
-        raise ValueError(f"a prediction with the error {error} and the standard deviation {std}")
+        raise ValueError(f"expected a finite error and a standard deviation of 0 or more, got {error} and {std}")
     return [error, std]
 
 
@@ -238,4 +238,6 @@ def _require_shapes(spec: EnvironmentSpec, samples: RealSamples) -> None:
             continue
         shape, got = shapes.get(name, (n,)), array.shape
         if got != shape:
-            raise NotASurrogateFile(f"{SAMPLES}{name}: expected shape {shape}, got {got}")
+            raise NotASurrogateFile(
+                f"array {SAMPLES}{name}: expected shape {shape}, got {got}; export the surrogate again"
+            )

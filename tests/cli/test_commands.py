@@ -133,10 +133,8 @@ def test_a_surrogate_can_be_exported_to_a_file_and_imported(surrogym, pendulum_s
         f"next: surrogym train {name}\n"
     )
     taken = surrogym("import", "pendulum.surrogate", "--quiet", *server)
-    assert (taken.code, taken.err) == (
-        1,
-        "error: expected an unused name, got 'pendulum': give another by --name\n",
-    )
+    assert taken.code == 1
+    assert re.match("error: .*'pendulum'.*--name\n$", taken.err)
 
 
 def test_exporting_a_surrogate_without_a_model_is_refused(on_server, pendulum):

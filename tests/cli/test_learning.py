@@ -43,7 +43,7 @@ def diary(tmp_path, monkeypatch):
 
 def test_evaluate_with_wait_but_without_learn_is_refused():
     """It was ignored, and a person took the model of before for the one that had learned."""
-    with pytest.raises(CommandError, match="expected --wait with --learn or --learn-all, got neither"):
+    with pytest.raises(CommandError, match="expected --wait together with --learn"):
         Differences(wait=5.0).check(EvaluationSettings())
     Differences(wait=5.0, learn_all=True).check(EvaluationSettings())
     Differences(wait=5.0, learn=3).check(EvaluationSettings())

@@ -22,8 +22,8 @@ def line(server_process):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (("--on-ray", "2", "--once"), "--on-ray: expected --until-done or --time-limit to end it"),
-        (("--runtime-env", "env.yaml"), "--runtime-env: expected --on-ray N with it, got none"),
+        (("--on-ray", "2", "--once"), "--on-ray: expected --until-done or --time-limit, got --once"),
+        (("--runtime-env", "env.yaml"), "--runtime-env: expected --on-ray N"),
         (("--on-ray", "2", "--ray-resources", "CPU=-1"), "--ray-resources: expected NAME=AMOUNT"),
         (("--on-ray", "2", "--ray-resources", "robot"), "--ray-resources: expected NAME=AMOUNT"),
         (

@@ -125,7 +125,7 @@ def test_without_any_answer_nothing_can_be_fitted():
         ({"reward": np.inf}, "reward: expected a finite number"),
         ({"reward": "x"}, "reward: expected numbers, got 'x'"),
         ({"reward": None}, "reward: expected numbers, got None"),
-        ({"reward": 1e300}, "reward: expected a finite number within 1e[+]12, got 1e[+]300"),
+        ({"reward": 1e300}, "reward: expected .* 1e[+]12.*, got 1e[+]300"),
         (
             {"coordinates": [1e300, 0.0]},
             "coordinates: expected '.*' from .* to .*, got 1e[+]300",
@@ -180,7 +180,7 @@ def test_a_query_of_another_design_is_refused(spec: surrogym.EnvironmentSpec):
     for refused in (design.tell, lambda query, _: design.give_up(query)):
         with pytest.raises(InvalidInput, match="got query 1, which belongs to another design"):
             refused(theirs, step)
-    with pytest.raises(InvalidInput, match="expected a Query that was asked, got str"):
+    with pytest.raises(InvalidInput, match=r"expected a Query .*, got str"):
         design.tell("x", step)  # type: ignore[arg-type]
     design.give_up(mine)
     with pytest.raises(InvalidInput, match="got query 1, which was given up"):

@@ -92,7 +92,7 @@ def test_comment_lines_between_rows_are_counted(tmp_path: Path):
         (b"\x89HDF\r\n\x1a\n" + bytes(200), "expected an HDF5 file in .*, got one that can't be read"),
         (b'[{"x": 1, "action": 2}]', "got JSON"),
         (b"<html><table>", "got JSON, XML or HTML"),
-        (b"x,action\n1,2\n\x00\x01\x02", "got bytes that are none"),
+        (b"x,action\n1,2\n\x00\x01\x02", "got bytes in another format"),
         (b"\x81\x8d\x01abc", "got other bytes"),
         ("state_x,action,reward\n".encode("utf-16")[:-1], "UTF-16 .* the file may be cut off"),
     ],
@@ -137,7 +137,5 @@ def test_a_repeated_column_only_matters_if_it_is_used(tmp_path: Path):
     assert len(log.steps)
     assert log.ignored == {"note": "it has no role"}
     path.write_text(path.read_text().replace("note", "action", 1))
-    with pytest.raises(
-        UnusableLog, match="expected each column that is used once in the heading, got 'action' 2 times"
-    ):
+    with pytest.raises(UnusableLog, match="got 'action' 2 times"):
         read_log(path)

@@ -148,7 +148,7 @@ def test_an_older_or_newer_server_is_refused():
 def test_an_answer_that_is_no_step_is_refused(body: str):
     with scripted_server(session_view(), reply(body)) as server, surrogate(server) as port:
         port.open(wire.OpenSession(num_envs=2))
-        with pytest.raises(errors.ProtocolMismatch, match="unexpected answer of /v1/sessions/abc/step"):
+        with pytest.raises(errors.ProtocolMismatch, match="/v1/sessions/abc/step"):
             port.step("abc", ACTION)
 
 

@@ -264,7 +264,7 @@ def command(
             f"{policy!r}; of a surrogate only an fmu can be made"
         )
     if named and (checking != Checking() or faults != Faults() or reading != PolicyReading() or spec is not None):
-        raise CommandError("expected no option of a policy with a surrogate: only --out and --period")
+        raise CommandError("a surrogate as an fmu takes only --out and --period: leave out all options of policies")
     if named:
         twin = write_twin(context, policy, out, period, service)
         output.give(twin, lambda: in_words(twin))

@@ -75,7 +75,8 @@ class Differences:
             raise CommandError("expected --learn or --learn-all, got both; give one of the two")
         if self.wait and not self.learns:
             raise CommandError(
-                "expected --wait with --learn or --learn-all, got neither: there is no model to wait for"
+                "expected --wait together with --learn or --learn-all, got --wait alone: add one of the two, or leave "
+                "--wait out"
             )
         if self.learns and settings.perturb:
             option = "--learn-all" if self.learn_all else "--learn"

@@ -110,7 +110,9 @@ def command(
 
     if format_of(file) == "surrogate":
         if given := [f"--{name}" for name, value in vars(log).items() if value is not None]:
-            raise CommandError(f"{file} is a surrogate's file: {given[0].replace('mapping', 'map')} is for logs")
+            raise CommandError(
+                f"{file} is a surrogate's file: leave out {given[0].replace('mapping', 'map')}, an option for logs"
+            )
         _import_surrogate(context, file, name, service, output)
         return
     if name is not None:

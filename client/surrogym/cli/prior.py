@@ -92,7 +92,7 @@ def command(
             return
         target = _Target(api, calls, view)
         if simulator == OTHER + surrogate:
-            raise CommandError(f"expected another surrogate than {surrogate} itself")
+            raise CommandError(f"expected another surrogate as the prior, got {surrogate} itself: name another")
         if _is_model(simulator) and (parameter or steps):
             raise CommandError(f"expected no --parameter and no --steps with {simulator}: a model has no parameters")
         if (file := _file_of(api, simulator)) is not None:
@@ -131,7 +131,7 @@ class _Target:
             if view.phase == "failed":
                 raise CommandError(f"the design of {name!r} failed: {view.error}")
             if present.about is None and not present.awaited:
-                raise CommandError(f"the prior of {name!r} was dropped by another command")
+                raise CommandError(f"another command removed the prior of {name!r}: run this command again to set it")
             is_new = view.samples > used and view.samples >= LEAST
             if is_new and (used or not _asked(view)):
                 real, used = self._real_steps(), view.samples

@@ -175,8 +175,8 @@ def _sorted_out(
     if file is not None:
         if spec is not None:
             raise CommandError(
-                f"expected one specification, got the argument {file} and --spec {spec}: the environment of a "
-                "named surrogate is given by --env"
+                f"expected one specification, got the argument {file} and --spec {spec}: leave one out, and give the "
+                "environment by --env"
             )
         spec = file
     if file is None and env is None:

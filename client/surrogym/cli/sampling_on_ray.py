@@ -47,9 +47,13 @@ class RayOptions:
             worker_limits: whether ``--once`` or ``--max-queries`` was given.
         """
         if self.on_ray is None and self.runtime_env is not None:
-            raise CommandError("--runtime-env: expected --on-ray N with it, got none")
+            raise CommandError(
+                "--runtime-env: expected --on-ray N as well, got none: add it, or leave --runtime-env out"
+            )
         if self.on_ray is not None and worker_limits:
-            raise CommandError("--on-ray: expected --until-done or --time-limit to end it, got --once or --max-queries")
+            raise CommandError(
+                "--on-ray: expected --until-done or --time-limit, got --once or --max-queries: replace it"
+            )
 
 
 def samplers_on_ray(options: RayOptions, plan: SamplerPlan) -> RaySamplers:

@@ -46,7 +46,7 @@ def write_twin(
     name = Path(surrogate).stem
     path = out / f"{name}.fmu"
     if out.exists() and (not out.is_dir() or any(one != path for one in out.iterdir())):
-        raise CommandError(f"expected a new or an empty folder, got {out} with other files: nothing was written")
+        raise CommandError(f"expected a new or an empty folder, got {out} with other files: name another by --out")
     if surrogate.endswith(FILE):
         content = Path(surrogate).read_bytes()
     else:

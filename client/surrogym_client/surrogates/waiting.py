@@ -115,7 +115,7 @@ def wait_for_design(
         if view.phase in COMPLETED and view.round > after_round and not _under_way(view):
             return view
         if view.phase == "failed":
-            raise DesignUnfinished(f"the design of {name!r} failed: {view.error}")
+            raise DesignUnfinished(f"the design of {name!r} failed: {view.error}; surrogym status {name} shows more")
     raise DesignUnfinished(
         f"the design of {name!r} has not ended after {seconds:g} s, its phase is {_phase(view)}: see surrogym "
         f"status {name}"
@@ -162,7 +162,7 @@ def wait_for_model(
         if view.fidelity is not None and view.fidelity.samples >= view.samples:
             return view
         if view.phase == "failed":
-            raise DesignUnfinished(f"the fit of {name!r} failed: {view.error}")
+            raise DesignUnfinished(f"the fit of {name!r} failed: {view.error}; surrogym status {name} shows more")
     if view is not None and view.phase == "fitting":
         raise DesignUnfinished(
             f"the fit of {view.samples} steps of {name!r} has not ended after {seconds:g} s; it "

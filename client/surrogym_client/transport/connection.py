@@ -305,8 +305,8 @@ def _body(response: httpx.Response) -> bytes:
         if response.status_code in _GATEWAY_STATUSES:
             raise httpx.RemoteProtocolError(f"a gateway answered {response.status_code}") from None
         raise ProtocolMismatch(
-            f"expected a Surrogym server at {response.url}, got status {response.status_code} "
-            f"of type {kind or 'unknown'!r}"
+            f"expected a Surrogym server at {response.url}, got an answer with status {response.status_code} and "
+            f"content type {kind or 'unknown'!r}: check the address"
         ) from None
     raise error_from_problem(problem)
 

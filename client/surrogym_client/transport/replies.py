@@ -24,7 +24,7 @@ def parse(reply: type[R], content: bytes, path: str) -> R:
     except ValidationError as error:
         from surrogym_shared.faults import first_fault  # only for an error
 
-        raise ProtocolMismatch(f"unexpected answer of {path}: {first_fault(error)}") from error
+        raise ProtocolMismatch(f"the answer of {path} can't be read: {first_fault(error)}") from error
 
 
 def new_key() -> str:

@@ -78,6 +78,7 @@ def _compiled(command: tuple[str, ...], sources: dict[str, str], names: list[str
         compile_c(command, FLAGS, names, library, Path(folder))
         if subprocess.run([sys.executable, "-c", LOADS, str(library)], capture_output=True, check=False).returncode:
             raise CannotCompile(
-                f"expected a C compiler for this machine, got {command[0]}: its library can't be loaded"
+                f"expected a C compiler for this machine, got {command[0]}, whose library can't be loaded: set the "
+                "variable CC to another"
             )
         return library.read_bytes()

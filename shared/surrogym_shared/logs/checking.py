@@ -173,7 +173,9 @@ def _require_choices(spec: EnvironmentSpec, roles: Roles, values: Floats) -> Non
     for name, count, column in zip(roles.action, counts, values.T, strict=True):
         if (declared := roles.choices.get(name)) is not None:
             if len(declared) != count:
-                raise UnusableLog(f"action {name}: expected {count} choices in discrete, got {list(declared)}")
+                raise UnusableLog(
+                    f"action {name}: expected {count} choices in discrete, as specified, got {list(declared)}"
+                )
             continue
         present = set(np.unique(column[np.isfinite(column)]).tolist())
         missing = set(range(count)) - present

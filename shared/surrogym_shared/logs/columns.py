@@ -334,7 +334,7 @@ def _require_declared(mapped: LogMapping, state: Iterable[str], action: Iterable
             what = "one of" if key == "limits" else "one of the states"
             raise UnusableLog(f"{where} names {unknown[0]!r} in {key}: expected {what} {choices}")
     if both := sorted(set(mapped.angles or ()) & set(mapped.constants)):
-        raise UnusableLog(f"{where}: expected {both[0]!r} in angles or in constants, got it in both")
+        raise UnusableLog(f"{where}: expected {both[0]!r} in angles or in constants, got it in both: remove one")
     if both := sorted(set(mapped.limits) & set(states) & set(actions)):
         raise UnusableLog(
             f"{where}: expected limits of a state or of an action, got {both[0]!r}, which is both: rename one of them"

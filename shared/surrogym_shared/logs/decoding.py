@@ -69,7 +69,7 @@ def decoded(content: bytes, where: str) -> tuple[str, tuple[str, ...]]:
         ) from error
     if "\0" in text:
         raise UnusableLog(
-            f"expected text, NPZ, Parquet or a surrogate's file in {where}, got bytes that are none of them"
+            f"expected text, NPZ, Parquet or a surrogate's file in {where}, got bytes in another format: {AS_CSV}"
         )
     return text, () if name == "UTF-8" else (f"the text is in {name}",)
 
@@ -90,5 +90,5 @@ def _windows(content: bytes, where: str) -> tuple[str, tuple[str, ...]]:
     except UnicodeDecodeError:
         text = "\0"
     if any((letter < " " and letter not in "\t\n\r\f") or letter == "\x7f" for letter in text):
-        raise UnusableLog(f"expected text, NPZ, Parquet or a surrogate's file, got other bytes in {where}")
+        raise UnusableLog(f"expected text, NPZ, Parquet or a surrogate's file, got other bytes in {where}: {AS_CSV}")
     return text, (f"the text is not UTF-8, and was read as {WINDOWS} (Windows): check the names, or save it as UTF-8",)

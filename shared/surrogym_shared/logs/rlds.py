@@ -40,10 +40,10 @@ def from_rlds(table: Table) -> Table:
             f"{int(first[odd[0]])} in line {table.lines[odd[0]]}"
         )
     if (odd := np.flatnonzero(terminal & ~last)).size:
-        raise UnusableLog(f"expected {TERMINAL} only where {LAST} is 1, got it in line {table.lines[odd[0]]}")
+        raise UnusableLog(f"expected {TERMINAL} only where {LAST} is 1, got 1 and 0 in line {table.lines[odd[0]]}")
     rows = np.flatnonzero(~last[:-1])
     if not len(rows):
-        raise UnusableLog(f"expected steps of RLDS, got none: each row has {LAST}, or no row after it")
+        raise UnusableLog(f"expected steps of RLDS, got none: each row is marked by {LAST}, or is the last row")
     columns = {name: cells for name, cells in table.columns.items() if name not in marks.values()}
     states = roles_by_name(list(columns)).state
     columns_of_steps = {name: cells[rows] for name, cells in columns.items()}

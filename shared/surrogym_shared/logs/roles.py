@@ -92,7 +92,9 @@ def read_roles(table: Table, mapping: Path | Mapping[str, Any] | LogMapping | No
         roles = replace(roles, discrete=table.discrete, limits={**table.limits, **roles.limits})
     if twice := [name for name in roles.used if name in table.repeated]:
         count = table.repeated[twice[0]]
-        raise UnusableLog(f"expected each column that is used once in the heading, got {twice[0]!r} {count} times")
+        raise UnusableLog(
+            f"expected different names of used columns, got {twice[0]!r} {count} times: rename the columns"
+        )
     return table, roles
 
 
