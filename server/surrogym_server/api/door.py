@@ -75,7 +75,7 @@ class Door:
     def _media_type(self, scope: Scope) -> str:
         given = raw_header(scope, b"content-type").decode("latin-1").partition(";")[0].strip().lower()
         if given not in self.bodies:
-            raise HTTPException(415, f"expected content type {' or '.join(self.bodies)}, got {given or 'no type'}")
+            raise HTTPException(415, f"expected content type {' or '.join(self.bodies)}, got {given or 'none'}")
         encoding = raw_header(scope, b"content-encoding").decode("latin-1").strip().lower()
         if encoding not in ("", "identity"):
             raise HTTPException(415, f"expected a body without content encoding, got {encoding!r}: send it plain")
