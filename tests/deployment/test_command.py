@@ -164,8 +164,8 @@ def test_deploying_a_surrogate_name_is_refused_with_the_form_of_policy_names(sur
     for arguments, words in [
         (["pendulum", "--target", "c"], "pendulum@1 or pendulum@production"),
         (["twin.surrogate", "--target", "onnx"], "of a surrogate only an fmu"),
-        (["pendulum", "--target", "fmu", "--trust-policy"], "no option of a policy"),
-        (["pendulum", "--target", "fmu", "--env", "Pendulum-v1"], "no option of a policy"),
+        (["pendulum", "--target", "fmu", "--trust-policy"], "only --out and --period"),
+        (["pendulum", "--target", "fmu", "--env", "Pendulum-v1"], "only --out and --period"),
     ]:
         said = surrogym("deploy", *arguments, "--out", "c")
         assert (said.code, words in said.err.replace("\n", " ")) == (1, True), said.err

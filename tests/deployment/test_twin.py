@@ -270,4 +270,4 @@ def test_the_command_writes_the_fmu_of_a_surrogate_file(surrogate, tmp_path, cap
         [*command, "new", "--fallback", "0"],
     ):
         said = surrogym(*other)
-        assert (said.code, "no option of a policy" in said.err) == (1, True)
+        assert (said.code, "only --out and --period" in said.err) == (1, True)
