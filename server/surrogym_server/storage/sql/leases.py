@@ -278,7 +278,7 @@ def _check_steps(lease: Answered, steps: set[int]) -> None:
             )
     elif steps != set(range(len(steps))) or len(steps) > lease.steps:
         raise InvalidInput(
-            f"expected all steps from 0 on of query {lease.query_id}, at most {lease.steps} steps, got the steps "
+            f"expected steps 0, 1, ... of query {lease.query_id}, at most {lease.steps} of them, got the steps "
             f"{sorted(steps)}: send the whole answer in one request"
         )
 
