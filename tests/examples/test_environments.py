@@ -18,7 +18,7 @@ from surrogym_sampler.original.protocol import RolloutEnvironment
 ENVIRONMENT_LINES = 60  # of one's own environment, without blank ones
 
 
-def test_the_drone_is_learned_trained_on_and_evaluated(server: ServerProcess, tmp_path: Path) -> None:
+def test_the_drone_example_can_be_learned_trained_on_and_evaluated(server: ServerProcess, tmp_path: Path) -> None:
     surrogym(server, tmp_path, "register", "drone:Drone", "--name", "drone", "--budget", "10", "--initial", "10")
     report = surrogym(server, tmp_path, "sample", "drone", "--env", "drone:Drone", "--until-done", "--json")
     assert json.loads(report)["steps"] == 10
@@ -27,12 +27,12 @@ def test_the_drone_is_learned_trained_on_and_evaluated(server: ServerProcess, tm
     assert json.loads(evaluated)["episodes"] == 2
 
 
-def test_the_drone_is_as_short_as_the_docs_say() -> None:
+def test_the_drone_example_is_as_short_as_the_docs_say() -> None:
     lines = (EXAMPLES / "drone.py").read_text(encoding="utf-8").splitlines()
     assert sum(bool(line) for line in lines) <= ENVIRONMENT_LINES
 
 
-def test_four_samplers_share_the_queries_of_a_slow_simulator(server: ServerProcess, tmp_path: Path) -> None:
+def test_four_samplers_share_the_queries_of_the_slow_simulator_example(server: ServerProcess, tmp_path: Path) -> None:
     surrogym(
         server, tmp_path, "register", "slow_simulator:SlowPendulum", "--name", "slow", "--budget", "8", "--initial", "8"
     )
@@ -44,7 +44,7 @@ def test_four_samplers_share_the_queries_of_a_slow_simulator(server: ServerProce
     assert len(set(workers)) >= 2
 
 
-def test_the_robot_that_can_be_set_to_no_state_is_sampled(server: ServerProcess, tmp_path: Path) -> None:
+def test_the_reset_only_robot_example_can_be_sampled(server: ServerProcess, tmp_path: Path) -> None:
     surrogym(server, tmp_path, "register", "robot:Joint", "--name", "joint", "--budget", "14")
     report = surrogym(
         server, tmp_path, "sample", "joint", "--env", "robot:Joint", "--until-done", "--json", ROBOT_PERIOD="0"
@@ -52,7 +52,7 @@ def test_the_robot_that_can_be_set_to_no_state_is_sampled(server: ServerProcess,
     assert 12 <= json.loads(report)["steps"] <= 14
 
 
-def test_an_fmu_is_controlled_by_a_policy_from_its_surrogate(server: ServerProcess, tmp_path: Path) -> None:
+def test_a_policy_trained_on_the_surrogate_of_an_fmu_controls_the_fmu(server: ServerProcess, tmp_path: Path) -> None:
     pytest.importorskip("fmpy")
     pytest.importorskip("pythonfmu")
     program = [str(EXAMPLES / "fmus" / "control.py"), "TwoTanks", "--budget", "10", "--steps", "2048"]
@@ -62,7 +62,7 @@ def test_an_fmu_is_controlled_by_a_policy_from_its_surrogate(server: ServerProce
 
 
 @pytest.mark.parametrize("name", ["bump:Bump", "noisy_mass:NoisyMass"])
-def test_environments_of_the_decisions_take_a_step(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_example_environments_of_the_decision_pages_take_a_step(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(EXAMPLES)
     environment = make(name)
     assert isinstance(environment, OriginalEnvironment)
@@ -74,7 +74,9 @@ def test_environments_of_the_decisions_take_a_step(name: str, monkeypatch: pytes
 
 
 @pytest.mark.parametrize(("name", "history"), [("dead_time:Vessel", 4), ("hidden_speed:AngleAlone", 1)])
-def test_environments_with_a_past_are_learned(name: str, history: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_example_environments_with_lagged_dynamics_are_learned(
+    name: str, history: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.syspath_prepend(EXAMPLES)
     machine = make(name)
     assert isinstance(machine, RolloutEnvironment)
@@ -87,5 +89,5 @@ def test_environments_with_a_past_are_learned(name: str, history: int, monkeypat
     assert moved.feature_map.history in (None, history), "None: all that are declared"
 
 
-def test_the_notebook_runs_from_its_first_cell_to_its_last(server: ServerProcess, tmp_path: Path) -> None:
+def test_every_cell_of_the_example_notebook_runs(server: ServerProcess, tmp_path: Path) -> None:
     run(server, tmp_path, "-W", "error", "-c", cells(EXAMPLES / "first_steps.ipynb"))

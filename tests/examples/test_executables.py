@@ -45,13 +45,13 @@ def rail_in_shell() -> str:
 
 
 @pytest.mark.parametrize("example", ["cartpole_in_c", "tank_in_node", "rail_in_shell"])
-def test_an_example_keeps_the_protocol(example: str, request: pytest.FixtureRequest):
+def test_every_example_program_passes_the_protocol_checks(example: str, request: pytest.FixtureRequest):
     checked = list(conformance(request.getfixturevalue(example), 30.0))
     assert {outcome.name: outcome.failure for outcome in checked if outcome.failure} == {}
     assert len(checked) > 10
 
 
-def test_cartpole_in_c_steps_as_gymnasium_does(cartpole_in_c: str):
+def test_the_cart_pole_example_in_c_steps_like_gymnasium(cartpole_in_c: str):
     rng, task = np.random.default_rng(0), original.make("CartPole-v1")
     plant = original.make(f"exec:{cartpole_in_c}")
     try:
@@ -65,6 +65,6 @@ def test_cartpole_in_c_steps_as_gymnasium_does(cartpole_in_c: str):
         task.close()
 
 
-def test_cartpole_in_c_declares_what_gymnasium_has():
+def test_the_cart_pole_example_in_c_declares_the_spaces_and_limits_of_gymnasium():
     own = EnvironmentSpec.model_validate_json((FOLDER / "cartpole.json").read_text())
     assert own == cartpole().model_copy(update={"environment": "cartpole-c"})

@@ -112,18 +112,18 @@ PROGRAMS = {
 PAGE = ROOT / "docs" / "how-to" / "trainers.md"
 
 
-def test_the_lines_of_the_how_to_are_those_that_run() -> None:
+def test_the_library_examples_in_the_how_to_page_are_those_tested() -> None:
     table = PAGE.read_text(encoding="utf-8").partition("| library | line |")[2].partition("\n\n")[0]
     lines = re.findall(r"\| `([^`]+)`", table)
     assert len(lines) == 8
     assert [line for line in lines if not any(line in program for program in (GYMNASIUM, *PROGRAMS.values()))] == []
 
 
-def test_gymnasium(server: ServerProcess, tmp_path: Path) -> None:
+def test_the_gymnasium_example_program_runs(server: ServerProcess, tmp_path: Path) -> None:
     run(server, tmp_path, "-c", GYMNASIUM)
 
 
 @needs_extras
 @pytest.mark.parametrize("name", PROGRAMS)
-def test_a_library_takes_a_surrogate_as_it_takes_gymnasiums(server: ServerProcess, tmp_path: Path, name: str) -> None:
+def test_the_example_program_of_every_supported_library_runs(server: ServerProcess, tmp_path: Path, name: str) -> None:
     run(server, tmp_path, "-c", PROGRAMS[name], python=str(EXTRAS))

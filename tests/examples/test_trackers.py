@@ -11,14 +11,14 @@ TRAIN = ("-m", "surrogym", "train", "pendulum", "--steps", "1024", "--num-envs",
 
 
 @needs_extras
-def test_weights_and_biases(server: ServerProcess, tmp_path: Path) -> None:
+def test_a_training_logs_its_curves_to_weights_and_biases(server: ServerProcess, tmp_path: Path) -> None:
     run(server, tmp_path, *TRAIN, "--log", "wandb", python=str(EXTRAS), WANDB_MODE="offline")
     (log,) = (tmp_path / "wandb").glob("offline-run-*/run-*.wandb")
     assert b"surrogym/imagined_return" in log.read_bytes()
 
 
 @needs_extras
-def test_mlflow(server: ServerProcess, tmp_path: Path) -> None:
+def test_a_training_logs_its_curves_to_mlflow(server: ServerProcess, tmp_path: Path) -> None:
     store = f"sqlite:///{tmp_path}/mlflow.db"
     run(server, tmp_path, *TRAIN, "--log", "mlflow", python=str(EXTRAS), MLFLOW_TRACKING_URI=store)
     ask = (

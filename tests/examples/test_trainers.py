@@ -12,34 +12,34 @@ def program(name: str) -> str:
     return str(EXAMPLES / name)
 
 
-def test_stable_baselines3(server: ServerProcess, tmp_path: Path) -> None:
+def test_the_stable_baselines3_example_trains_on_a_surrogate(server: ServerProcess, tmp_path: Path) -> None:
     said = run(server, tmp_path, program("train_sb3.py"), "pendulum", "--steps", "2048")
     assert "imagined return: -" in said
     assert (tmp_path / "sb3.zip").exists()
     assert list((tmp_path / "runs" / "sb3").rglob("events.out.tfevents.*"))
 
 
-def test_a_plain_loop(server: ServerProcess, tmp_path: Path) -> None:
+def test_the_plain_loop_example_trains_on_a_surrogate(server: ServerProcess, tmp_path: Path) -> None:
     said = run(server, tmp_path, program("train_cleanrl.py"), "pendulum", "--steps", str(7 * 2048))
     assert said.startswith("14336 steps, imagined return -")
     assert (tmp_path / "cleanrl.pt").exists()
 
 
 @needs_extras
-def test_torchrl(server: ServerProcess, tmp_path: Path) -> None:
+def test_the_torchrl_example_trains_on_a_surrogate(server: ServerProcess, tmp_path: Path) -> None:
     said = run(server, tmp_path, program("train_torchrl.py"), "pendulum", "--steps", str(7 * 1024), python=str(EXTRAS))
     assert "imagined return -" in said
     assert (tmp_path / "torchrl.pt").exists()
 
 
 @needs_extras
-def test_tianshou(server: ServerProcess, tmp_path: Path) -> None:
+def test_the_tianshou_example_trains_on_a_surrogate(server: ServerProcess, tmp_path: Path) -> None:
     said = run(server, tmp_path, program("train_tianshou.py"), "pendulum", "--steps", "2048", python=str(EXTRAS))
     assert "imagined return: -" in said
     assert (tmp_path / "tianshou.pt").exists()
 
 
 @needs_extras
-def test_rllib(server: ServerProcess, tmp_path: Path) -> None:
+def test_the_rllib_example_trains_on_a_surrogate(server: ServerProcess, tmp_path: Path) -> None:
     said = run(server, tmp_path, program("train_rllib.py"), "pendulum", "--iterations", "2", python=str(EXTRAS))
     assert "iteration 2: imagined return -" in said

@@ -43,7 +43,7 @@ def done() -> surrogym.Design:
     return design
 
 
-def test_pendulum_is_known_after_a_few_real_steps():
+def test_an_in_process_design_learns_the_pendulum_in_at_most_12_real_steps():
     design = surrogym.Design(pendulum(), budget=30)
     asked = run(design)
     assert (design.phase, design.steps) == ("ready", len(asked))
@@ -52,7 +52,7 @@ def test_pendulum_is_known_after_a_few_real_steps():
     assert {query.purpose for query in asked} == {"initial", "adaptive"}
 
 
-def test_its_queries_equal_those_of_a_server(server_process: ServerProcess):
+def test_an_in_process_design_asks_the_same_queries_as_the_server(server_process: ServerProcess):
     design = surrogym.Design(small())
     asked = run(design)
     with surrogym.Client(server_process.url) as client:
@@ -70,7 +70,7 @@ def test_its_queries_equal_those_of_a_server(server_process: ServerProcess):
     assert max(one.predictions for one in scores if one is not None) == BUDGET - INITIAL
 
 
-def test_the_next_round_waits_for_the_answers_of_this_one():
+def test_asking_for_the_next_round_before_all_answers_raises():
     design = surrogym.Design(small())
     queries = [design.ask() for _ in range(INITIAL)]
     with pytest.raises(surrogym.QueriesOpen, match=r"the queries \[1, 2, 3, 4, 5\] first") as caught:
@@ -78,7 +78,7 @@ def test_the_next_round_waits_for_the_answers_of_this_one():
     assert caught.value.ids == tuple(query.id for query in queries if query)
 
 
-def test_a_query_without_an_answer_counts_against_the_budget():
+def test_a_query_that_was_given_up_counts_against_the_budget():
     design = surrogym.Design(small(budget=INITIAL))
     real = GymnasiumEnvironment(design.spec)
     lost = design.ask()
@@ -90,7 +90,7 @@ def test_a_query_without_an_answer_counts_against_the_budget():
         design.give_up(lost)
 
 
-def test_a_round_that_is_given_up_is_followed_by_another_until_none_is_left_in_the_budget():
+def test_giving_up_every_adaptive_query_ends_the_design_unsure():
     design = surrogym.Design(small())
     real = GymnasiumEnvironment(design.spec)
     while (query := design.ask()) is not None:
@@ -101,7 +101,7 @@ def test_a_round_that_is_given_up_is_followed_by_another_until_none_is_left_in_t
     assert (design.phase, design.steps) == ("unsure", INITIAL)
 
 
-def test_without_any_answer_nothing_can_be_fitted():
+def test_asking_after_all_queries_were_given_up_raises():
     design = surrogym.Design(small(budget=2))
     for query in (design.ask(), design.ask()):
         assert query is not None
@@ -142,7 +142,7 @@ def test_without_any_answer_nothing_can_be_fitted():
         ({"truncated": 2}, "truncated: expected True or False, got 2"),
     ],
 )
-def test_a_step_that_can_not_be_is_refused_and_the_query_stays_open(change: dict[str, Any], said: str):
+def test_an_invalid_real_step_is_refused_and_its_query_stays_open(change: dict[str, Any], said: str):
     design = surrogym.Design(small())
     query = design.ask()
     step = {"coordinates": query.coordinates, "action": query.action, "next_coordinates": [0.0, 0.0], "reward": 0.0}
@@ -160,7 +160,7 @@ def test_a_step_that_can_not_be_is_refused_and_the_query_stays_open(change: dict
     assert design.steps == 1
 
 
-def test_a_step_as_far_out_as_one_may_be_can_be_fitted():
+def test_a_real_step_with_the_largest_accepted_values_can_be_fitted():
     """What can't be fitted is refused when it is told: no later ``ask`` could mend it."""
     design, real = surrogym.Design(small()), GymnasiumEnvironment(small())
     design.tell(None, surrogym.RealStep([0.0, 1.6e7], [0.0], [0.0, -1.6e7], 1e12))
@@ -202,7 +202,7 @@ def test_a_query_of_another_design_is_refused(spec: surrogym.EnvironmentSpec):
         *[({"threads": wrong}, "threads: expected a whole number from 1") for wrong in (0, 1.5, 10**9, "1")],
     ],
 )
-def test_an_option_out_of_its_range_is_refused(options: dict[str, Any], said: str):
+def test_an_out_of_range_option_of_a_design_is_refused(options: dict[str, Any], said: str):
     if options == {"target": None}:
         assert surrogym.Design(small(), **options).target == small().design.target
         return
@@ -210,7 +210,7 @@ def test_an_option_out_of_its_range_is_refused(options: dict[str, Any], said: st
         surrogym.Design(small(), **options)
 
 
-def test_a_query_may_come_back_from_another_process():
+def test_a_pickled_query_can_be_answered_by_its_design():
     design = surrogym.Design(small())
     query = pickle.loads(pickle.dumps(design.ask()))
     design.give_up(query)
@@ -220,12 +220,12 @@ def test_a_query_may_come_back_from_another_process():
     copied.give_up(second)
 
 
-def test_an_invalid_specification_is_refused():
+def test_a_design_of_an_invalid_specification_is_refused():
     with pytest.raises(InvalidInput, match="spec: expected an EnvironmentSpec, got dict"):
         surrogym.Design({})  # type: ignore[arg-type]
 
 
-def test_numbers_of_numpy_are_numbers():
+def test_a_design_accepts_numpy_numbers_as_options():
     assert surrogym.Design(small(), budget=np.int64(6), target=np.float64(0.9)).budget == 6
 
 
@@ -241,7 +241,7 @@ def test_numbers_of_numpy_are_numbers():
         (1, [[1e308, 0.0]], "visited: expected '.*' from"),
     ],
 )
-def test_an_impossible_request_for_more_queries_changes_nothing(steps: Any, visited: Any, said: str):
+def test_an_invalid_improve_request_changes_nothing(steps: Any, visited: Any, said: str):
     design = surrogym.Design(pendulum(), budget=20)
     before = (design._extra, design._visited)
     with pytest.raises(InvalidInput, match=said):
@@ -249,7 +249,7 @@ def test_an_impossible_request_for_more_queries_changes_nothing(steps: Any, visi
     assert (design._extra, design._visited) == before
 
 
-def test_queries_near_visited_states_can_be_added_within_the_budget():
+def test_improve_adds_queries_near_visited_states_within_the_budget():
     design = surrogym.Design(pendulum(), budget=20)
     before = len(run(design))
     design.improve(2, np.zeros((50, 2)))
@@ -259,7 +259,7 @@ def test_queries_near_visited_states_can_be_added_within_the_budget():
     assert design.steps >= before + 2
 
 
-def test_the_model_is_an_environment(done: surrogym.Design):
+def test_a_gymnasium_environment_can_be_made_from_a_design_with_a_model(done: surrogym.Design):
     env = surrogym.make(done)
     env.reset(seed=0)
     assert env.step(env.action_space.sample())[0].shape == (3,)
@@ -269,7 +269,7 @@ def test_the_model_is_an_environment(done: surrogym.Design):
         surrogym.make(surrogym.Design(small()))
 
 
-def test_it_is_saved_and_continues(done: surrogym.Design, tmp_path: Path):
+def test_a_saved_design_can_be_loaded_and_continued(done: surrogym.Design, tmp_path: Path):
     done.save(tmp_path / "pendulum.surrogate", "pendulum")
     assert SurrogateFile.load(tmp_path / "pendulum.surrogate").name == "pendulum"
     assert surrogym.make(tmp_path / "pendulum.surrogate").reset(seed=0)[0].shape == (3,)
@@ -283,7 +283,9 @@ def test_it_is_saved_and_continues(done: surrogym.Design, tmp_path: Path):
 @pytest.mark.parametrize(
     ("budget", "target", "phase"), [(30, None, "ready"), (INITIAL, None, "over_budget"), (30, 0.6, "ready")]
 )
-def test_a_design_that_has_ended_is_loaded_as_it_was(tmp_path: Path, budget: int, target: float | None, phase: str):
+def test_an_ended_design_is_loaded_with_phase_budget_and_model(
+    tmp_path: Path, budget: int, target: float | None, phase: str
+):
     """Nothing is missing: no fit and no real step is needed to use its model, or to hear that it is known."""
     design = surrogym.Design(small(budget=20), budget=budget, target=target)
     run(design)
@@ -302,7 +304,7 @@ def test_a_design_that_has_ended_is_loaded_as_it_was(tmp_path: Path, budget: int
         assert again.ask() is not None
 
 
-def test_a_design_that_was_under_way_is_loaded_and_asks_for_more(tmp_path: Path):
+def test_an_unfinished_design_is_loaded_and_asks_further_queries(tmp_path: Path):
     design, real = surrogym.Design(small(budget=20), target=0.99999), GymnasiumEnvironment(small())
     while (query := design.ask()) is not None and query.purpose == "initial":
         design.tell(query, real.step_from(np.array(query.coordinates), np.array(query.action)))
@@ -315,7 +317,7 @@ def test_a_design_that_was_under_way_is_loaded_and_asks_for_more(tmp_path: Path)
     assert again.ask() is not None
 
 
-def test_a_file_that_is_not_there_is_named(tmp_path: Path):
+def test_opening_a_missing_surrogate_file_raises_an_error_that_names_it(tmp_path: Path):
     for opened in (surrogym.make, surrogym.make_vec, surrogym.make_sb3, surrogym.Design.load):
         with pytest.raises(
             FileNotFoundError, match=r"expected a file that Design.save or surrogym export wrote, got no"
@@ -323,7 +325,7 @@ def test_a_file_that_is_not_there_is_named(tmp_path: Path):
             opened(tmp_path / "nofile.surrogate")
 
 
-def test_a_policy_of_stable_baselines_trains_on_it(done: surrogym.Design, tmp_path: Path):
+def test_a_stable_baselines3_policy_trains_on_an_in_process_design(done: surrogym.Design, tmp_path: Path):
     from stable_baselines3 import PPO
 
     done.save(tmp_path / "it.surrogate", "it")
@@ -332,7 +334,7 @@ def test_a_policy_of_stable_baselines_trains_on_it(done: surrogym.Design, tmp_pa
     assert surrogym.make_sb3(tmp_path / "it.surrogate", 2, time_limit=5).reset().shape == (2, 3)
 
 
-def test_where_no_state_can_be_set_it_asks_for_rollouts():
+def test_a_design_of_a_reset_only_environment_asks_rollouts():
     spec = cartpole().model_copy(update={"query": "rollout", "max_rollout": 10})
     spec = spec.model_copy(update={"design": spec.design.model_copy(update={"initial": 10})})
     design = surrogym.Design(spec, budget=10)
@@ -350,12 +352,12 @@ def test_where_no_state_can_be_set_it_asks_for_rollouts():
     assert design.steps == 1
 
 
-def test_an_invalid_budget_is_refused():
+def test_a_design_with_an_invalid_budget_is_refused():
     with pytest.raises(InvalidInput, match="budget: expected a whole number from 2 to 100000, got 1"):
         surrogym.Design(pendulum(), budget=1)
 
 
-def test_a_machine_in_place_of_its_specification_is_refused_with_the_call_that_gives_it():
+def test_passing_an_environment_instead_of_its_specification_is_refused_with_a_hint():
     class Machine:
         def spec(self) -> None: ...
 
@@ -363,7 +365,7 @@ def test_a_machine_in_place_of_its_specification_is_refused_with_the_call_that_g
         surrogym.Design(Machine())  # type: ignore[arg-type]
 
 
-def test_a_printed_design_shows_its_phase_and_its_steps():
+def test_the_repr_of_a_design_shows_phase_and_real_steps():
     shown = repr(surrogym.Design(pendulum(), budget=20))
     assert "collecting" in shown
     assert "0 of 20 real steps" in shown

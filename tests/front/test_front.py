@@ -25,27 +25,27 @@ def python(code: str) -> str:
 
 
 @pytest.mark.parametrize("name", surrogym.__all__)
-def test_every_name_is_there(name: str):
+def test_every_exported_name_of_the_package_exists(name: str):
     assert getattr(surrogym, name) is not None
 
 
-def test_an_unknown_name_is_an_attribute_error():
+def test_an_unknown_name_of_the_package_raises_attribute_error():
     with pytest.raises(AttributeError, match="module 'surrogym' has no attribute 'Desing'"):
         surrogym.Desing  # noqa: B018
 
 
-def test_it_brings_every_class_of_the_specification():
+def test_the_package_exports_every_class_of_the_specification():
     classes = {name for name in spec.__all__ if isinstance(getattr(spec, name), type)} - {"Design"}
     assert classes <= set(surrogym.__all__)
     assert surrogym.DesignSettings is spec.Design
 
 
-def test_importing_it_loads_nothing_heavy():
+def test_importing_the_package_loads_no_heavy_dependency():
     heavy = python("import surrogym, sys; print([m for m in ('torch', 'gymnasium', 'httpx') if m in sys.modules])")
     assert heavy == "[]"
 
 
-def test_a_missing_extra_is_named():
+def test_the_error_for_a_name_that_needs_a_missing_extra_names_the_extra():
     code = WITHOUT.format(missing="'torch',") + (
         "try:\n    surrogym.Design\nexcept ImportError as error:\n    print(error)\n"
         "print(surrogym.make, surrogym.Client)"
@@ -54,7 +54,7 @@ def test_a_missing_extra_is_named():
     assert said.startswith("surrogym.Design needs the package torch: pip install 'surrogym[server]'")
 
 
-def test_a_surrogate_of_a_server_by_its_name(pendulum_server: ServerProcess):
+def test_make_opens_a_surrogate_of_a_server_by_name(pendulum_server: ServerProcess):
     env = surrogym.make("pendulum", url=pendulum_server.url)
     assert env.reset(seed=0)[0].shape == (3,)
     env.close()
@@ -63,6 +63,6 @@ def test_a_surrogate_of_a_server_by_its_name(pendulum_server: ServerProcess):
     envs.close()
 
 
-def test_anything_else_is_refused():
+def test_make_refuses_arguments_that_are_no_name_path_or_design():
     with pytest.raises(TypeError, match=r"expected the name of a surrogate, a path .* got int"):
         surrogym.make(3)

@@ -33,7 +33,7 @@ def noise_of(design: Design) -> list[float]:
     return [output["noise"] / span for output, span in zip(outputs[:-1], spans, strict=True)]
 
 
-def test_a_machine_without_noise_is_ready_without_any():
+def test_a_design_of_a_noise_free_environment_becomes_ready_without_noise():
     design = designed("cart", noise=0.0, seed=0, budget=30)
     assert design.phase == "ready"
     assert noise_of(design) == [0, 0]
@@ -41,12 +41,12 @@ def test_a_machine_without_noise_is_ready_without_any():
 
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("name", ["arm", "cart"])
-def test_process_noise_is_found_and_the_rest_is_known(name: str, seed: int):
+def test_a_design_of_a_noisy_environment_estimates_the_process_noise_and_becomes_ready(name: str, seed: int):
     design = designed(name, noise=0.01, seed=seed, budget=120)
     assert design.phase == "ready"
     assert noise_of(design) == pytest.approx([0.01, 0.01], rel=0.5)
 
 
 @pytest.mark.parametrize("name", ["arm", "cart", "pole", "mass"])
-def test_no_noise_is_found_where_there_is_none(name: str):
+def test_no_noise_is_estimated_in_a_noise_free_environment(name: str):
     assert not any(noise_of(designed(name, noise=0.0, seed=1, budget=40)))

@@ -34,7 +34,7 @@ def design_of(name: str, seed: int, budget: int) -> surrogym.Design:
 
 
 @pytest.mark.parametrize("seed", [63, 113])
-def test_a_valley_that_looks_linear_at_its_bottom(seed: int):
+def test_a_ready_design_with_snapshots_is_accurate_over_the_whole_sampling_range(seed: int):
     """Beside the bottom the slope of MountainCarContinuous is linear to the third order. Without an excursion these two
     designs were ready after 28 and 27 steps, with speeds that were wrong by 32 tolerances."""
     design = design_of("MountainCarContinuous-v0", seed, 400)

@@ -21,33 +21,33 @@ def read(folder: Path, **arrays) -> ReadLog:
 
 
 @pytest.mark.parametrize("name", ["states", "actions", "next_states"])
-def test_arrays_by_episode_are_refused_with_their_shape(tmp_path: Path, name: str):
+def test_log_arrays_shaped_by_episode_are_refused_with_their_shape(tmp_path: Path, name: str):
     arrays = {"states": STATES, "actions": STATES, "rewards": np.zeros((6, 100))} | {name: np.zeros((6, 100, 2))}
     with pytest.raises(UnusableLog, match=rf"for the array {name} in .*, got \(6, 100, 2\)"):
         read(tmp_path, **arrays)
 
 
 @pytest.mark.parametrize("spare", [np.float64(0.05), np.array([0.05]), np.zeros((2, 3, 4)), np.array(["a", "b"])])
-def test_an_array_that_is_no_column_is_ignored(tmp_path: Path, spare: np.ndarray):
+def test_a_log_array_without_one_value_per_step_is_ignored(tmp_path: Path, spare: np.ndarray):
     log = read(tmp_path, **VECTORS, dt=spare)
     assert len(log.steps) == 20
     assert log.ignored == {"dt": f"its shape {spare.shape} is not one value a step"}
 
 
-def test_a_column_of_another_length_is_refused(tmp_path: Path):
+def test_log_arrays_of_different_length_are_refused(tmp_path: Path):
     with pytest.raises(UnusableLog, match="expected arrays with the same number of rows in"):
         read(tmp_path, x=np.zeros(20), speed=np.zeros(21), action=np.zeros(20))
     with pytest.raises(UnusableLog, match="expected arrays with the same number of rows in"):
         read(tmp_path, **VECTORS | {"r": np.zeros(21)})
 
 
-def test_rewards_of_one_column_are_the_reward(tmp_path: Path):
+def test_a_reward_array_with_one_column_is_read_as_the_reward(tmp_path: Path):
     log = read(tmp_path, **VECTORS | {"r": np.arange(20.0)[:, None]})
     assert log.steps.reward is not None
     assert log.steps.reward.tolist() == list(range(20))
 
 
-def test_the_command_says_the_role_of_each_column(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_the_import_command_prints_the_role_of_each_column(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     from surrogym.cli import main
 
     path = tmp_path / "log.npz"
@@ -80,7 +80,9 @@ MOMENTS = np.arange(20).astype("M8[s]")
     ],
 )
 @pytest.mark.parametrize("column", ["x", "next_x", "action", "reward"])
-def test_dates_durations_and_complex_numbers_are_no_numbers(tmp_path: Path, cells: np.ndarray, kind: str, column: str):
+def test_dates_durations_and_complex_numbers_in_number_columns_are_refused(
+    tmp_path: Path, cells: np.ndarray, kind: str, column: str
+):
     """They were cast: a missing date was a state of -9.2e18, and an imaginary part was lost."""
     arrays = {"x": STATES[:-1, 0], "next_x": STATES[1:, 0], "action": VECTORS["u"], "reward": VECTORS["r"]}
     with pytest.raises(UnusableLog, match=f"{column}: expected a column of numbers, got {kind}"):
@@ -88,7 +90,7 @@ def test_dates_durations_and_complex_numbers_are_no_numbers(tmp_path: Path, cell
 
 
 @pytest.mark.parametrize("unit", ["M8[ms]", "m8[ms]"])
-def test_times_may_be_dates_or_durations(tmp_path: Path, unit: str):
+def test_time_columns_of_a_log_may_contain_dates_or_durations(tmp_path: Path, unit: str):
     log = read(tmp_path, x=STATES[:-1, 0], action=VECTORS["u"], time=(500 * np.arange(20)).astype(unit))
     assert log.steps.interval == pytest.approx(0.5)
 
@@ -104,7 +106,7 @@ def test_times_may_be_dates_or_durations(tmp_path: Path, unit: str):
         ({"r": np.zeros((20, 2))}, r"one value for each step in r, got an array of shape \(20, 2\)"),
     ],
 )
-def test_arrays_that_collide_are_refused(tmp_path: Path, more: dict[str, np.ndarray], says: str):
+def test_log_arrays_with_conflicting_names_are_refused(tmp_path: Path, more: dict[str, np.ndarray], says: str):
     """One of them won silently, or became columns of states."""
     with pytest.raises(UnusableLog, match=says):
         read(tmp_path, **VECTORS | more)

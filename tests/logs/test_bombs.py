@@ -32,28 +32,28 @@ def zeros(file: zipfile.ZipFile, name: str, rows: int) -> None:
         entry.write(bytes(rows))
 
 
-def test_rows_of_an_npz_are_counted_in_its_headers(tmp_path: Path):
+def test_an_npz_with_too_many_rows_is_refused_by_its_headers(tmp_path: Path):
     with zipfile.ZipFile(tmp_path / "log.npz", "w", zipfile.ZIP_DEFLATED) as file:
         for name in ("x", "action"):
             zeros(file, name, 60 * MIB)
     refused(tmp_path / "log.npz", "expected at most 2,000,000 rows in .*, got 62,914,560")
 
 
-def test_bytes_of_an_npz_are_counted_in_its_directory(tmp_path: Path):
+def test_an_npz_that_decompresses_to_too_many_bytes_is_refused_before_reading(tmp_path: Path):
     with zipfile.ZipFile(tmp_path / "log.npz", "w", zipfile.ZIP_DEFLATED, compresslevel=1) as file:
         zeros(file, "x", MIB)
         file.getinfo("x.npy").file_size = 1025 * MIB + 128  # of the directory, which is written last
     refused(tmp_path / "log.npz", "expected at most 1073741824 bytes after decompression, got 1074790")
 
 
-def test_arrays_of_an_npz_are_counted_and_not_listed(tmp_path: Path):
+def test_an_npz_with_too_many_arrays_is_refused(tmp_path: Path):
     with zipfile.ZipFile(tmp_path / "log.npz", "w") as file:
         for number in range(2_000):
             zeros(file, f"x{number}", 1)
     refused(tmp_path / "log.npz", "expected at most 1,000 arrays in .*, got 2,000")
 
 
-def test_rows_of_parquet_are_counted_in_its_metadata(tmp_path: Path):
+def test_a_parquet_file_with_too_many_rows_is_refused_by_its_metadata(tmp_path: Path):
     pyarrow = pytest.importorskip("pyarrow")
     from pyarrow import parquet
 
@@ -65,7 +65,7 @@ def test_rows_of_parquet_are_counted_in_its_metadata(tmp_path: Path):
     refused(tmp_path / "log.parquet", "expected at most 2,000,000 rows in .*, got 4,000,000")
 
 
-def test_cells_of_lists_in_parquet_are_counted(tmp_path: Path):
+def test_a_parquet_file_with_too_many_list_cells_is_refused(tmp_path: Path):
     pyarrow = pytest.importorskip("pyarrow")
     from pyarrow import parquet
 
@@ -75,7 +75,7 @@ def test_cells_of_lists_in_parquet_are_counted(tmp_path: Path):
     refused(tmp_path / "log.parquet", "expected at most 50,000,000 cells in .*, got 52,000,002")
 
 
-def test_a_long_text_in_parquet_is_not_repeated_in_each_row(tmp_path: Path):
+def test_a_parquet_file_with_very_long_text_cells_is_refused(tmp_path: Path):
     """A file of 12 kB asked for 373 GiB."""
     pyarrow = pytest.importorskip("pyarrow")
     from pyarrow import parquet
@@ -89,7 +89,7 @@ def test_a_long_text_in_parquet_is_not_repeated_in_each_row(tmp_path: Path):
     )
 
 
-def test_text_and_nested_columns_of_parquet(tmp_path: Path):
+def test_nested_and_binary_parquet_columns_are_ignored(tmp_path: Path):
     pyarrow = pytest.importorskip("pyarrow")
     from pyarrow import parquet
 
@@ -102,7 +102,7 @@ def test_text_and_nested_columns_of_parquet(tmp_path: Path):
     assert log.steps.episodes[0] == 3
 
 
-def test_a_message_lists_few_of_many_columns(tmp_path: Path):
+def test_an_error_about_many_columns_lists_only_a_few(tmp_path: Path):
     (tmp_path / "log.csv").write_text(",".join(f"x{k}" for k in range(900)) + "\n" + ",".join("1" * 900))
     with pytest.raises(UnusableLog, match=r"'x9' and 890 more\]") as error:
         read_log(tmp_path / "log.csv")

@@ -33,7 +33,7 @@ def asked(log: ReadLog) -> list[str]:
     return [note for note in log.notes if note.startswith("action") and "mapping file (--map)" in note]
 
 
-def test_codes_that_are_not_numbered_from_0_are_asked_about():
+def test_integer_actions_not_numbered_from_0_are_asked_about():
     """{1, 2, 3}, {0, 2, 3} and {-1, 0, 1} were amounts without a word."""
     for seed in DRAWS:
         rng = np.random.default_rng(seed)
@@ -60,7 +60,7 @@ def test_codes_that_are_not_numbered_from_0_are_asked_about():
         assert not asked(amounts)
 
 
-def test_several_columns_of_codes_are_choices_or_asked_about():
+def test_several_integer_action_columns_become_discrete_actions_or_are_asked_about():
     for seed in DRAWS:
         rng = np.random.default_rng(seed)
         counts, low = rng.integers(2, 5, 2), int(rng.integers(0, 2))
@@ -77,7 +77,7 @@ def test_several_columns_of_codes_are_choices_or_asked_about():
             assert log.spec.action == MultiDiscreteAction(nvec=tuple(counts.tolist()))
 
 
-def test_one_column_for_each_choice_is_asked_about():
+def test_one_hot_action_columns_are_asked_about():
     for seed in DRAWS:
         rng = np.random.default_rng(seed)
         count = int(rng.integers(2, 6))
@@ -87,7 +87,7 @@ def test_one_column_for_each_choice_is_asked_about():
         assert len(asked(log)) == 1
 
 
-def test_codes_beside_amounts_are_named():
+def test_an_integer_action_beside_a_continuous_one_is_reported():
     for seed in DRAWS:
         rng = np.random.default_rng(seed)
         values = drawn(rng, np.arange(3.0))
@@ -96,21 +96,23 @@ def test_codes_beside_amounts_are_named():
         assert any("gear of 0, 1, 2" in note for note in log.notes)
 
 
-def test_a_value_that_is_no_declared_choice_is_set_aside():
+def test_a_row_with_an_undeclared_discrete_action_is_set_aside():
     values = np.r_[np.tile([1.0, 2.0, 3.0], 20), 7.0, 1.0]
     log = read({"switch": values}, discrete={"switch": [1, 2, 3]})
     assert [reason for _, reason in log.rejected] == ["action_switch: expected one of [1.0, 2.0, 3.0], got 7"]
 
 
 @pytest.mark.parametrize("discrete", [{"other": [1, 2]}, {"switch": [1, 1]}, {"switch": [1]}])
-def test_choices_that_fit_no_action_are_refused(discrete: dict[str, list[int]]):
+def test_declared_discrete_values_that_fit_no_action_are_refused(discrete: dict[str, list[int]]):
     with pytest.raises(UnusableLog, match="discrete"):
         read({"switch": np.tile([1.0, 2.0], 20)}, discrete=discrete)
 
 
 @pytest.mark.parametrize("spec", [DiscreteAction(n=3), MultiDiscreteAction(nvec=(3,))])
 @pytest.mark.parametrize("codes", [[1, 2, 3], [1, 2], [0, 2, 3], [-1, 0, 1], [0.5, 1, 1.5]])
-def test_codes_of_choices_are_never_taken_for_others(spec: DiscreteAction | MultiDiscreteAction, codes: list[float]):
+def test_a_log_whose_action_codes_do_not_match_the_specification_is_refused(
+    spec: DiscreteAction | MultiDiscreteAction, codes: list[float]
+):
     """A log of 1, 2, 3 lost its rows with 3, and its rows with 1 and 2 became those of the second and third choice."""
     numbered = read({"switch": np.tile([0.0, 1.0, 2.0], 20)}).spec.model_copy(update={"action": spec})
     values = np.tile(np.array(codes, dtype=float), 20)
@@ -118,7 +120,7 @@ def test_codes_of_choices_are_never_taken_for_others(spec: DiscreteAction | Mult
         read({"switch": values}, numbered)
 
 
-def test_a_declaration_settles_what_codes_mean():
+def test_declared_discrete_values_determine_the_meaning_of_action_codes():
     numbered = read({"switch": np.tile([0.0, 1.0, 2.0], 20)}).spec
     values = np.tile([1.0, 2.0], 20)
     np.testing.assert_array_equal(read({"switch": values}, numbered, discrete=True).steps.u[:, 0], values[:-1])
@@ -128,7 +130,7 @@ def test_a_declaration_settles_what_codes_mean():
         read({"switch": values}, numbered, discrete={"switch": [1, 2]})
 
 
-def test_a_faulty_row_among_numbered_choices_is_set_aside():
+def test_a_row_with_an_out_of_range_discrete_action_is_set_aside():
     numbered = read({"switch": np.tile([0.0, 1.0, 2.0], 20)}).spec
     few = read({"switch": np.r_[np.tile([0.0, 1.0], 20), 0.0]}, numbered)
     assert not few.rejected, "a log need not show every choice"

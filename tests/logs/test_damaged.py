@@ -24,7 +24,7 @@ def parquet(path: Path, **columns: object) -> Path:
 
 
 @pytest.mark.parametrize("kept", [4, 300, -1])
-def test_a_parquet_file_that_was_cut_is_refused(tmp_path: Path, kept: int):
+def test_a_truncated_parquet_log_is_refused(tmp_path: Path, kept: int):
     path = parquet(tmp_path / "log.parquet", x=RNG.normal(size=60), **COLUMNS)
     path.write_bytes(path.read_bytes()[:kept])
     with pytest.raises(UnusableLog, match=r"expected a Parquet file in .*, got one that can't be read: "):
@@ -33,7 +33,7 @@ def test_a_parquet_file_that_was_cut_is_refused(tmp_path: Path, kept: int):
 
 @pytest.mark.parametrize("odd", [[1.0], None])
 @pytest.mark.parametrize("place", [0, 59])
-def test_lists_of_different_lengths_are_refused(tmp_path: Path, odd: list[float] | None, place: int):
+def test_parquet_lists_of_different_lengths_are_refused(tmp_path: Path, odd: list[float] | None, place: int):
     lists: list[list[float] | None] = [[1.0, 2.0]] * 60
     lists[place] = odd
     path = parquet(tmp_path / "log.parquet", obs=lists, **COLUMNS)
@@ -51,7 +51,7 @@ def test_lists_of_different_lengths_are_refused(tmp_path: Path, odd: list[float]
         b"",
     ],
 )
-def test_a_header_that_is_none_is_refused(tmp_path: Path, header: bytes):
+def test_an_npz_log_with_an_invalid_array_header_is_refused(tmp_path: Path, header: bytes):
     with zipfile.ZipFile(tmp_path / "log.npz", "w") as file:
         file.writestr("x.npy", b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header) + 1) + header + b"\n")
     with pytest.raises(UnusableLog, match="expected an array 'x'"):

@@ -29,7 +29,7 @@ def rows(count: int = 50, **changes) -> dict[str, np.ndarray]:
     return {"x": x, "next_x": x + 0.1 * u, "action": u, "reward": -(x**2)} | changes
 
 
-def test_the_reactors_log_gives_its_specification(tmp_path: Path):
+def test_the_specification_of_the_reactor_is_drafted_from_its_log(tmp_path: Path):
     module = reactor.example()
     module.write(str(tmp_path / "log.csv"), list(module.operate()))
     spec = read_log(tmp_path / "log.csv").spec
@@ -40,7 +40,7 @@ def test_the_reactors_log_gives_its_specification(tmp_path: Path):
     assert (spec.time_limit, spec.termination, spec.design.budget) == (100, (), 0)
 
 
-def test_pendulums_angle_wraps_and_its_speed_saturates(tmp_path: Path):
+def test_drafting_from_a_pendulum_log_finds_the_angle_and_the_speed_limit(tmp_path: Path):
     machine = make("Pendulum-v1")
     steps = []
     for _ in range(60):
@@ -61,7 +61,7 @@ def test_pendulums_angle_wraps_and_its_speed_saturates(tmp_path: Path):
     assert log.spec.observation_names == ("cos(theta)", "sin(theta)", "speed")
 
 
-def test_an_angle_from_0_to_a_full_turn_is_wrapped(tmp_path: Path):
+def test_a_logged_angle_between_0_and_2_pi_is_drafted_as_angle(tmp_path: Path):
     turned = np.arange(200) * 0.3
     u = RNG.uniform(-1, 1, 200)
     two_pi = 2 * math.pi
@@ -71,19 +71,19 @@ def test_an_angle_from_0_to_a_full_turn_is_wrapped(tmp_path: Path):
     assert log.steps.q.max() < math.pi
 
 
-def test_constant_columns_are_left_out_and_reported(tmp_path: Path):
+def test_constant_log_columns_are_left_out_of_the_draft_and_reported(tmp_path: Path):
     log = drafted(tmp_path, **rows(p=np.full(50, 3.0), next_p=np.full(50, 3.0)))
     assert log.spec.coordinate_names == ("x",)
     assert "p: always 3, left out" in log.notes
 
 
-def test_a_state_that_never_moves_within_episodes_is_constant(tmp_path: Path):
+def test_a_state_that_is_fixed_within_episodes_is_drafted_as_constant(tmp_path: Path):
     goal = np.repeat(RNG.uniform(-1, 1, 5), 10)
     log = drafted(tmp_path, **rows(goal=goal, next_goal=goal))
     assert {c.name: c.kind for c in log.spec.coordinates} == {"x": "linear", "goal": "constant"}
 
 
-def test_a_range_has_a_margin_and_actions_have_none(tmp_path: Path):
+def test_drafted_state_ranges_have_a_margin_and_action_ranges_none(tmp_path: Path):
     columns = rows()
     spec = drafted(tmp_path, **columns).spec
     low, high = (f(f(columns["x"]), f(columns["next_x"])) for f in (min, max))
@@ -92,12 +92,12 @@ def test_a_range_has_a_margin_and_actions_have_none(tmp_path: Path):
     assert spec.action == BoxAction(low=(columns["action"].min(),), high=(columns["action"].max(),))
 
 
-def test_whole_numbers_are_a_discrete_action(tmp_path: Path):
+def test_an_action_of_whole_numbers_is_drafted_as_discrete(tmp_path: Path):
     spec = drafted(tmp_path, **rows(action=np.arange(50) % 3)).spec
     assert spec.action == DiscreteAction(n=3)
 
 
-def test_no_column_of_the_reward_declares_it_as_nothing(tmp_path: Path):
+def test_without_a_reward_column_a_zero_reward_is_drafted(tmp_path: Path):
     columns = rows()
     del columns["reward"]
     log = drafted(tmp_path, **columns)
@@ -105,19 +105,19 @@ def test_no_column_of_the_reward_declares_it_as_nothing(tmp_path: Path):
     assert any(note.startswith("reward: no column") for note in log.notes)
 
 
-def test_an_episode_that_ended_has_its_end_learned(tmp_path: Path):
+def test_terminated_log_episodes_give_a_drafted_learned_termination(tmp_path: Path):
     ended = np.arange(50) % 10 == 9
     assert drafted(tmp_path, **rows(terminated=ended)).spec.termination == "learned"
 
 
-def test_episodes_that_begin_at_one_place_start_there(tmp_path: Path):
+def test_a_start_value_equal_in_all_episodes_is_drafted_as_fixed(tmp_path: Path):
     columns = rows(episode=np.arange(50) // 10)
     columns["x"][::10] = 1.0
     spec = drafted(tmp_path, **columns).spec
     assert (spec.start["x"], spec.time_limit) == (Fixed(value=1.0), 10)
 
 
-def test_a_value_far_from_all_others_is_pointed_out(tmp_path: Path):
+def test_an_outlier_in_the_log_is_reported_in_the_draft(tmp_path: Path):
     columns = rows()
     columns["next_x"][7] = 500.0
     assert any("1 step ends far from the others, up to 500" in note for note in drafted(tmp_path, **columns).notes)
@@ -130,12 +130,12 @@ def test_a_value_far_from_all_others_is_pointed_out(tmp_path: Path):
         ({"x": np.ones(50), "next_x": np.ones(50)}, "expected at least one state that changes"),
     ],
 )
-def test_a_log_that_shows_nothing_is_refused(tmp_path: Path, changes, says: str):
+def test_drafting_from_a_log_without_variation_is_refused(tmp_path: Path, changes, says: str):
     with pytest.raises(UnusableLog, match=says):
         drafted(tmp_path, **rows(**changes))
 
 
-def test_a_specification_sets_contradicting_rows_aside(tmp_path: Path):
+def test_log_rows_that_contradict_the_declared_termination_are_set_aside(tmp_path: Path):
     from surrogym_shared.spec import EnvironmentSpec, Inequality, Term
 
     columns = rows(terminated=np.zeros(50))
@@ -151,7 +151,7 @@ def test_a_specification_sets_contradicting_rows_aside(tmp_path: Path):
     assert 1 not in told
 
 
-def test_virtual_episodes_start_where_the_log_has_been(tmp_path: Path):
+def test_a_drafted_specification_starts_episodes_at_logged_states(tmp_path: Path):
     columns = rows()
     alone = drafted(tmp_path, **columns).spec
     assert len(alone.starts) == 50, "a single episode: any state of it"
@@ -160,7 +160,7 @@ def test_virtual_episodes_start_where_the_log_has_been(tmp_path: Path):
     assert [start[0] for start in many.starts] == columns["x"][::5].tolist()
 
 
-def test_outside_the_log_counts_as_its_worst_step_where_there_is_no_machine(tmp_path: Path):
+def test_without_a_budget_leaving_the_range_costs_the_worst_logged_reward(tmp_path: Path):
     columns = rows()
     np.savez(tmp_path / "log.npz", **columns)
     assert read_log(tmp_path / "log.npz").spec.outside_reward == columns["reward"].min()
@@ -177,7 +177,7 @@ def test_outside_the_log_counts_as_its_worst_step_where_there_is_no_machine(tmp_
         ({"action": 1e-300}, "the action '0': expected values that differ by 1e-12 or more"),
     ],
 )
-def test_numbers_that_no_specification_takes_are_refused_in_a_sentence(
+def test_drafting_from_a_log_with_too_large_or_small_numbers_is_refused(
     tmp_path: Path, changes: dict[str, float], says: str
 ):
     columns = rows()
@@ -186,7 +186,7 @@ def test_numbers_that_no_specification_takes_are_refused_in_a_sentence(
         drafted(tmp_path, **columns | {name: factor * columns[name] for name, factor in changes.items()})
 
 
-def test_a_draft_that_is_no_specification_is_refused_in_a_sentence(tmp_path: Path):
+def test_a_draft_that_would_be_an_invalid_specification_is_refused(tmp_path: Path):
     name = "a" * 62  # cos(name) is longer than a name may be
     angle = np.remainder(np.arange(50) * 0.3, 2 * math.pi)
     with pytest.raises(UnusableLog, match="the drafted specification is not valid: name: "):
@@ -194,13 +194,13 @@ def test_a_draft_that_is_no_specification_is_refused_in_a_sentence(tmp_path: Pat
 
 
 @pytest.mark.parametrize("name", ["cls", "self"])
-def test_a_coordinate_may_have_any_name(tmp_path: Path, name: str):
+def test_a_drafted_coordinate_can_have_any_column_name(tmp_path: Path, name: str):
     columns = rows()
     log = drafted(tmp_path, **{name: columns["x"], "action": columns["action"], "reward": columns["reward"]})
     assert log.spec.coordinate_names == (name,)
 
 
-def test_starts_that_differ_by_rounding_are_one_start(tmp_path: Path):
+def test_start_values_that_differ_by_rounding_are_drafted_as_fixed(tmp_path: Path):
     columns = rows(episode=np.arange(50) // 10)
     columns["x"][::10] = 1.0 + 1e-15 * np.arange(5)
     assert isinstance(drafted(tmp_path, **columns).spec.start["x"], Fixed)

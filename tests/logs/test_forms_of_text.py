@@ -43,7 +43,7 @@ def assert_steps(log: ReadLog, drawn: list[tuple[float, ...]]) -> None:
 
 
 @pytest.mark.parametrize("seed", range(24))
-def test_a_drawn_form_gives_the_steps_of_the_plain_file(tmp_path: Path, seed: int):
+def test_a_text_log_in_any_encoding_and_delimiter_gives_the_same_steps(tmp_path: Path, seed: int):
     rng = random.Random(seed)
     encoding, delimiter = rng.choice(list(ENCODINGS)), rng.choice([",", ";", "\t", "|", " ", "   "])
     comment = rng.choice(["", "# rig 7, night shift; stand 2\n", "% a\n%\n", "// 1, 2, 3\n", "\n# x y\n\n"])
@@ -60,13 +60,13 @@ def test_a_drawn_form_gives_the_steps_of_the_plain_file(tmp_path: Path, seed: in
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_a_text_without_a_heading_is_refused_with_the_cause(tmp_path: Path, seed: int):
+def test_a_text_log_without_heading_is_refused_with_the_cause(tmp_path: Path, seed: int):
     content = text(rows(seed), random.Random(seed).choice(",;\t "), heading=False)
     with pytest.raises(UnusableLog, match=r"expected a heading that names the columns .* got a row of numbers"):
         read(tmp_path, content.encode())
 
 
-def test_numbers_from_zero_may_name_columns(tmp_path: Path):
+def test_log_columns_named_by_numbers_can_be_mapped(tmp_path: Path):
     (tmp_path / "log.csv").write_text("0,1,2\n" + "".join(f"{k % 5},{k % 3}.5,{-k}\n" for k in range(9)))
     from surrogym_sampler.logs.importing import Options
 
@@ -74,7 +74,7 @@ def test_numbers_from_zero_may_name_columns(tmp_path: Path):
     assert len(read_log(tmp_path / "log.csv", Options(mapping=mapping)).steps)
 
 
-def test_comment_lines_between_rows_are_counted(tmp_path: Path):
+def test_comment_lines_in_a_log_are_skipped_and_counted(tmp_path: Path):
     drawn = rows(0)
     lines = text(drawn).splitlines(keepends=True)
     log = read(tmp_path, "".join([*lines[:5], "# shift ends\n", *lines[5:]]).encode())
@@ -97,7 +97,7 @@ def test_comment_lines_between_rows_are_counted(tmp_path: Path):
         ("state_x,action,reward\n".encode("utf-16")[:-1], "UTF-16 .* the file may be cut off"),
     ],
 )
-def test_a_foreign_or_damaged_file_is_named(tmp_path: Path, content: bytes, says: str):
+def test_a_log_of_a_foreign_format_is_refused_with_the_format_named(tmp_path: Path, content: bytes, says: str):
     if "HDF5" in says:
         pytest.importorskip("h5py")
     with pytest.raises(UnusableLog, match=says):
@@ -105,7 +105,7 @@ def test_a_foreign_or_damaged_file_is_named(tmp_path: Path, content: bytes, says
 
 
 @pytest.mark.parametrize("whole", [True, False])
-def test_a_workbook_is_named_also_if_it_is_cut(tmp_path: Path, whole: bool):
+def test_an_excel_workbook_is_refused_with_a_hint_even_if_truncated(tmp_path: Path, whole: bool):
     path = tmp_path / "book.xlsx"
     with zipfile.ZipFile(path, "w") as file:
         file.writestr("[Content_Types].xml", "<Types/>")
@@ -115,7 +115,7 @@ def test_a_workbook_is_named_also_if_it_is_cut(tmp_path: Path, whole: bool):
         read_log(path)
 
 
-def test_cells_are_decimal_numbers_or_true_and_false(tmp_path: Path):
+def test_log_cells_must_be_decimal_numbers_or_true_or_false(tmp_path: Path):
     drawn = rows(1)
     lines = text(drawn).splitlines()
     odd = {3: "1_000", 7: "１２", 11: "0x1f"}
@@ -128,7 +128,7 @@ def test_cells_are_decimal_numbers_or_true_and_false(tmp_path: Path):
     assert set(log.steps.u[log.table.lines[log.steps.row] % 2 == 0, 0]) == {1.0}
 
 
-def test_a_repeated_column_only_matters_if_it_is_used(tmp_path: Path):
+def test_a_repeated_column_name_is_refused_only_if_the_column_is_used(tmp_path: Path):
     names = ("state_x", "note", "note", "action", "reward")
     lines = [names, *itertools.islice(((k % 5, 1, 2, k % 3, -k) for k in itertools.count()), 9)]
     path = tmp_path / "log.csv"

@@ -61,7 +61,7 @@ def assert_tank(log: ReadLog, columns: dict[str, list[float]], *, time: bool = T
 
 
 @pytest.mark.parametrize("seed", range(40))
-def test_a_drawn_heading_with_units_has_its_role(tmp_path: Path, seed: int):
+def test_log_headings_with_units_are_recognised_with_their_role(tmp_path: Path, seed: int):
     rng = random.Random(seed)
     forms = ["{} [{}]", "{}[{}]", "{} ({})", "{}({})", "{} / {}", "{} in {}"]
     columns = plant(seed)
@@ -80,7 +80,7 @@ def test_a_drawn_heading_with_units_has_its_role(tmp_path: Path, seed: int):
 
 
 @pytest.mark.parametrize("role", list(ASKED))
-def test_a_likely_role_is_asked_for(tmp_path: Path, role: str):
+def test_a_column_name_that_suggests_a_role_is_asked_about(tmp_path: Path, role: str):
     """The column became a state, and the reward was declared as 0."""
     shown = {"terminated": [0] * (ROWS - 1) + [1], "episode": [k // 8 for k in range(ROWS)]}
     for name, unit in itertools.product(ASKED[role], ["", " [x]", " (-)"]):
@@ -91,7 +91,7 @@ def test_a_likely_role_is_asked_for(tmp_path: Path, role: str):
             read_log(write(tmp_path / "log.csv", named))
 
 
-def test_the_mapping_that_a_message_proposes_is_taken(tmp_path: Path):
+def test_the_column_mapping_proposed_by_an_error_message_works(tmp_path: Path):
     import json
 
     columns = plant(0)
@@ -107,7 +107,7 @@ def test_the_mapping_that_a_message_proposes_is_taken(tmp_path: Path):
 @pytest.mark.parametrize(
     "name", ["terminal_voltage", "time_to_go", "end_effector", "return_flow_is_reward_free", "dead"]
 )
-def test_a_state_with_such_a_word_stays_a_state_if_its_cells_show_it(tmp_path: Path, name: str):
+def test_a_state_column_whose_name_suggests_another_role_stays_a_state_by_its_values(tmp_path: Path, name: str):
     columns = plant(0)
     named = {"action": columns["heat"], name: columns["T"], "reward": columns["reward"]}
     if "reward" in name:
@@ -117,7 +117,7 @@ def test_a_state_with_such_a_word_stays_a_state_if_its_cells_show_it(tmp_path: P
     assert read_log(write(tmp_path / "log.csv", named)).spec.coordinate_names == (name,)
 
 
-def test_single_letters_with_a_physical_unit_are_quantities():
+def test_single_letter_columns_with_a_physical_unit_are_read_as_states():
     roles = roles_by_name(["t [°C]", "r [m]", "T [K]", "t_d", "u [V]"])
     assert (roles.time, roles.reward, list(roles.state)) == (None, None, ["t", "r", "T", "t_d"])
     assert roles.units["t [°C]"] == "°C"
@@ -129,12 +129,12 @@ def test_next_states_in_another_unit_than_the_states_are_refused():
         roles_by_name(["T [K]", "next_T [degC]", "u"])
 
 
-def test_an_index_is_no_unit():
+def test_an_index_in_brackets_is_not_read_as_a_unit():
     assert [heading(name).unit for name in ("action[0]", "u(1)", "km/h", "x")] == [""] * 4
 
 
 @pytest.mark.parametrize("seed", range(24))
-def test_a_drawn_column_that_numbers_rows_is_named_and_left_out(tmp_path: Path, seed: int):
+def test_a_row_number_column_is_reported_and_ignored(tmp_path: Path, seed: int):
     rng = random.Random(seed)
     columns = plant(seed)
     first = rng.choice([0, 1, 7, -3, 10_000])
@@ -151,7 +151,7 @@ def test_a_drawn_column_that_numbers_rows_is_named_and_left_out(tmp_path: Path, 
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_a_counter_that_starts_again_numbers_episodes(tmp_path: Path, seed: int):
+def test_a_step_counter_that_restarts_separates_episodes(tmp_path: Path, seed: int):
     """The last row of an episode was joined with the first one of the next."""
     rng = random.Random(seed)
     lengths = [rng.randint(3, 8) for _ in range(3)]
@@ -174,7 +174,7 @@ def test_a_counter_that_starts_again_numbers_episodes(tmp_path: Path, seed: int)
     assert read_log(tmp_path / "log.csv", again).steps.digest == log.steps.digest
 
 
-def test_rows_that_are_missing_from_an_index_leave_a_gap(tmp_path: Path):
+def test_rows_missing_from_a_row_number_column_give_no_step_across_the_gap(tmp_path: Path):
     columns = plant(0)
     kept = [k for k in range(ROWS) if k not in (5, 6, 15)]
     named = {"": kept} | {
@@ -187,14 +187,14 @@ def test_rows_that_are_missing_from_an_index_leave_a_gap(tmp_path: Path):
 
 @pytest.mark.parametrize("name", ["", "index", "Unnamed: 0", "step"])
 @pytest.mark.parametrize("order", [range(ROWS)[::-1], random.Random(0).sample(range(ROWS), ROWS)])
-def test_rows_in_another_order_than_their_numbers_are_refused(tmp_path: Path, name: str, order: list[int]):
+def test_rows_not_in_the_order_of_their_row_numbers_are_refused(tmp_path: Path, name: str, order: list[int]):
     columns = plant(0)
     named = {name: list(order), "T": columns["T"], "u": columns["heat"], "reward": columns["reward"]}
     with pytest.raises(UnusableLog, match=r"expected rows in the order of .*, got another order"):
         read_log(write(tmp_path / "log.csv", named))
 
 
-def test_a_state_that_always_grows_is_pointed_out(tmp_path: Path):
+def test_a_state_that_grows_in_every_row_is_reported(tmp_path: Path):
     columns = plant(0)
     named = {"tijd": [k + 0.1 * (k % 3) for k in range(ROWS)], "T": columns["T"], "u": columns["heat"]}
     log = read_log(write(tmp_path / "log.csv", {**named, "reward": columns["reward"]}))
@@ -202,14 +202,14 @@ def test_a_state_that_always_grows_is_pointed_out(tmp_path: Path):
 
 
 @pytest.mark.parametrize("form", ["2024-03-31T00:00:{:02d}", "202403310000{:02d}"])
-def test_dates_that_grow_by_one_second_are_a_time_and_no_numbers_of_rows(tmp_path: Path, form: str):
+def test_a_column_of_dates_is_recognised_as_time_and_not_as_row_numbers(tmp_path: Path, form: str):
     columns = plant(0)
     named = {"stamp": [form.format(k) for k in range(ROWS)], "T": columns["T"], "u": columns["heat"]}
     with pytest.raises(UnusableLog, match="'stamp' is likely the time"):
         read_log(write(tmp_path / "log.csv", {**named, "reward": columns["reward"]}))
 
 
-def test_a_counter_that_starts_again_may_have_gaps_too(tmp_path: Path):
+def test_a_restarting_step_counter_may_have_gaps(tmp_path: Path):
     columns = plant(0)
     steps = [0, 1, 3, 4, 5, 6, 7, 8, 0, 1, 2, 4, 5, 6, 7, 8, 0, 1, 2, 3, 4, 5, 6, 7]
     named = {"step": steps, "T": columns["T"], "u": columns["heat"], "reward": columns["reward"]}
@@ -218,7 +218,7 @@ def test_a_counter_that_starts_again_may_have_gaps_too(tmp_path: Path):
     assert not {1, 7, 10, 15} & set(log.steps.row.tolist()), "rows before a gap or a new start"
 
 
-def test_an_age_that_an_action_resets_is_a_state(tmp_path: Path):
+def test_a_counter_that_an_action_resets_is_read_as_a_state(tmp_path: Path):
     age, cells, actions = 0, [], []
     for k in range(ROWS):
         cells.append(age)

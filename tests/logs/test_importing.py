@@ -29,7 +29,7 @@ def name(request: pytest.FixtureRequest) -> str:
     return request.node.name[:60].replace("[", "-").rstrip("]")
 
 
-def test_a_log_gives_a_model_without_a_sampler(server_process: ServerProcess, log: Path, name: str):
+def test_importing_a_log_gives_a_model_without_a_sampler(server_process: ServerProcess, log: Path, name: str):
     imported = import_log(log, register=name, url=server_process.url)
     assert (imported.sent, imported.taken, imported.rejected_file) == (ROWS, ROWS, None)
     with Api(server_process.url) as api:
@@ -39,7 +39,7 @@ def test_a_log_gives_a_model_without_a_sampler(server_process: ServerProcess, lo
     assert (view.queries.pending, view.samples, kinds) == (0, ROWS, {"logged"})
 
 
-def test_the_same_log_twice_changes_nothing(server_process: ServerProcess, log: Path, name: str):
+def test_importing_the_same_log_twice_changes_nothing(server_process: ServerProcess, log: Path, name: str):
     import_log(log, register=name, url=server_process.url)
     with Api(server_process.url) as api:
         first = wait_for_model(api, name, 120)
@@ -49,7 +49,7 @@ def test_the_same_log_twice_changes_nothing(server_process: ServerProcess, log: 
     assert (second.round, second.samples, second.phase) == (first.round, first.samples, "from_log")
 
 
-def test_equal_steps_all_count_and_a_log_that_begins_alike_is_another_log(
+def test_equal_steps_of_a_log_and_logs_with_equal_beginnings_are_all_stored(
     server_process: ServerProcess, tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
 ):
     """A gauge of whole metres: 1,864 of 1,999 steps were dropped, because others had their numbers."""
@@ -68,7 +68,7 @@ def test_equal_steps_all_count_and_a_log_that_begins_alike_is_another_log(
         assert api.surrogate(name).samples == 2 * 59
 
 
-def test_steps_that_were_there_are_sent_and_not_stored(server_process: ServerProcess, log: Path, name: str):
+def test_the_progress_of_a_repeated_import_reports_sent_steps(server_process: ServerProcess, log: Path, name: str):
     """The progress said that 60 of 60 steps were stored, and the result that none of them was new."""
     said: list[str] = []
     for _ in range(2):
@@ -76,7 +76,7 @@ def test_steps_that_were_there_are_sent_and_not_stored(server_process: ServerPro
     assert said[-1] == f"{ROWS} of {ROWS} steps sent"
 
 
-def test_an_interrupted_import_is_taken_up(
+def test_an_interrupted_import_can_be_resumed(
     server_process: ServerProcess, log: Path, name: str, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(importing, "BATCH", 25)
@@ -105,12 +105,14 @@ def test_a_grown_log_adds_only_its_new_steps(server_process: ServerProcess, tmp_
 
 
 @pytest.mark.parametrize(("budget", "expected"), [(None, 5), (0, 0), (30, 30)])
-def test_a_budget_replaces_that_of_a_given_specification(log: Path, budget: int | None, expected: int):
+def test_the_budget_option_of_import_replaces_that_of_the_specification(log: Path, budget: int | None, expected: int):
     drafted = import_log(log, budget=5).log.spec
     assert import_log(log, spec=drafted, budget=budget).log.spec.design.budget == expected
 
 
-def test_a_surrogate_of_a_log_moves_as_a_file(server_process: ServerProcess, log: Path, name: str):
+def test_a_surrogate_learned_from_a_log_can_be_exported_and_imported(
+    server_process: ServerProcess, log: Path, name: str
+):
     import_log(log, register=name, url=server_process.url)
     with Api(server_process.url) as api:
         before = wait_for_model(api, name, 120)
@@ -120,7 +122,7 @@ def test_a_surrogate_of_a_log_moves_as_a_file(server_process: ServerProcess, log
     assert (after.spec, after.model_version) == (before.spec, 1)
 
 
-def test_a_real_environment_continues_from_its_log(server_process: ServerProcess, log: Path, name: str):
+def test_a_design_continues_with_real_steps_after_a_log_import(server_process: ServerProcess, log: Path, name: str):
     spec = reactor.example().Reactor().spec()
     with Api(server_process.url) as api:
         before = api.create_surrogate(name, spec)
@@ -132,7 +134,7 @@ def test_a_real_environment_continues_from_its_log(server_process: ServerProcess
     assert view.queries.pending < before.queries.pending + 3, "initial queries that the log covers are withdrawn"
 
 
-def test_rows_beyond_the_surrogates_ranges_are_set_aside(server_process: ServerProcess, tmp_path: Path, name: str):
+def test_log_rows_outside_the_surrogates_ranges_are_set_aside(server_process: ServerProcess, tmp_path: Path, name: str):
     with Api(server_process.url) as api:
         api.create_surrogate(name, reactor.example().Reactor().spec())
     damaged = reactor.log(runs=3, length=20).at(7, "action_coolant", "321").at(9, "temperature", "401")
@@ -157,19 +159,19 @@ def test_rewards_in_another_unit_than_the_samples_are_refused(
         assert api.surrogate(name).samples == ROWS
 
 
-def test_nothing_is_sent_without_a_name(log: Path):
+def test_importing_a_log_without_a_surrogate_name_sends_nothing(log: Path):
     imported = import_log(log, url="http://127.0.0.1:9")
     assert (imported.surrogate, imported.sent, len(imported.log.steps)) == (None, 0, ROWS)
 
 
-def test_an_unknown_surrogate_and_a_server_that_is_away_are_named(server_process: ServerProcess, log: Path):
+def test_the_import_error_names_an_unknown_surrogate_or_unreachable_server(server_process: ServerProcess, log: Path):
     with pytest.raises(UnknownSurrogate):
         import_log(log, to="nobody", url=server_process.url)
     with pytest.raises(ValueError, match="expected to without register and spec"):
         import_log(log, register="a", to="b")
 
 
-def test_the_command_drafts_registers_and_waits(
+def test_the_import_command_drafts_registers_and_waits_for_the_model(
     server_process: ServerProcess, tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]
 ):
     from surrogym.cli import main
@@ -206,7 +208,7 @@ def test_the_command_drafts_registers_and_waits(
         (["--map", "nothing.toml"], "nothing.toml: No such file"),
     ],
 )
-def test_wrong_options_of_a_log_are_refused(
+def test_invalid_options_of_the_import_command_are_refused(
     log: Path, capsys: pytest.CaptureFixture[str], options: list[str], says: str
 ):
     from surrogym.cli import main
@@ -217,7 +219,7 @@ def test_wrong_options_of_a_log_are_refused(
     assert says in capsys.readouterr().err
 
 
-def test_an_unreachable_server_is_reported_before_any_loss(log: Path, monkeypatch: pytest.MonkeyPatch):
+def test_importing_to_an_unreachable_server_raises_an_error(log: Path, monkeypatch: pytest.MonkeyPatch):
     from surrogym_client.transport.connection import Retries
 
     monkeypatch.setattr("surrogym_sampler.logs.importing.Api", lambda *given: Api(*given, retries=Retries(seconds=0)))
@@ -225,7 +227,7 @@ def test_an_unreachable_server_is_reported_before_any_loss(log: Path, monkeypatc
         import_log(log, register="a", url="http://127.0.0.1:9")
 
 
-def test_the_next_command_has_the_options_of_this_one(
+def test_the_command_recommended_after_a_log_check_repeats_its_options(
     log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ):
     from surrogym.cli import main
@@ -242,7 +244,7 @@ def test_the_next_command_has_the_options_of_this_one(
         assert told == f"{common}{kept} --register NAME"
 
 
-def test_a_log_without_a_reward_leads_to_its_declaration(
+def test_importing_a_log_without_reward_recommends_declaring_it(
     server_process: ServerProcess,
     tmp_path: Path,
     name: str,

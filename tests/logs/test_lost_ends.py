@@ -16,7 +16,7 @@ def read(columns: dict[str, Floats]) -> ReadLog:
     return draft_log(table, roles_by_name(table.names), "drawn")
 
 
-def test_every_end_is_in_a_step_or_said_to_be_lost():
+def test_every_logged_termination_is_used_or_reported_as_lost():
     """30 of 30 ends were lost without a word, and a draft that never ends promised 55 where 9.3 came."""
     for seed in DRAWS:
         rng = np.random.default_rng(seed)

@@ -84,7 +84,7 @@ def huge(file: Any) -> None:
         (huge, "at most"),
     ],
 )
-def test_a_forged_data_set_is_refused_in_a_sentence(main_file: Path, change: Change, says: str):
+def test_a_forged_minari_data_set_is_refused_in_a_sentence(main_file: Path, change: Change, says: str):
     """Missing arrays gave a traceback, 24 GB were read, and rewards that moved from one episode to the next were
     paired with other steps without a word."""
     assert len(read_log(NAME).steps) == 2 * STEPS

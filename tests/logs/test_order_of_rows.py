@@ -51,7 +51,7 @@ def drawn() -> Iterator[tuple[np.random.Generator, Plant]]:
         yield rng, Plant.drawn(rng, int(rng.integers(40, 400)))
 
 
-def test_equal_rows_without_a_clock_are_steps():
+def test_equal_log_rows_without_a_time_column_are_all_steps():
     """Equal rows were dropped as repeats, and their neighbours joined: 29 of 599 steps were left, 21 of them wrong."""
     for _, plant in drawn():
         rows = np.arange(len(plant))
@@ -60,7 +60,7 @@ def test_equal_rows_without_a_clock_are_steps():
         assert plant.wrong(steps, rows, rows[-1:]) == 0
 
 
-def test_equal_rows_of_episodes_are_steps():
+def test_equal_log_rows_within_episodes_are_all_steps():
     for rng, plant in drawn():
         rows, episode = np.arange(len(plant)), np.arange(len(plant)) // int(rng.integers(5, 20))
         steps, last = plant.log(rows, episode=episode), np.flatnonzero(np.diff(episode, append=-1))
@@ -68,7 +68,7 @@ def test_equal_rows_of_episodes_are_steps():
         assert plant.wrong(steps, rows, last) == 0
 
 
-def test_rows_written_twice_at_one_time_are_set_aside():
+def test_log_rows_repeated_at_the_same_time_are_set_aside():
     for rng, plant in drawn():
         rows = np.repeat(np.arange(len(plant)), 1 + (rng.random(len(plant)) < rng.random()))
         steps = plant.log(rows, time=rows * 0.5)
@@ -77,7 +77,7 @@ def test_rows_written_twice_at_one_time_are_set_aside():
         assert plant.wrong(steps, rows, rows[-1:]) == 0
 
 
-def test_a_file_joined_to_itself_counts_once():
+def test_a_log_concatenated_with_itself_counts_once():
     for rng, plant in drawn():
         copies = int(rng.integers(2, 4))
         rows = np.tile(np.arange(len(plant)), copies)
@@ -86,7 +86,7 @@ def test_a_file_joined_to_itself_counts_once():
         assert plant.wrong(steps, rows, rows[-1:]) == 0
 
 
-def test_equal_episodes_of_one_log_all_count():
+def test_equal_episodes_within_a_log_all_count():
     """A machine that is reset and does the same writes equal rows, which are not repeats."""
     for rng, plant in drawn():
         length = len(plant)
@@ -98,7 +98,7 @@ def test_equal_episodes_of_one_log_all_count():
         assert len(plant.log(other, time=other * 0.5, episode=named)) == len(other) - 3
 
 
-def test_a_clock_coarser_than_the_rows_orders_them_all():
+def test_rows_sharing_a_coarse_time_stamp_are_all_used_in_order():
     """Rows of one time were set aside, and the first rows of two times joined."""
     for rng, plant in drawn():
         rows, each = np.arange(len(plant)), float(rng.uniform(2, 12))
@@ -111,7 +111,7 @@ def test_a_clock_coarser_than_the_rows_orders_them_all():
             assert len(steps.notes) == 1
 
 
-def test_rows_that_a_coarse_clock_lacks_give_no_step():
+def test_rows_missing_from_a_coarsely_timed_log_give_no_wrong_step():
     seen = []
     for rng, plant in drawn():
         plant = Plant(plant.x + 0.01 * rng.random(len(plant)), plant.u)
@@ -131,7 +131,7 @@ def test_rows_that_a_coarse_clock_lacks_give_no_step():
     assert all("rows may be missing" in refusal for refusal in seen)
 
 
-def test_joined_files_are_episodes():
+def test_concatenated_log_files_become_separate_episodes():
     for rng, plant in drawn():
         cut = int(rng.integers(5, len(plant) - 5))
         rows = np.r_[np.arange(cut, len(plant)), np.arange(cut)]
@@ -143,7 +143,7 @@ def test_joined_files_are_episodes():
             assert "a new episode begins there" in steps.notes[0]
 
 
-def test_files_that_overlap_count_the_shared_rows_once():
+def test_rows_shared_by_overlapping_log_files_count_once():
     for rng, plant in drawn():
         cut = int(rng.integers(10, len(plant) - 5))
         shared = int(rng.integers(3, cut - 3))
@@ -154,7 +154,7 @@ def test_files_that_overlap_count_the_shared_rows_once():
         assert plant.wrong(steps, rows, np.array([cut - 1, len(plant) - 1])) == 0
 
 
-def test_a_name_of_an_episode_that_returns_is_another_episode():
+def test_a_returning_episode_name_starts_another_episode():
     for rng, plant in drawn():
         length = int(rng.integers(4, 8))
         rows = np.arange(len(plant) // (4 * length) * 4 * length)
@@ -165,7 +165,7 @@ def test_a_name_of_an_episode_that_returns_is_another_episode():
         assert len(rows) == 4 * length or "returned after other episodes" in steps.notes[0]
 
 
-def test_rows_of_episodes_that_alternate_are_sorted():
+def test_interleaved_rows_of_several_episodes_are_separated():
     for rng, plant in drawn():
         lanes = int(rng.integers(2, 5))
         length = len(plant) // lanes

@@ -36,7 +36,9 @@ def refusal(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
 
 @pytest.mark.parametrize("option", ["--rejected", "--draft", "--picture"])
 @pytest.mark.parametrize("name", ["log.csv", "link.csv", "map.json", "spec.json"])
-def test_an_output_never_overwrites_an_input(folder: Path, capsys: pytest.CaptureFixture[str], option: str, name: str):
+def test_an_import_output_never_overwrites_an_input_file(
+    folder: Path, capsys: pytest.CaptureFixture[str], option: str, name: str
+):
     before = {file.name: file.read_bytes() for file in folder.iterdir()}
     inputs = (folder / "log.csv", "--map", folder / "map.json", "--spec", folder / "spec.json")
     said = refusal(capsys, *inputs, option, folder / name)
@@ -44,7 +46,7 @@ def test_an_output_never_overwrites_an_input(folder: Path, capsys: pytest.Captur
     assert {file.name: file.read_bytes() for file in folder.iterdir()} == before
 
 
-def test_two_outputs_are_two_files(folder: Path, capsys: pytest.CaptureFixture[str]):
+def test_two_import_outputs_with_the_same_file_name_are_refused(folder: Path, capsys: pytest.CaptureFixture[str]):
     said = refusal(capsys, folder / "log.csv", "--draft", folder / "a.png", "--picture", folder / "a.png")
     assert "--picture: expected another file than --draft" in said
     said = refusal(capsys, folder / "log.csv", "--draft", folder / "log.rejected.csv")
@@ -66,7 +68,7 @@ def test_the_rejected_rows_of_the_library_never_overwrite_the_log(folder: Path):
         ("--draft", "", "expected a file, got the folder"),
     ],
 )
-def test_an_output_that_cant_be_written_is_refused_before_anything_is_stored(
+def test_an_unwritable_import_output_is_refused_before_anything_is_stored(
     folder: Path, capsys: pytest.CaptureFixture[str], option: str, name: str, says: str
 ):
     said = refusal(capsys, folder / "log.csv", "--register", "new", "--server", NOWHERE, option, folder / name)
@@ -93,7 +95,7 @@ def damaged(tmp_path: Path) -> Path:
     return reactor.log(runs=3, length=20).at(4, "temperature", "nan").write(tmp_path / "log.csv")
 
 
-def test_rejected_rows_never_replace_a_file_of_somebody_else(damaged: Path, capsys: pytest.CaptureFixture[str]):
+def test_rejected_log_rows_never_replace_a_foreign_file(damaged: Path, capsys: pytest.CaptureFixture[str]):
     """The default name was taken from the log's, so nobody had named the file that was lost."""
     other = damaged.with_name("log.rejected.csv")
     other.write_text(FOREIGN)
@@ -109,14 +111,14 @@ def test_rejected_rows_never_replace_a_file_of_somebody_else(damaged: Path, caps
     assert keep_rejected(damaged, log) == other, "and is one of rejected rows then"
 
 
-def test_a_file_of_somebody_else_does_not_hinder_a_flawless_log(folder: Path):
+def test_a_foreign_file_with_the_rejected_rows_name_does_not_hinder_a_valid_log(folder: Path):
     other = folder / "log.rejected.csv"
     other.write_text(FOREIGN)
     assert import_log(folder / "log.csv").rejected_file is None
     assert other.read_text() == FOREIGN
 
 
-def test_a_log_without_usable_rows_says_both(damaged: Path):
+def test_a_log_without_usable_rows_beside_a_foreign_file_reports_both(damaged: Path):
     lines = damaged.read_text().splitlines()
     damaged.write_text("\n".join([lines[0], lines[5]]))
     damaged.with_name("log.rejected.csv").write_text(FOREIGN)
@@ -125,7 +127,7 @@ def test_a_log_without_usable_rows_says_both(damaged: Path):
     assert damaged.with_name("log.rejected.csv").read_text() == FOREIGN
 
 
-def test_a_draft_never_replaces_an_edited_one(folder: Path, capsys: pytest.CaptureFixture[str]):
+def test_a_drafted_specification_never_replaces_an_edited_one(folder: Path, capsys: pytest.CaptureFixture[str]):
     """The specification that a person had edited was lost without a word, and the log was stored."""
     drafted = folder / "drafted.json"
     for _ in range(2):  # the same draft again is no loss

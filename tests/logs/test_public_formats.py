@@ -37,7 +37,7 @@ def rlds(found: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
     }
 
 
-def test_rlds_gives_each_step_its_own_reward_and_end(tmp_path: Path):
+def test_an_rlds_log_gives_each_step_its_own_reward_and_termination(tmp_path: Path):
     found = episodes()
     np.savez(tmp_path / "log.npz", **rlds(found))
     log = read_log(tmp_path / "log.npz")
@@ -50,7 +50,7 @@ def test_rlds_gives_each_step_its_own_reward_and_end(tmp_path: Path):
     assert (log.rejected, log.steps.episodes) == ([], (5, 3, 4))
 
 
-def test_rlds_as_text_is_the_same(tmp_path: Path):
+def test_an_rlds_log_as_csv_gives_the_same_steps_as_npz(tmp_path: Path):
     arrays = rlds(episodes())
     np.savez(tmp_path / "log.npz", **arrays)
     heading = "obs.s0,obs.s1,action,reward,is_first,is_last,is_terminal"
@@ -70,7 +70,7 @@ def test_rlds_as_text_is_the_same(tmp_path: Path):
         ("is_terminal", 2, "is_terminal only where is_last"),
     ],
 )
-def test_marks_of_rlds_that_contradict_each_other_are_refused(tmp_path: Path, mark: str, row: int, says: str):
+def test_contradicting_episode_flags_of_an_rlds_log_are_refused(tmp_path: Path, mark: str, row: int, says: str):
     arrays = rlds(episodes())
     arrays[mark][row] = not arrays[mark][row]
     np.savez(tmp_path / "log.npz", **arrays)
@@ -78,7 +78,7 @@ def test_marks_of_rlds_that_contradict_each_other_are_refused(tmp_path: Path, ma
         read_log(tmp_path / "log.npz")
 
 
-def test_d4rl_in_hdf5_ends_at_terminals_and_at_timeouts(tmp_path: Path):
+def test_a_d4rl_log_ends_episodes_at_terminals_and_timeouts(tmp_path: Path):
     h5py = pytest.importorskip("h5py")
     rng = np.random.default_rng(0)
     observations = rng.normal(size=(12, 2)).astype(np.float32)
@@ -96,7 +96,7 @@ def test_d4rl_in_hdf5_ends_at_terminals_and_at_timeouts(tmp_path: Path):
     assert {"infos", "metadata"} <= set(log.ignored)
 
 
-def test_dones_of_stable_baselines_are_no_terminal_states_at_timeouts(tmp_path: Path):
+def test_stable_baselines3_dones_at_timeouts_are_read_as_truncation(tmp_path: Path):
     rng = np.random.default_rng(0)
     states = rng.normal(size=(11, 2))
     arrays = {"observations": states[:-1], "next_observations": states[1:], "actions": rng.normal(size=(10, 1))}
@@ -107,7 +107,7 @@ def test_dones_of_stable_baselines_are_no_terminal_states_at_timeouts(tmp_path: 
     assert np.flatnonzero(log.steps.truncated).tolist() == [9]
 
 
-def test_imitation_and_marks_of_starts(tmp_path: Path):
+def test_a_log_with_episode_start_flags_is_split_into_episodes(tmp_path: Path):
     rng = np.random.default_rng(0)
     starts = np.isin(np.arange(12), [0, 5])
     arrays = {"obs": rng.normal(size=(12, 2)), "acts": rng.normal(size=(12, 1)), "rews": rng.normal(size=12)}
@@ -117,14 +117,14 @@ def test_imitation_and_marks_of_starts(tmp_path: Path):
     np.testing.assert_array_equal(log.reward, arrays["rews"][log.steps.row])
 
 
-def test_an_episode_of_rlds_without_a_step_is_refused(tmp_path: Path):
+def test_an_rlds_log_without_a_step_is_refused(tmp_path: Path):
     np.savez(tmp_path / "log.npz", **{name: cells[:1] for name, cells in rlds(episodes()).items()})
     with pytest.raises(UnusableLog, match="expected steps of RLDS, got none"):
         read_log(tmp_path / "log.npz")
 
 
 @pytest.mark.parametrize("name", ["is_last", "is_terminal"])
-def test_a_single_mark_of_rlds_is_asked_for(tmp_path: Path, name: str):
+def test_a_single_rlds_episode_flag_is_asked_about(tmp_path: Path, name: str):
     """Whether the row's own step ended, or the one before, can't be known."""
     arrays = {key: cells for key, cells in rlds(episodes()).items() if not key.startswith("is_") or key == name}
     np.savez(tmp_path / "log.npz", **arrays)

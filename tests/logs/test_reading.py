@@ -25,7 +25,7 @@ def read(path: Path, **changes) -> ReadLog:
     return read_log(path, Options(mapping=reactor.MAPPING | changes))
 
 
-def test_every_format_gives_the_same_steps(tmp_path: Path):
+def test_every_log_file_format_gives_the_same_steps(tmp_path: Path):
     pytest.importorskip("pyarrow")
     module = reactor.example()
     rows = list(module.operate(runs=3, length=20))
@@ -38,7 +38,9 @@ def test_every_format_gives_the_same_steps(tmp_path: Path):
     assert len({log.spec.model_dump_json() for log in found.values()}) == 1
 
 
-def test_a_format_whose_package_is_missing_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_the_error_for_a_log_format_with_missing_package_tells_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     monkeypatch.setitem(sys.modules, "minari", None)
     (tmp_path / "log.parquet").write_bytes(b"PAR1 and so on")
@@ -103,7 +105,7 @@ def test_a_minari_data_set_gives_its_steps(tmp_path: Path, monkeypatch: pytest.M
         ({"action_space": gymnasium.spaces.MultiDiscrete([2, 2])}, "expected actions of a Box"),
     ],
 )
-def test_declared_spaces_of_a_minari_data_set_decide(
+def test_the_declared_spaces_of_a_minari_data_set_determine_the_action_type(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, spaces: dict[str, gymnasium.Space], says: str
 ):
     """A discrete action whose values have a gap was continuous, and a label was a number."""
@@ -135,7 +137,7 @@ def test_declared_spaces_of_a_minari_data_set_decide(
     assert (log.spec.action, log.spec.coordinate_names) == (DiscreteAction(n=4), ("s0", "s1"))
 
 
-def test_exactly_the_broken_rows_are_set_aside(tmp_path: Path):
+def test_exactly_the_invalid_log_rows_are_set_aside(tmp_path: Path):
     whole = reactor.log(runs=50, length=100)
     damaged, ways = reactor.broken(whole, share=0.01)
     assert set(ways.values()) == set(reactor.WAYS), "every way is there"
@@ -146,7 +148,7 @@ def test_exactly_the_broken_rows_are_set_aside(tmp_path: Path):
     assert len(log.steps) == len(whole.rows) - len(ways)
 
 
-def test_rejected_rows_are_written_with_line_reason_and_cells(tmp_path: Path):
+def test_rejected_log_rows_are_written_with_line_reason_and_cells(tmp_path: Path):
     damaged = reactor.log().at(3, "reward", "oops")
     path = damaged.write(tmp_path / "log.csv")
     file = keep_rejected(path, read(path))
@@ -157,13 +159,13 @@ def test_rejected_rows_are_written_with_line_reason_and_cells(tmp_path: Path):
     assert tuple(row[2:]) == damaged.rows[3]
 
 
-def test_a_whole_log_leaves_no_file_of_rejected_rows(tmp_path: Path):
+def test_a_valid_log_leaves_no_file_of_rejected_rows(tmp_path: Path):
     path = reactor.log().write(tmp_path / "log.csv")
     assert keep_rejected(path, read(path)) is None
     assert [file.name for file in tmp_path.iterdir()] == ["log.csv"]
 
 
-def test_next_states_come_from_the_order_within_an_episode(tmp_path: Path):
+def test_next_states_are_taken_from_the_following_row_of_the_episode(tmp_path: Path):
     whole = reactor.log(runs=3, length=10)
     with_next = read(whole.write(tmp_path / "a.csv"))
     by_order = read(whole.without("next_concentration", "next_temperature").write(tmp_path / "b.csv"), next={})
@@ -173,32 +175,32 @@ def test_next_states_come_from_the_order_within_an_episode(tmp_path: Path):
     np.testing.assert_array_equal(by_order.steps.u, with_next.steps.u[inner])
 
 
-def test_a_lost_row_leaves_no_step_across_its_gap(tmp_path: Path):
+def test_a_missing_log_row_leaves_no_step_across_the_gap(tmp_path: Path):
     whole = reactor.log(runs=1, length=10).without("next_concentration", "next_temperature")
     log = read(whole.at(5, "temperature", "nan").write(tmp_path / "log.csv"), next={})
     assert log.steps.row.tolist() == [0, 1, 2, 3, 6, 7, 8], "4 has no next state, 5 no state, 9 is the end"
 
 
-def test_a_bad_action_fails_only_its_own_step(tmp_path: Path):
+def test_an_invalid_logged_action_loses_only_its_own_step(tmp_path: Path):
     whole = reactor.log(runs=1, length=10).without("next_concentration", "next_temperature")
     log = read(whole.at(5, "action_coolant", "nan").write(tmp_path / "log.csv"), next={})
     assert log.steps.row.tolist() == [0, 1, 2, 3, 4, 6, 7, 8]
 
 
-def test_a_clock_that_restarts_begins_an_episode(tmp_path: Path):
+def test_a_time_column_that_restarts_begins_a_new_episode(tmp_path: Path):
     whole = reactor.log(runs=2, length=10).without("run", "next_concentration", "next_temperature")
     log = read(whole.write(tmp_path / "log.csv"), next={}, episode=None)
     assert (log.steps.episodes, log.rejected) == ((10, 10), [])
 
 
-def test_a_pause_of_the_clock_is_no_step(tmp_path: Path):
+def test_a_gap_in_the_time_column_gives_no_step(tmp_path: Path):
     whole = reactor.log(runs=1, length=10).without("next_concentration", "next_temperature")
     for row in range(6, 10):
         whole = whole.at(row, "time", repr(float(whole.rows[row][1]) + 30))
     assert read(whole.write(tmp_path / "log.csv"), next={}).steps.row.tolist() == [0, 1, 2, 3, 4, 6, 7, 8]
 
 
-def test_times_may_be_dates(tmp_path: Path):
+def test_the_time_column_of_a_log_may_contain_dates(tmp_path: Path):
     whole = reactor.log(runs=1, length=10)
     for row in range(10):
         whole = whole.at(row, "time", f"2026-03-01T12:{row:02d}:00Z")
@@ -209,7 +211,7 @@ def test_times_may_be_dates(tmp_path: Path):
 @pytest.mark.parametrize(
     ("form", "minutes"), [("2024033123{:02d}00", 1), ("2024033123{:02d}", 1), ("20240331T23{:02d}00", 1)]
 )
-def test_time_stamps_of_digits_are_times(tmp_path: Path, form: str, minutes: int):
+def test_unix_time_stamps_in_a_log_are_read_as_times(tmp_path: Path, form: str, minutes: int):
     """Their numbers jumped by 7,640 at midnight, and by 40 at each full minute."""
     whole = reactor.log(runs=1, length=10)
     for row in range(10):
@@ -220,11 +222,11 @@ def test_time_stamps_of_digits_are_times(tmp_path: Path, form: str, minutes: int
 
 
 @pytest.mark.parametrize("values", [[2.0, 3.0, 4.0, 5.0], [20240399.0, 20240400, 20240401, 20250000]])
-def test_other_numbers_are_no_time_stamps(values: list[float]):
+def test_other_large_numbers_are_not_read_as_time_stamps(values: list[float]):
     assert stamps(np.array(values)) is None
 
 
-def test_days_of_digits_are_dates():
+def test_dates_written_as_digits_are_read_as_dates():
     found = stamps(np.array([20240228.0, 20240229, 20240301, 20240302, np.nan] + [20240303.0] * 9))
     assert found is not None
     assert np.diff(found[:4]).tolist() == [86_400.0] * 3
@@ -247,14 +249,14 @@ def test_a_file_of_rejected_rows_has_no_formulas_and_no_control_characters(tmp_p
     assert rows[-1][heading.index("temperature")] == "-5.5", "a number stays a number"
 
 
-def test_columns_are_known_by_their_names():
+def test_the_roles_of_log_columns_are_recognised_by_their_names():
     roles = roles_by_name(["Run", "t", "T", "c", "action_valve", "T_next", "next_c", "done", "reward"])
     assert (roles.state, roles.action) == ({"T": "T", "c": "c"}, {"valve": "action_valve"})
     assert roles.following == {"T": "T_next", "c": "next_c"}
     assert (roles.time, roles.episode, roles.terminated, roles.reward) == ("t", "Run", "done", "reward")
 
 
-def test_marked_states_leave_other_columns_out():
+def test_if_some_columns_are_marked_as_states_other_columns_are_ignored():
     roles = roles_by_name(["id", "q.theta", "q.speed", "u.0", "next.theta", "next.speed", "late", "reward"])
     assert (tuple(roles.state), tuple(roles.action), roles.ignored) == (("theta", "speed"), ("0",), ("id", "late"))
 
@@ -267,12 +269,12 @@ def test_marked_states_leave_other_columns_out():
         (["a", "b", "action", "next_a"], "expected a column of the next state for all of \\['a', 'b'\\] or for none"),
     ],
 )
-def test_columns_that_say_too_little_are_refused(heading: list[str], says: str):
+def test_a_log_whose_column_names_are_not_sufficient_is_refused(heading: list[str], says: str):
     with pytest.raises(UnusableLog, match=says):
         roles_by_name(heading)
 
 
-def test_a_mapping_that_names_no_column_is_refused(tmp_path: Path):
+def test_a_mapping_that_names_an_unknown_column_is_refused(tmp_path: Path):
     path = reactor.log().write(tmp_path / "log.csv")
     with pytest.raises(UnusableLog, match="names the column 'TT-101': expected one of"):
         read(path, state={"T": "TT-101"})
@@ -291,19 +293,19 @@ def test_a_mapping_that_names_no_column_is_refused(tmp_path: Path):
         ("state = ['a']\naction = ['b']\nangles = 'a'", "angles: expected a list of names of states, got 'a'$"),
     ],
 )
-def test_a_mapping_of_another_form_is_refused_in_plain_words(tmp_path: Path, text: str, says: str):
+def test_a_column_mapping_of_wrong_structure_is_refused_with_an_explanation(tmp_path: Path, text: str, says: str):
     (tmp_path / "log.csv").write_text("a,b\n1,1\n2,0\n3,1\n")
     (tmp_path / "map.toml").write_text(text)
     with pytest.raises(UnusableLog, match="map.toml is not a mapping of columns: .*" + says):
         read_log(tmp_path / "log.csv", Options(mapping=tmp_path / "map.toml"))
 
 
-def test_more_states_than_a_model_takes_are_refused():
+def test_a_log_with_too_many_states_is_refused():
     with pytest.raises(UnusableLog, match="expected at most 64 states, got 65"):
         roles_by_name(["action", *(f"x{i}" for i in range(65))])
 
 
-def test_a_mapping_may_be_toml_or_json(tmp_path: Path):
+def test_a_column_mapping_can_be_toml_or_json(tmp_path: Path):
     path = reactor.log().without("next_concentration", "next_temperature").write(tmp_path / "log.csv")
     plain = {"state": ["temperature"], "action": ["action_coolant"], "time": "time"}
     (tmp_path / "map.json").write_text(json.dumps(plain))
@@ -330,7 +332,7 @@ def test_an_invalid_log_is_refused_in_a_sentence(tmp_path: Path, content: bytes,
         read_log(path)
 
 
-def test_a_file_that_is_not_there_is_named(tmp_path: Path):
+def test_the_error_for_a_missing_log_file_names_it(tmp_path: Path):
     with pytest.raises(FileNotFoundError, match=r"nothing\.csv"):
         format_of(tmp_path / "nothing.csv")
 

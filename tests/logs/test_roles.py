@@ -23,7 +23,7 @@ PLAIN = {"state": ["x", "y"], "action": ["v"]}
         (["q.x", "next_x", "next_q.x", "action"], "one column for the next state 'x', got two: next_x and next_q.x"),
     ],
 )
-def test_two_columns_for_one_name_are_refused(names: list[str], says: str):
+def test_two_log_columns_for_one_state_or_action_name_are_refused(names: list[str], says: str):
     """The last one won, and the others were lost."""
     with pytest.raises(UnusableLog, match="expected " + says):
         roles_by_name(names)
@@ -38,13 +38,13 @@ def test_two_columns_for_one_name_are_refused(names: list[str], says: str):
         (["state_x", "action", "t", "time"], "the role time, got t and time"),
     ],
 )
-def test_two_columns_for_one_role_are_refused(names: list[str], says: str):
+def test_two_log_columns_for_one_role_are_refused(names: list[str], says: str):
     """One of them was taken, and the other became a state."""
     with pytest.raises(UnusableLog, match=f"expected one column for {says}: rename one, or name the columns in a map"):
         roles_by_name(names)
 
 
-def test_letters_of_other_cases_are_other_columns():
+def test_log_column_names_are_case_sensitive():
     roles = roles_by_name(["T", "t", "R", "r", "action"])
     assert (roles.time, roles.reward, list(roles.state)) == ("t", "r", ["T", "R"])
 
@@ -76,7 +76,7 @@ def test_a_mapping_that_contradicts_itself_is_refused(changes: dict[str, object]
         roles_by_map(PLAIN | changes, NAMES)
 
 
-def test_the_mapping_of_known_names_is_a_mapping():
+def test_the_mapping_of_recognised_columns_gives_the_same_roles_again():
     """The server tells a page the roles of the columns. The page sends them back, and the roles stay the same."""
     roles = roles_by_name(["x", "next_x", "action_x", "reward", "time"])
     assert roles_by_map(roles.mapping.model_dump(), ["x", "next_x", "action_x", "reward", "time"]) == roles
@@ -99,7 +99,7 @@ def test_a_mapping_file_that_cant_be_read_is_refused_in_a_sentence(
         roles_by_file(tmp_path / name, NAMES)
 
 
-def test_the_next_value_of_a_state_is_found_by_the_whole_name():
+def test_a_next_state_column_is_matched_by_the_whole_state_name():
     """next.q_0 was the next value of a state called 0, although the state q_0 was there."""
     assert roles_by_name(["q.q_0", "next.q_0", "action"]).following == {"q_0": "next.q_0"}
     assert roles_by_name(["q_0", "next.q_0", "action"]).following == {"0": "next.q_0"}

@@ -21,7 +21,7 @@ def said(path: Path, text: str) -> str:
     return str(refused.value)
 
 
-def test_the_most_frequent_reason_is_named_with_its_line(tmp_path: Path):
+def test_a_log_with_too_few_usable_rows_names_the_most_frequent_reason(tmp_path: Path):
     rows = ["0.1,", "0.2,x", "0.3,y", "0.4,z"]
     words = said(tmp_path / "log.csv", "\n".join(["level,action", *rows]) + "\n")
     assert words.startswith("expected two usable steps at least, got 0 of 4 rows; ")
@@ -32,18 +32,18 @@ def test_the_most_frequent_reason_is_named_with_its_line(tmp_path: Path):
     assert [row[0] for row in kept] == ["line", "2", "3", "4", "5"]
 
 
-def test_decimal_commas_and_semicolons_are_named(tmp_path: Path):
+def test_a_log_with_decimal_commas_and_semicolons_is_refused_with_the_cause(tmp_path: Path):
     words = said(tmp_path / "log.csv", "level;action\n0,1;1,5\n0,2;1,0\n0,3;0,5\n")
     assert "the columns are separated by ';', and the numbers have a decimal comma: write a point" in words
 
 
-def test_decimal_commas_between_commas_are_named(tmp_path: Path):
+def test_a_log_with_decimal_commas_and_comma_separators_is_refused_with_the_cause(tmp_path: Path):
     words = said(tmp_path / "log.csv", "level,action\n0,1,1,5\n0,2,1,0\n")
     assert "expected 2 columns, got 4" in words
     assert "the columns are separated by ',': numbers need a decimal point, not a comma" in words
 
 
-def test_a_log_of_two_rows_says_that_its_last_has_no_next_state(tmp_path: Path):
+def test_a_log_of_two_rows_is_refused_because_the_last_has_no_next_state(tmp_path: Path):
     words = said(tmp_path / "log.csv", "level,action\n0.1,1\n0.2,0\n")
     assert words.startswith("expected two usable steps at least, got 1 of 2 rows; 1 row has no next state")
     assert not (tmp_path / "log.rejected.csv").exists()

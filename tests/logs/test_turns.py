@@ -45,7 +45,7 @@ def turning(rng: np.random.Generator, size: float, digits: int = 5) -> dict[str,
     return recorded(rng, int(rng.integers(150, 400)), (low + 0.9) * size, after, digits)
 
 
-def test_every_turn_is_noticed_with_its_size():
+def test_a_log_column_that_wraps_around_is_reported_with_its_period():
     for seed in DRAWS:
         rng = np.random.default_rng(seed)
         size = SIZES[seed % len(SIZES)]
@@ -57,7 +57,7 @@ def test_every_turn_is_noticed_with_its_size():
             assert any(note.startswith(f"x: jumps by {size:g}") for note in log.notes), (seed, size, log.notes)
 
 
-def test_whole_numbers_of_an_encoder_are_noticed():
+def test_an_integer_encoder_column_that_wraps_is_reported():
     for seed in DRAWS:
         rng = np.random.default_rng(seed)
         size = (4096, 1024, 360, 400)[seed % 4]
@@ -81,7 +81,7 @@ def falling(rng: np.random.Generator) -> dict[str, Floats]:
     return recorded(rng, int(rng.integers(200, 500)), size / 2, after, 4)
 
 
-def test_states_that_fall_back_are_no_angles():
+def test_a_state_that_periodically_falls_back_is_not_drafted_as_angle():
     """Levels, pressures and pH of 0 to 6 became angles."""
     for seed in DRAWS:
         log = drafted(falling(np.random.default_rng(seed)))
@@ -103,14 +103,14 @@ def gearbox(rng: np.random.Generator) -> Rule:
 
 
 @pytest.mark.parametrize("plant", [siphon, gearbox])
-def test_an_irregular_fall_and_whole_numbers_are_no_angles(plant: Callable[[np.random.Generator], Rule]):
+def test_irregularly_falling_and_integer_states_are_not_drafted_as_angles(plant: Callable[[np.random.Generator], Rule]):
     for seed in DRAWS:
         rng = np.random.default_rng(seed)
         assert drafted(recorded(rng, 400, 3.0, plant(rng))).spec.coordinates[0].kind == "linear"
 
 
 @pytest.mark.parametrize("seed", [0, 10])
-def test_the_mapping_decides_what_is_an_angle(seed: int):
+def test_angles_declared_in_the_mapping_override_the_detection(seed: int):
     """An empty list of angles did not switch off what the data seemed to show."""
     turned = turning(np.random.default_rng(seed), 2 * math.pi)
     fallen = falling(np.random.default_rng(seed))
@@ -119,7 +119,7 @@ def test_the_mapping_decides_what_is_an_angle(seed: int):
     assert drafted(fallen, angles=["x"]).spec.coordinates[0].kind == "angle"
 
 
-def test_a_pendulum_is_an_angle_by_its_speed():
+def test_a_pendulum_angle_is_recognised_from_its_speed_and_one_jump():
     """Its change depends on the speed beside it, and one jump among its steps is enough."""
     for seed in DRAWS:
         rng = np.random.default_rng(seed)

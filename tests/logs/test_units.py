@@ -25,18 +25,18 @@ def states(speed: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("factor", [1_000.0, 1e5])
-def test_a_column_a_thousand_times_its_range_is_refused(factor: float) -> None:
+def test_a_log_column_a_thousand_times_its_sampling_range_is_refused(factor: float) -> None:
     speeds = states(factor * np.linspace(-8, 8, 50))
     with pytest.raises(UnusableLog, match=r"speed: half of the log lies between .* is the column in another unit\?"):
         require_units(speeds, pendulum())
 
 
-def test_a_column_with_another_zero_is_refused() -> None:
+def test_a_log_column_shifted_out_of_its_sampling_range_is_refused() -> None:
     with pytest.raises(UnusableLog, match="speed"):
         require_units(states(np.linspace(-8, 8, 50) + 1_000), pendulum())
 
 
-def test_a_few_wild_rows_and_missing_ones_are_no_other_unit() -> None:
+def test_a_few_outliers_and_missing_values_do_not_suggest_another_unit() -> None:
     speeds = np.linspace(-12, 12, 50)
     speeds[:5], speeds[5:8] = 1e6, np.nan
     require_units(states(speeds), pendulum())
@@ -59,7 +59,7 @@ CONVERSIONS = {
 
 
 @pytest.mark.parametrize("conversion", CONVERSIONS)
-def test_a_column_in_another_unit_is_never_taken_in_silence(conversion: str) -> None:
+def test_a_log_column_in_another_unit_is_refused_or_reported(conversion: str) -> None:
     """Those that shrink a column were taken without a word, and so was a factor of 3.6."""
     factor, zero = CONVERSIONS[conversion]
     for seed in range(20):
@@ -110,7 +110,7 @@ def celsius(tmp_path: Path) -> tuple[Path, Path]:
     return log.write(tmp_path / "kelvin.csv"), other.write(tmp_path / "celsius.csv")
 
 
-def test_celsius_is_refused_where_the_range_is_in_kelvin(tmp_path: Path) -> None:
+def test_a_log_in_celsius_is_refused_for_a_range_in_kelvin(tmp_path: Path) -> None:
     """It lies only three widths of the range away: 60 steps went into the model of a surrogate in kelvin."""
     log, other = celsius(tmp_path)
     spec = importing.read_log(log).spec
@@ -124,7 +124,9 @@ def test_celsius_is_refused_where_the_range_is_in_kelvin(tmp_path: Path) -> None
     assert said.endswith("If the values are right, widen the sampling range in a new specification (--spec)")
 
 
-def test_celsius_is_refused_before_a_step_is_sent(server_process: ServerProcess, tmp_path: Path) -> None:
+def test_a_log_in_the_wrong_unit_is_refused_before_any_step_is_sent(
+    server_process: ServerProcess, tmp_path: Path
+) -> None:
     log, other = celsius(tmp_path)
     importing.import_log(log, register="in-kelvin", url=server_process.url)
     with pytest.raises(UnusableLog, match="outside its sampling range"):
@@ -138,7 +140,7 @@ def test_celsius_is_refused_before_a_step_is_sent(server_process: ServerProcess,
 
 
 @pytest.mark.parametrize(("low", "high"), [(8.1, 12.0), (-12.0, -8.1)])
-def test_a_column_just_outside_its_range_is_refused(low: float, high: float) -> None:
+def test_a_log_column_just_outside_its_sampling_range_is_refused(low: float, high: float) -> None:
     with pytest.raises(UnusableLog, match=r"speed: half of the log lies between .*, outside its sampling range of -8"):
         require_units(states(np.linspace(low, high, 50)), pendulum())
 
@@ -152,16 +154,16 @@ def test_a_column_just_outside_its_range_is_refused(low: float, high: float) -> 
         (-30.0, 30.0),
     ],
 )
-def test_a_log_that_reaches_the_range_is_taken(low: float, high: float) -> None:
+def test_a_log_that_partly_lies_in_the_sampling_range_is_accepted(low: float, high: float) -> None:
     require_units(states(np.linspace(low, high, 50)), pendulum())
 
 
-def test_angles_of_other_turns_are_taken() -> None:
+def test_logged_angles_of_any_turn_are_accepted() -> None:
     turns = np.stack([np.linspace(30.0, 40.0, 50), np.zeros(50)], axis=1)
     require_units(turns, pendulum())
 
 
-def test_a_log_in_another_unit_is_refused_as_it_is_read(tmp_path) -> None:
+def test_reading_a_log_in_another_unit_than_the_specification_is_refused(tmp_path) -> None:
     log = reactor.log(runs=3, length=20).write(tmp_path / "log.csv")
     spec = importing.read_log(log).spec
     small = spec.model_dump()
@@ -173,7 +175,7 @@ def test_a_log_in_another_unit_is_refused_as_it_is_read(tmp_path) -> None:
         importing.read_log(log, options)
 
 
-def test_next_states_in_another_unit_are_refused_too(tmp_path) -> None:
+def test_next_states_in_another_unit_than_the_sampling_range_are_refused(tmp_path) -> None:
     """Only current states were checked: next states of a thousand times their size reached the model."""
     log = reactor.log(runs=3, length=20).write(tmp_path / "log.csv")
     read = importing.read_log(log)
@@ -194,7 +196,7 @@ def test_next_states_in_another_unit_are_refused_too(tmp_path) -> None:
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_rewards_a_thousand_times_those_of_the_samples_are_refused(sign: float) -> None:
+def test_logged_rewards_a_thousand_times_those_of_the_samples_are_refused(sign: float) -> None:
     """Dollars instead of thousands of dollars: the model of both would predict neither."""
     known = sign * np.linspace(0.5, 2, 50)
     with pytest.raises(
@@ -214,7 +216,7 @@ def test_rewards_a_thousand_times_those_of_the_samples_are_refused(sign: float) 
         np.zeros(0),
     ],
 )
-def test_other_rewards_are_no_other_unit(known: np.ndarray) -> None:
+def test_logged_rewards_that_merely_differ_from_the_samples_are_accepted(known: np.ndarray) -> None:
     paid = np.linspace(-40, 5, 50)
     paid[:5] = -1e6  # a few crashes
     require_reward_unit(paid, known, "tank")

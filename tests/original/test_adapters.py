@@ -28,7 +28,7 @@ def random_action(simulator: Simulator, rng: np.random.Generator) -> np.ndarray:
 
 @pytest.mark.filterwarnings("ignore")  # of the packages themselves
 @pytest.mark.parametrize("name", CASES)
-def test_a_step_from_a_set_state_is_that_of_the_episode(name: str) -> None:
+def test_a_simulator_step_from_a_set_state_equals_that_of_its_episode(name: str) -> None:
     simulator, rng = open_simulator(name), np.random.default_rng(0)
     simulator.reset(3)
     for _ in range(5):
@@ -48,7 +48,7 @@ def test_a_step_from_a_set_state_is_that_of_the_episode(name: str) -> None:
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("name", CASES)
-def test_two_resets_with_one_seed_are_equal(name: str) -> None:
+def test_two_simulator_resets_with_one_seed_are_equal(name: str) -> None:
     simulator = open_simulator(name)
     simulator.reset(5)
     first = simulator.read()
@@ -60,7 +60,7 @@ def test_two_resets_with_one_seed_are_equal(name: str) -> None:
 
 @installed("dm_control")
 @pytest.mark.filterwarnings("ignore")
-def test_a_task_of_the_control_suite_steps_as_its_own_environment() -> None:
+def test_a_dm_control_task_steps_like_its_own_environment() -> None:
     from dm_control import suite
 
     ours = open_simulator("dm_control:cartpole-swingup")
@@ -79,13 +79,13 @@ def test_a_task_of_the_control_suite_steps_as_its_own_environment() -> None:
 
 @pytest.mark.parametrize("name", ["dm_control:cartpole-fly", "dm_control:nothing"])
 @installed("dm_control")
-def test_an_unknown_task_of_the_control_suite_is_named(name: str) -> None:
+def test_the_error_for_an_unknown_dm_control_task_names_it(name: str) -> None:
     with pytest.raises(UnknownEnvironment, match="expected dm_control:DOMAIN-TASK, such as"):
         open_simulator(name)
 
 
 @pytest.mark.parametrize(("name", "package"), [("dm_control:cartpole-swingup", "dm_control"), ("pcgym:cstr", "pcgym")])
-def test_a_package_that_is_missing_is_named_with_its_extra(name: str, package: str) -> None:
+def test_the_error_for_a_missing_simulator_package_names_its_extra(name: str, package: str) -> None:
     if find_spec(package):
         pytest.skip(f"{package} is installed here")
     extra = package.replace("_", "-")
@@ -94,7 +94,7 @@ def test_a_package_that_is_missing_is_named_with_its_extra(name: str, package: s
 
 
 @installed("pcgym")
-def test_a_reset_shows_the_setpoint_that_the_first_step_is_paid_by() -> None:
+def test_after_a_reset_the_setpoint_is_that_of_the_first_reward() -> None:
     """Neither opens, resets nor steps with a warning, which would be an error here."""
     tank = open_simulator("pcgym:cstr")
     setpoint = tank.reset(0)[2]
@@ -139,7 +139,7 @@ TANK = {
         ({"model": 5}, "expected model to be the name of a model"),
     ],
 )
-def test_a_value_of_a_process_that_cannot_be_used_is_named(
+def test_the_error_for_an_unusable_value_in_a_process_file_names_it(
     wrong: dict[str, object], message: str, tmp_path: Path
 ) -> None:
     file = tmp_path / "process.json"
@@ -160,7 +160,9 @@ def test_a_value_of_a_process_that_cannot_be_used_is_named(
         ({"constraints": {"T": [327]}}, "pc-gym refused the parameters of pcgym:.*KeyError: 'done_on_cons_vio'"),
     ],
 )
-def test_a_value_that_does_not_fit_the_model_is_named(wrong: dict[str, object], message: str, tmp_path: Path) -> None:
+def test_the_error_for_a_process_file_value_that_does_not_fit_names_it(
+    wrong: dict[str, object], message: str, tmp_path: Path
+) -> None:
     file = tmp_path / "process.json"
     file.write_text(json.dumps(TANK | wrong))
     with pytest.raises(UnknownEnvironment, match=message):
@@ -168,13 +170,13 @@ def test_a_value_that_does_not_fit_the_model_is_named(wrong: dict[str, object], 
 
 
 @installed("pcgym")
-def test_setpoints_after_the_last_sample_do_not_count(tmp_path: Path) -> None:
+def test_setpoints_scheduled_after_the_last_step_are_ignored(tmp_path: Path) -> None:
     file = tmp_path / "process.json"
     file.write_text(json.dumps(TANK | {"SP": {"Ca": [0.85] * 10 + [7.0]}}))
     assert open_simulator(f"pcgym:{file}").scheduled == {"Ca_setpoint": (0.85, 0.85)}
 
 
-def test_choices_that_do_not_begin_at_zero_are_refused() -> None:
+def test_discrete_action_spaces_that_do_not_start_at_zero_are_refused() -> None:
     space = gymnasium.spaces.MultiDiscrete([3, 3])
     assert action_of("Own-v0", space).nvec == (3, 3)  # type: ignore[union-attr]
     for later in (gymnasium.spaces.MultiDiscrete([3, 3], start=[0, 1]), gymnasium.spaces.Discrete(3, start=1)):
@@ -182,7 +184,7 @@ def test_choices_that_do_not_begin_at_zero_are_refused() -> None:
             action_of("Own-v0", later)
 
 
-def test_parameters_of_a_process_come_from_a_file(tmp_path) -> None:
+def test_the_parameters_of_a_process_simulator_are_read_from_a_file(tmp_path) -> None:
     file = tmp_path / "tank.json"
     file.write_text(json.dumps(TANK))
     read = parameters_of(str(file))
@@ -197,7 +199,7 @@ def test_parameters_of_a_process_come_from_a_file(tmp_path) -> None:
     ("content", "message"),
     [("{", "is not JSON"), ("[]", "expected an object with model"), (None, "expected pcgym:cstr, or pcgym:FILE.json")],
 )
-def test_a_file_that_describes_no_process_is_refused(tmp_path, content: str | None, message: str) -> None:
+def test_a_process_file_without_a_process_is_refused(tmp_path, content: str | None, message: str) -> None:
     file = tmp_path / "tank.json"
     if content is not None:
         file.write_text(content)
@@ -205,7 +207,7 @@ def test_a_file_that_describes_no_process_is_refused(tmp_path, content: str | No
         parameters_of(str(file))
 
 
-def test_an_attribute_called_state_is_the_state(registered: Register) -> None:
+def test_the_attribute_state_of_a_gymnasium_environment_is_used_as_its_state(registered: Register) -> None:
     simulator = open_simulator(registered("Spiral-v0"))
     assert [variable.name for variable in simulator.variables] == ["state0", "state1"]
     simulator.write(np.array([1.0, 0.0]))
@@ -214,7 +216,7 @@ def test_an_attribute_called_state_is_the_state(registered: Register) -> None:
     assert simulator.time_limit == 30
 
 
-def test_a_state_that_can_not_be_read_leaves_only_resets(registered: Register) -> None:
+def test_an_environment_with_unreadable_state_is_reset_only(registered: Register) -> None:
     simulator = open_simulator(registered("Hidden-v0", attribute="_hidden"))
     assert not simulator.settable
     with pytest.raises(UnknownEnvironment, match="its state can't be read"):
@@ -229,12 +231,14 @@ def test_a_state_that_can_not_be_read_leaves_only_resets(registered: Register) -
         ({"observation_space": gymnasium.spaces.Discrete(4)}, "a symbol out of several"),
     ],
 )
-def test_spaces_that_no_specification_can_express_are_refused(registered: Register, space, message: str) -> None:
+def test_gymnasium_spaces_that_a_specification_cannot_express_are_refused(
+    registered: Register, space, message: str
+) -> None:
     with pytest.raises(UnknownEnvironment, match=message):
         open_simulator(registered("Odd-v0", space=space))
 
 
-def test_an_id_of_a_module_in_the_working_directory_is_opened(tmp_path, monkeypatch) -> None:
+def test_a_gymnasium_id_of_a_module_in_the_working_directory_is_opened(tmp_path, monkeypatch) -> None:
     """A factory there was found, and the id of a class in the same file was not."""
     lines = ["import gymnasium", "from support.simulators import Spiral", "gymnasium.register('Here-v0', Spiral)"]
     (tmp_path / "plant_here.py").write_text("\n".join(lines))
@@ -244,7 +248,7 @@ def test_an_id_of_a_module_in_the_working_directory_is_opened(tmp_path, monkeypa
     gymnasium.registry.pop("Here-v0")
 
 
-def test_a_column_of_numbers_is_no_image():
+def test_an_observation_of_shape_n_by_1_is_not_refused_as_image():
     """An observation of shape (n, 1) was refused as an image."""
     from surrogym_sampler.original.adapters.parts import flat
 

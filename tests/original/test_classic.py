@@ -41,7 +41,7 @@ def turned(spec, difference):
     return np.where(angles, (difference + np.pi) % (2 * np.pi) - np.pi, difference)
 
 
-def test_rows_of_states_are_wrapped_like_each_state(environments):
+def test_wrapping_many_states_at_once_equals_wrapping_each(environments):
     """An angle's column, and not the row of the same number: descriptions of rewards read many steps at once."""
     spec = environments["Pendulum-v1"].spec()
     rows = np.random.default_rng(0).uniform(-8, 8, (5, len(spec.coordinates)))
@@ -49,7 +49,7 @@ def test_rows_of_states_are_wrapped_like_each_state(environments):
 
 
 @pytest.mark.parametrize("name", IDS)
-def test_step_from_follows_the_environments_own_trajectory(environments, name):
+def test_step_from_reproduces_the_classic_environments_trajectory(environments, name):
     environment = environments[name]
     spec = environment.spec()
     real = gymnasium.make(name).unwrapped
@@ -73,7 +73,7 @@ def test_step_from_follows_the_environments_own_trajectory(environments, name):
 @pytest.mark.parametrize("name", IDS)
 @given(seed=st.integers(0, 10_000))
 @settings(max_examples=30)
-def test_declared_observation_and_termination_are_the_environments_own(environments, name, seed):
+def test_declared_observation_and_termination_equal_those_of_gymnasium(environments, name, seed):
     environment = environments[name]
     spec = environment.spec()
     rng = np.random.default_rng(seed)
@@ -85,7 +85,7 @@ def test_declared_observation_and_termination_are_the_environments_own(environme
 
 
 @pytest.mark.parametrize("name", IDS)
-def test_steps_are_independent_of_each_other(environments, name):
+def test_step_from_does_not_depend_on_earlier_steps(environments, name):
     """A counter left from an earlier episode would change the reward, or warn."""
     environment = environments[name]
     spec = environment.spec()
@@ -100,7 +100,7 @@ def test_steps_are_independent_of_each_other(environments, name):
 
 
 @pytest.mark.parametrize("name", IDS)
-def test_declared_spaces_are_the_environments_own(environments, name):
+def test_the_declared_spaces_equal_those_of_gymnasium(environments, name):
     spec = environments[name].spec()
     env = gymnasium.make(name)
     assert spec.time_limit == env.spec.max_episode_steps
@@ -116,7 +116,7 @@ def test_declared_spaces_are_the_environments_own(environments, name):
 
 
 @pytest.mark.parametrize("name", IDS)
-def test_declared_start_contains_the_environments_resets(environments, name):
+def test_the_declared_start_range_contains_gymnasiums_resets(environments, name):
     spec = environments[name].spec()
     env = gymnasium.make(name).unwrapped
     for seed in range(50):
@@ -126,13 +126,13 @@ def test_declared_start_contains_the_environments_resets(environments, name):
             assert low - 1e-7 <= value <= high + 1e-7
 
 
-def test_cartpole_failing_step_is_rewarded_as_gymnasium_does(environments):
+def test_the_terminating_step_of_cart_pole_is_rewarded_as_in_gymnasium(environments):
     step = environments["CartPole-v1"].step_from(np.array([0, 0, 0.209, 3.0]), np.array([1.0]))
     assert step.terminated
     assert step.reward == 1.0
 
 
-def test_cartpole_of_the_paper_pays_nothing_outside_and_never_terminates():
+def test_cart_pole_of_preset_paper_pays_0_outside_and_never_terminates():
     environment = original.make("CartPole-v1", preset="paper")
     assert environment.spec().design.preset == "paper"
     assert environment.spec().time_limit == 200

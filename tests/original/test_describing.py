@@ -43,7 +43,7 @@ def test_a_described_environment_steps_from_its_coordinates_as_in_an_episode(nam
     environment.close()
 
 
-def test_a_state_is_written_in_the_type_that_it_has_now() -> None:
+def test_setting_a_state_keeps_its_current_python_type() -> None:
     """MountainCar's state is an array after a reset and a tuple after a step."""
     owner = SimpleNamespace(state=np.zeros(2))
     part = Attribute(owner, "state")
@@ -53,7 +53,7 @@ def test_a_state_is_written_in_the_type_that_it_has_now() -> None:
 
 
 @installed("mujoco")
-def test_a_design_takes_the_steps_of_a_described_environment() -> None:
+def test_a_design_can_sample_a_described_environment() -> None:
     machine = original.make("Swimmer-v5", spec=describe("Swimmer-v5", STEPS).spec, budget=4, initial=4)
     design = surrogym.Design(machine.spec())
     while (query := design.ask()) is not None:
@@ -63,7 +63,7 @@ def test_a_design_takes_the_steps_of_a_described_environment() -> None:
 
 
 @installed("mujoco")
-def test_the_swimmer_needs_neither_its_place_nor_whole_turns() -> None:
+def test_describe_drops_the_swimmers_position_and_finds_its_angle() -> None:
     found = describe("Swimmer-v5", STEPS)
     assert "slider1" not in kinds(found)
     assert kinds(found)["free_body_rot"] == "angle"
@@ -72,14 +72,14 @@ def test_the_swimmer_needs_neither_its_place_nor_whole_turns() -> None:
 
 
 @installed("mujoco")
-def test_the_cheetah_keeps_its_height_and_not_its_place() -> None:
+def test_describe_keeps_the_cheetahs_height_and_drops_its_position() -> None:
     found = kinds(describe("HalfCheetah-v5", STEPS))
     assert "rootx" not in found
     assert found["rootz"] == "linear"
 
 
 @installed("mujoco")
-def test_the_described_observation_is_the_environments_own() -> None:
+def test_the_described_observation_equals_that_of_the_environment() -> None:
     name = "Reacher-v5"
     found = describe(name, STEPS)
     environment = original.make(name, spec=found.spec)
@@ -93,7 +93,7 @@ def test_the_described_observation_is_the_environments_own() -> None:
 
 
 @installed("mujoco")
-def test_entries_that_terms_can_not_express_are_replaced_by_coordinates() -> None:
+def test_observation_entries_that_cannot_be_expressed_are_replaced_by_coordinates() -> None:
     found = describe("Pusher-v5", STEPS)
     assert any("of 1, q, sin(q) and cos(q)" in line for line in found.found)
     shown = {name for entry in found.spec.observation for part in entry.term.parts for name in part.weights}
@@ -102,13 +102,13 @@ def test_entries_that_terms_can_not_express_are_replaced_by_coordinates() -> Non
 
 
 @installed("mujoco")
-def test_terminating_steps_make_termination_learned_and_a_question() -> None:
+def test_describing_an_environment_that_terminates_declares_a_learned_termination() -> None:
     found = describe("Hopper-v5", STEPS)
     assert found.spec.termination == "learned"
     assert any(line.startswith("termination:") for line in found.asked)
 
 
-def test_an_angle_in_an_attribute_is_found_and_shown_by_its_cosine_and_sine() -> None:
+def test_describe_finds_angles_and_observes_them_by_cosine_and_sine() -> None:
     """Both tasks show single precision, whose rounding errors are no part of a term."""
     found = describe("Acrobot-v1", STEPS)
     assert kinds(found) == {"state0": "angle", "state1": "angle", "state2": "linear", "state3": "linear"}
@@ -138,7 +138,7 @@ class Wheel(gymnasium.Env):
         return np.array([place, np.cos(angle), np.sin(angle), speed])
 
 
-def test_a_place_on_which_nothing_depends_is_no_angle(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_describe_does_not_take_an_irrelevant_position_for_an_angle(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(gymnasium.registry, "Wheel-v0", gymnasium.envs.registration.EnvSpec("Wheel-v0", Wheel))
     assert kinds(describe("Wheel-v0", STEPS)) == {"state0": "linear", "state1": "angle", "state2": "linear"}
     assert set(kinds(describe("CartPole-v1", STEPS)).values()) == {"linear"}
@@ -167,7 +167,7 @@ class Remembering(Wheel):
         return np.array([*self.state, 0.0])
 
 
-def test_a_number_that_forgets_a_shift_is_no_angle(listed) -> None:
+def test_describe_does_not_take_a_memoryless_variable_for_an_angle(listed) -> None:
     """Without whole turns, its next value is the same after any shift."""
     assert set(kinds(describe(listed(Remembering), STEPS)).values()) == {"linear"}
 
@@ -182,20 +182,20 @@ class Hanging(Wheel):
         return self._get_obs(), {}
 
 
-def test_starts_on_both_sides_of_the_jump_of_an_angle_are_one_arc(listed) -> None:
+def test_start_angles_on_both_sides_of_pi_are_described_as_one_arc(listed) -> None:
     """They were the whole circle."""
     low, high = limits(describe(listed(Hanging), STEPS).spec.start["state1"])
     assert np.pi - 0.12 < low < np.pi - 0.05
     assert np.pi + 0.05 < high < np.pi + 0.12
 
 
-def test_a_sampling_range_ends_at_the_limits_of_what_is_shown() -> None:
+def test_a_described_sampling_range_ends_at_the_clipping_limits() -> None:
     """Pendulum's speed is clipped at 8 rad/s; a quarter of the range was added on each side."""
     spec = describe("Pendulum-v1").spec
     assert limits(spec.coordinates[1].sampling) == (-8, 8)
 
 
-def test_a_reward_has_no_terms_of_rounding_and_none_that_cancel() -> None:
+def test_a_described_reward_has_no_rounding_terms_and_no_cancelling_terms() -> None:
     """Squares of cosine and sine came with a constant that cancels them."""
     terms = describe("Pendulum-v1").spec.reward.terms
     assert sorted(round(term.weight, 6) for term in terms) == [-1, -0.1, -0.001]
@@ -211,7 +211,7 @@ class Pair(NamedTuple):
     ("state", "written"),
     [((0.5, 2), (1.5, 3)), ([0.5, 2], [1.5, 3]), (Pair(0.5, 2), Pair(1.5, 3)), (np.array([0.5, 2]), None)],
 )
-def test_a_state_keeps_its_container_and_its_whole_numbers(state, written) -> None:
+def test_setting_a_state_keeps_its_container_type_and_integers(state, written) -> None:
     """A named tuple ended in an error, and a whole number that the environment used as an index became a fraction."""
     owner = SimpleNamespace(state=state)
     assert holds_numbers(owner, "state")
@@ -222,7 +222,7 @@ def test_a_state_keeps_its_container_and_its_whole_numbers(state, written) -> No
         assert type(owner.state[1]) is int
 
 
-def test_a_state_that_can_not_be_written_is_none() -> None:
+def test_a_read_only_or_nested_state_attribute_is_not_used_as_state() -> None:
     class Fixed:
         @property
         def state(self) -> np.ndarray:
@@ -233,20 +233,20 @@ def test_a_state_that_can_not_be_written_is_none() -> None:
 
 
 @installed("pcgym")
-def test_a_setpoint_is_constant_over_its_whole_range() -> None:
+def test_describe_declares_a_setpoint_as_constant_over_its_whole_range() -> None:
     spec = describe("pcgym:cstr", STEPS).spec
     setpoint = spec.coordinates[2]
     assert (setpoint.name, setpoint.kind, limits(setpoint.sampling)) == ("Ca_setpoint", "constant", (0.8, 0.9))
 
 
 @installed("pcgym")
-def test_virtual_episodes_begin_with_the_setpoints_of_the_schedule() -> None:
+def test_described_start_setpoints_are_those_of_the_schedule() -> None:
     found = describe("pcgym:cstr", STEPS)
     assert limits(found.spec.start["Ca_setpoint"]) == (0.85, 0.9), "others can't all be reached, and would cost much"
     assert any(line.startswith("start of Ca_setpoint: a schedule sets it") for line in found.asked)
 
 
-def test_every_step_is_counted(registered: Register) -> None:
+def test_describe_counts_every_real_step(registered: Register) -> None:
     name = registered("Spiral-v0")
     taken: list[int] = []
     made = gymnasium.registry[name].entry_point()
@@ -256,18 +256,18 @@ def test_every_step_is_counted(registered: Register) -> None:
     assert describe(name, 50).steps == len(taken) > 50
 
 
-def test_an_environment_with_hidden_memory_can_only_be_reset(registered: Register) -> None:
+def test_describe_declares_an_environment_with_hidden_memory_reset_only(registered: Register) -> None:
     found = describe(registered("Worn-v0", wear=0.01), 60)
     assert found.spec.query == "rollout"
     assert any("has memory that can't be set" in line for line in found.found)
 
 
-def test_the_observation_replaces_an_unreadable_state(registered: Register) -> None:
+def test_describe_uses_the_observation_if_the_state_is_unreadable(registered: Register) -> None:
     found = describe(registered("Hidden-v0", attribute="_hidden"), 60)
     assert (found.spec.query, found.spec.coordinate_names) == ("rollout", ("o0", "o1"))
 
 
-def test_a_mostly_constant_reward_becomes_a_question(registered: Register) -> None:
+def test_describe_asks_about_a_reward_that_is_mostly_constant(registered: Register) -> None:
     def step(self, action):
         shown, _, *rest = Spiral.step(self, action)
         return shown, float(np.abs(shown).sum() < 0.1), *rest
@@ -277,7 +277,7 @@ def test_a_mostly_constant_reward_becomes_a_question(registered: Register) -> No
     assert not any("paid exactly" in line for line in describe(registered("Spiral-v0"), 60).asked)
 
 
-def test_the_file_says_what_was_found_and_holds_the_specification(registered: Register) -> None:
+def test_the_description_file_contains_findings_and_specification(registered: Register) -> None:
     found = describe(registered("Spiral-v0"), 60)
     read = json.loads(found.text())
     assert read["real_steps"] == found.steps
@@ -285,7 +285,7 @@ def test_the_file_says_what_was_found_and_holds_the_specification(registered: Re
     assert EnvironmentSpec.model_validate_json(json.dumps(read["specification"])) == found.spec
 
 
-def test_an_observation_of_too_many_entries_is_replaced_by_the_coordinates(registered: Register) -> None:
+def test_describe_replaces_a_too_long_observation_by_the_coordinates(registered: Register) -> None:
     """It was refused after all real steps: a specification has at most 64 entries."""
     weights = np.random.default_rng(0).normal(size=(200, 2))
     space = {"_get_obs": lambda self: weights @ self.state}
@@ -317,14 +317,14 @@ class Counting(gymnasium.Env):
 
 
 @pytest.mark.parametrize("terminates", [True, False])
-def test_a_common_length_of_all_random_episodes_is_the_limit(listed, terminates: bool) -> None:
+def test_describe_takes_a_common_episode_length_as_time_limit(listed, terminates: bool) -> None:
     found = describe(listed(partial(Counting, 20, terminates)), STEPS)
     assert found.spec.time_limit == 20
     assert found.spec.termination == ()
     assert any("exactly 20 steps" in line for line in found.asked)
 
 
-def test_episodes_of_different_lengths_show_no_limit(listed) -> None:
+def test_describe_finds_no_time_limit_in_episodes_of_different_lengths(listed) -> None:
     found = describe(listed(partial(Counting, None, True)), STEPS)
     assert found.spec.time_limit == 200
     assert found.spec.termination == "learned"

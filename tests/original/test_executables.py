@@ -50,7 +50,7 @@ def moody(mood: str, version: int = 1, step_limit: float = 30.0):
     return original.make(f"exec:{shlex.join([sys.executable, '-c', code])}", step_limit=step_limit)
 
 
-def test_a_shell_program_takes_exact_steps():
+def test_an_environment_program_in_shell_takes_exact_steps():
     plant = original.make(f"exec:{shlex.quote(str(SHELL))}")
     step = plant.step_from(np.array([7.0]), np.array([1.0]))
     plant.close()
@@ -69,7 +69,7 @@ def test_a_shell_program_takes_exact_steps():
         ("os.close(1); time.sleep(60)", "the program closed its standard output and was ended during step$"),
     ],
 )
-def test_a_fault_costs_one_step(mood, message):
+def test_a_fault_of_an_environment_program_costs_one_step(mood, message):
     plant = moody(mood)
     try:
         with pytest.raises(StepFailed, match=message):
@@ -79,7 +79,7 @@ def test_a_fault_costs_one_step(mood, message):
         plant.close()
 
 
-def test_a_hanging_program_is_ended_and_started_anew():
+def test_a_hanging_environment_program_is_killed_and_restarted():
     plant = moody("time.sleep(3600)", step_limit=5.0)
     try:
         before = int(plant.step_from(np.zeros(4), np.zeros(1)).reward)
@@ -92,7 +92,7 @@ def test_a_hanging_program_is_ended_and_started_anew():
         plant.close()
 
 
-def test_a_line_without_an_end_is_in_the_error_with_the_way_out():
+def test_the_error_for_an_unterminated_output_line_shows_it_with_a_remedy():
     plant = moody("sys.stdout.write('{\"id\": 3'); sys.stdout.flush(); time.sleep(3600)", step_limit=2.0)
     try:
         with pytest.raises(StepTimedOut, match=r'printed {"id": 3 without an end of the line; a larger --step-limit'):
@@ -110,24 +110,24 @@ def test_a_line_without_an_end_is_in_the_error_with_the_way_out():
         (None, f"expected 'result' or 'error' in the program's answer, got {{\"id\": 1, \"error\": null}}; {CHECK}"),
     ],
 )
-def test_an_error_of_a_program_is_repeated_as_one_short_line(error, said):
+def test_the_error_of_an_environment_program_is_repeated_in_one_short_line(error, said):
     with pytest.raises(StepFailed) as raised:
         decode(json.dumps({"id": 1, "error": error}).encode(), 1)
     assert str(raised.value) == said
 
 
-def test_a_result_beside_an_error_that_is_null_is_a_result():
+def test_a_program_reply_with_error_null_and_a_result_is_accepted():
     assert decode(b'{"id": 1, "error": null, "result": {"state": [0]}}', 1) == {"state": [0]}
 
 
-def test_what_an_ended_program_has_started_is_ended_too(tmp_path):
+def test_child_processes_of_a_killed_environment_program_are_killed_too(tmp_path):
     plant = f"sh -c 'sleep 3600 >/dev/null & echo $! > {tmp_path}/pids; exit 3'"
     with pytest.raises(UnknownEnvironment, match="got none"):
         original.make(f"exec:{plant}")
     assert left_behind(tmp_path) == []
 
 
-def test_the_last_line_of_standard_error_is_in_the_error(capfd: pytest.CaptureFixture[str]):
+def test_the_error_of_a_failed_program_contains_its_last_stderr_line(capfd: pytest.CaptureFixture[str]):
     plant = moody("print('no licence\\x1b[2J\\n', file=sys.stderr, flush=True); os.abort()")
     try:
         with pytest.raises(
@@ -139,7 +139,7 @@ def test_the_last_line_of_standard_error_is_in_the_error(capfd: pytest.CaptureFi
     assert "no licence" in capfd.readouterr().err
 
 
-def test_a_flood_on_standard_error_does_not_stop_the_program(monkeypatch: pytest.MonkeyPatch):
+def test_much_output_on_stderr_does_not_block_an_environment_program(monkeypatch: pytest.MonkeyPatch):
     """This process's own standard error is a pipe that nobody reads."""
     reading, writing = os.pipe()
     monkeypatch.setattr("surrogym_sampler.original.executables.standard_error.OWN", writing)
@@ -153,7 +153,7 @@ def test_a_flood_on_standard_error_does_not_stop_the_program(monkeypatch: pytest
         os.close(writing)
 
 
-def test_a_large_snapshot_is_restored():
+def test_a_large_snapshot_of_an_environment_program_is_restored():
     plant = moody("pass")
     try:
         plant.begin()
@@ -162,7 +162,7 @@ def test_a_large_snapshot_is_restored():
         plant.close()
 
 
-def test_a_program_that_does_not_read_a_large_request_is_ended():
+def test_an_environment_program_that_does_not_read_its_input_is_killed():
     sleeper = Program("sleep 3600")
     sleeper.start()
     with pytest.raises(StepTimedOut, match=r"read \d+ of 1048576 bytes of restore within 0.2 s and was ended"):
@@ -170,16 +170,16 @@ def test_a_program_that_does_not_read_a_large_request_is_ended():
     assert not sleeper.running
 
 
-def test_a_newer_protocol_is_refused_with_the_way_out():
+def test_a_program_with_a_newer_protocol_version_is_refused_with_a_remedy():
     with pytest.raises(UnknownEnvironment, match="expected protocol 1 from the program, got 2: update surrogym"):
         moody("pass", version=2)
 
 
-def test_a_server_never_starts_a_program():
+def test_a_specification_from_a_server_never_starts_a_program():
     assert not is_known("exec:./plant")
 
 
-def test_a_late_answer_is_never_taken_for_another_request(tmp_path):
+def test_a_late_program_reply_is_never_taken_for_the_reply_to_another_request(tmp_path):
     late = ("    [u] = ", "    [u] = [0.0] if request['action'] == [1.0] and not time.sleep(1.0) else ")
     plant = original.make(f"exec:{program(tmp_path, late)}", step_limit=0.5)
     try:
@@ -191,7 +191,7 @@ def test_a_late_answer_is_never_taken_for_another_request(tmp_path):
         plant.close()
 
 
-def test_a_program_ends_with_a_client_that_is_killed(tmp_path):
+def test_an_environment_program_ends_if_its_client_is_killed(tmp_path):
     name = f"exec:{program(tmp_path, NOTES_ITSELF)}"
     client = f"import time; from surrogym_sampler import original; plant = original.make({name!r}); time.sleep(3600)"
     process = subprocess.Popen([sys.executable, "-c", client])
@@ -203,7 +203,7 @@ def test_a_program_ends_with_a_client_that_is_killed(tmp_path):
     assert left_behind(tmp_path) == []
 
 
-def test_a_program_that_hangs_is_ended_after_its_client_was_killed(tmp_path):
+def test_a_hanging_environment_program_ends_if_its_client_is_killed(tmp_path):
     """It reads nothing, so the end of its input says nothing to it, and SIGTERM does not end it."""
     hangs = (HANGS[0], "    open(os.path.dirname(__file__) + '/hangs', 'x')\n" + HANGS[1])
     command = program(tmp_path, NOTES_ITSELF, UNTERMINABLE, hangs)
@@ -224,7 +224,7 @@ plant.ask("step", time.monotonic() + 3600, action=[1.0])
     assert left_behind(tmp_path) == []
 
 
-def test_a_program_that_can_no_longer_be_started_is_the_machines_fault(tmp_path):
+def test_a_program_that_cannot_be_restarted_is_not_blamed_on_the_snapshot(tmp_path):
     """So the sampler keeps the snapshot that a query began at."""
     rail = tmp_path / "rail.sh"
     shutil.copy(SHELL, rail)
@@ -240,6 +240,6 @@ def test_a_program_that_can_no_longer_be_started_is_the_machines_fault(tmp_path)
         plant.close()
 
 
-def test_an_answer_with_a_key_twice_is_refused():
+def test_a_program_reply_with_a_repeated_key_is_refused():
     with pytest.raises(StepFailed, match=r"each key once .* 'reward' twice"):
         decode(b'{"id": 1, "result": {"reward": 1, "reward": 2}}', 1)

@@ -65,7 +65,7 @@ def paying(reward):
         (grows, "expected the state to have 2 numbers, as after the first reset, got 3"),
     ],
 )
-def test_a_step_that_fails_is_described_with_the_real_steps_before_it(
+def test_a_step_failing_during_describe_reports_the_real_steps_before_it(
     registered: Register, step: object, message: str
 ) -> None:
     name = registered("Fails-v0", space={"step": step})
@@ -87,7 +87,7 @@ def fails_at_once(self, *, seed=None, options=None):
         ({"reset": lambda _, **__: sys.exit()}, r"Fails-v0 can't be opened: SystemExit \(test_failing"),
     ],
 )
-def test_an_environment_that_cannot_be_opened_says_why(
+def test_describing_an_environment_that_cannot_be_opened_gives_the_reason(
     registered: Register, space: dict[str, object], message: str
 ) -> None:
     with pytest.raises(UnknownEnvironment, match=message):
@@ -101,7 +101,7 @@ def shown_once(self):
     return np.zeros(2)
 
 
-def test_what_fails_between_the_steps_says_how_many_there_were(registered: Register) -> None:
+def test_a_failure_between_steps_of_describe_reports_the_real_steps(registered: Register) -> None:
     """The observation of a state that was set was read outside of all counts: it ended in a traceback."""
     name = registered("Fails-v0", space={"_get_obs": shown_once, "stepped": False})
     with pytest.raises(StepFailed, match=r"Fails-v0 failed after \d+ real steps: OSError: no picture") as failed:
@@ -109,14 +109,14 @@ def test_what_fails_between_the_steps_says_how_many_there_were(registered: Regis
     assert int(str(failed.value).split()[3]) > STEPS
 
 
-def test_a_description_survives_an_environment_that_can_not_be_closed(registered: Register) -> None:
+def test_describe_returns_its_result_although_the_environment_fails_to_close(registered: Register) -> None:
     """Its real steps were taken, and nobody could use them."""
     found = describe(registered("Fails-v0", space={"close": lambda _: sys.exit(4)}), STEPS)
     assert found.found[-1].startswith("Fails-v0 could not be closed: SystemExit: 4 (test_failing")
     assert found.steps >= STEPS
 
 
-def test_starts_that_are_no_numbers_are_refused_before_any_real_step(registered: Register) -> None:
+def test_describe_refuses_nan_start_states_before_any_real_step(registered: Register) -> None:
     """Nor do they raise a warning of NumPy, which is an error here."""
     resets = iter(range(1_000))
 
@@ -131,12 +131,12 @@ def test_starts_that_are_no_numbers_are_refused_before_any_real_step(registered:
     assert "real steps" not in str(refused.value)
 
 
-def test_a_refusal_says_how_many_real_steps_it_took(registered: Register) -> None:
+def test_a_refusal_by_describe_reports_its_real_steps(registered: Register) -> None:
     with pytest.raises(UnknownEnvironment, match=f"infinite rewards or NaN .*; this took {STEPS} real steps"):
         describe(registered("Fails-v0", space={"step": paying(float("inf"))}), STEPS)
 
 
-def test_a_reset_of_the_old_form_is_not_taken_for_an_observation_and_info(registered: Register) -> None:
+def test_an_old_style_gym_reset_is_refused(registered: Register) -> None:
     def reset(self, *, seed=None, options=None):
         return Spiral.reset(self, seed=seed)[0]  # two numbers, not two values
 
@@ -145,18 +145,18 @@ def test_a_reset_of_the_old_form_is_not_taken_for_an_observation_and_info(regist
         open_simulator(registered("Old-v0", space={"reset": reset}))
 
 
-def test_a_reward_of_one_entry_is_a_number(registered: Register) -> None:
+def test_a_reward_array_of_one_entry_is_accepted(registered: Register) -> None:
     simulator = open_simulator(registered("Row-v0", space={"step": paying(np.array([2.0]))}))
     assert simulator.step(np.zeros(1)).reward == 2.0
 
 
 @pytest.mark.parametrize("reward", [float("inf"), float("nan")])
-def test_rewards_that_are_no_numbers_are_refused(registered: Register, reward: float) -> None:
+def test_describe_refuses_rewards_that_are_not_finite_numbers(registered: Register, reward: float) -> None:
     with pytest.raises(UnknownEnvironment, match="Fails-v0 paid infinite rewards or NaN"):
         describe(registered("Fails-v0", space={"step": paying(reward)}), STEPS)
 
 
-def test_a_variable_that_moves_by_rounding_only_is_left_out(registered: Register) -> None:
+def test_describe_leaves_out_a_variable_that_moves_only_by_rounding(registered: Register) -> None:
     def reset(self, *, seed=None, options=None):
         Spiral.reset(self, seed=seed)
         self.state[1] = 300.0
@@ -173,27 +173,29 @@ def test_a_variable_that_moves_by_rounding_only_is_left_out(registered: Register
 
 
 @pytest.mark.parametrize("name", ["own_cart:Cart", "my.plants:make", "exec:./plant"])
-def test_a_factory_is_not_described_and_is_told_why(name: str) -> None:
+def test_describing_a_factory_with_its_own_specification_is_refused_with_the_reason(name: str) -> None:
     with pytest.raises(UnknownEnvironment, match="gives its own specification: there is nothing to describe"):
         describe(name, STEPS)
 
 
 @pytest.mark.parametrize("name", ["nowhere", "", ":", "own_cart:", "../x:y"])
-def test_the_forms_of_names_that_can_be_described_are_listed(name: str) -> None:
+def test_the_error_for_a_name_that_cannot_be_described_lists_the_valid_forms(name: str) -> None:
     with pytest.raises(UnknownEnvironment, match=r"no adapter knows .* expected a Gymnasium id such as") as refused:
         describe(name, STEPS)
     assert "factory" not in str(refused.value), "a factory is no environment to describe"
 
 
 @pytest.mark.parametrize("space", [Box(1, 1, (1,)), Box(-1e30, 1e30, (1,), np.float64), Discrete(1)])
-def test_actions_that_no_specification_allows_are_refused_in_one_line(registered: Register, space: Space) -> None:
+def test_describe_refuses_unsupported_action_spaces_in_one_line(registered: Register, space: Space) -> None:
     with pytest.raises(UnknownEnvironment, match=r"\AFails-v0 can't be specified: .+\Z") as refused:
         open_simulator(registered("Fails-v0", space={"action_space": space}))
     assert "\n" not in str(refused.value)
 
 
 @pytest.mark.parametrize("size", [0, 65, 500])
-def test_an_action_of_no_entries_or_too_many_is_refused_with_a_way_out(registered: Register, size: int) -> None:
+def test_describe_refuses_an_action_with_none_or_too_many_entries_with_a_remedy(
+    registered: Register, size: int
+) -> None:
     """The words were Python's: Tuple should have at least 1 item after validation, not 0."""
     message = f"Fails-v0 has an action of {size} entries: expected 1 to 64; write a wrapper class"
     with pytest.raises(UnknownEnvironment, match=message):
@@ -224,7 +226,7 @@ def sized(size):
         (5_000, "Fails-v0 has 5000 variables that move: expected at most 64"),
     ],
 )
-def test_a_state_of_no_numbers_or_too_many_is_refused_before_any_real_step(
+def test_describe_refuses_an_empty_or_too_large_state_before_any_real_step(
     registered: Register, size: int, message: str
 ) -> None:
     """An empty one was refused in words of Python, and a large one after 400 real steps."""
@@ -233,7 +235,7 @@ def test_a_state_of_no_numbers_or_too_many_is_refused_before_any_real_step(
     assert "real steps" not in str(refused.value)
 
 
-def test_an_environment_in_which_nothing_moves_is_refused_with_a_way_out(registered: Register) -> None:
+def test_describing_an_environment_in_which_nothing_moves_is_refused_with_a_remedy(registered: Register) -> None:
     def reset(self, *, seed=None, options=None):
         Spiral.reset(self, seed=seed)
         self.state = np.ones(2)
@@ -256,7 +258,7 @@ class Mute(Exception):
     ("error", "said"),
     [(ValueError("valve \ud800 stuck"), r"ValueError: valve \ud800 stuck"), (Mute(), "its message can't be read")],
 )
-def test_any_error_is_described_by_text_that_can_be_sent(error: Exception, said: str):
+def test_any_environment_error_becomes_text_that_can_be_sent(error: Exception, said: str):
     for described in (sentence(error), sentence(StepFailed(str(error))) if error.args else said):
         assert said.partition(": ")[2] in described
         described.encode()

@@ -102,7 +102,7 @@ def moody_with_limits(moody: Path, folder: Path, step_limit: float = 30.0) -> Fm
 
 
 @pytest.mark.parametrize("which", ["tanks", "pendulum", "heater"])
-def test_episodes_and_restored_snapshots_replay_bit_for_bit(which: str, request) -> None:
+def test_fmu_episodes_and_restored_snapshots_replay_bit_equal(which: str, request) -> None:
     fmu = opened(f"fmu:{request.getfixturevalue(which)}")
     try:
         actions = drawn(fmu, 40)
@@ -120,7 +120,7 @@ def test_episodes_and_restored_snapshots_replay_bit_for_bit(which: str, request)
 
 
 @pytest.mark.parametrize("which", ["tanks", "pendulum", "heater"])
-def test_any_state_is_set_and_steps_on_bit_for_bit(which: str, request) -> None:
+def test_an_fmu_set_to_any_state_steps_on_bit_equal(which: str, request) -> None:
     fmu = opened(f"fmu:{request.getfixturevalue(which)}")
     try:
         (action, other) = drawn(fmu, 2)
@@ -138,7 +138,7 @@ def test_any_state_is_set_and_steps_on_bit_for_bit(which: str, request) -> None:
         fmu.close()
 
 
-def test_a_snapshot_outlives_the_process_that_made_it(tanks: Path) -> None:
+def test_an_fmu_snapshot_can_be_restored_in_another_process(tanks: Path) -> None:
     one, other = opened(f"fmu:{tanks}"), opened(f"fmu:{tanks}")
     try:
         one.step(np.ones(1))
@@ -150,7 +150,7 @@ def test_a_snapshot_outlives_the_process_that_made_it(tanks: Path) -> None:
         other.close()
 
 
-def test_a_snapshot_of_something_else_is_refused(tanks: Path, tmp_path: Path) -> None:
+def test_restoring_an_fmu_snapshot_of_another_file_is_refused(tanks: Path, tmp_path: Path) -> None:
     one = opened(f"fmu:{tanks}")
     other = opened(mapping(tmp_path, fmu=str(tanks), start={"flow": 1e-4}))
     try:
@@ -163,7 +163,7 @@ def test_a_snapshot_of_something_else_is_refused(tanks: Path, tmp_path: Path) ->
         other.close()
 
 
-def test_states_kept_in_memory_are_lost_with_their_process(tanks: Path, tmp_path: Path) -> None:
+def test_fmu_states_that_cannot_be_serialised_are_lost_with_their_process(tanks: Path, tmp_path: Path) -> None:
     quiet = changed(tanks, tmp_path / "quiet.fmu", {'canSerializeFMUstate="true"': 'canSerializeFMUstate="false"'})
     one, other = opened(f"fmu:{quiet}"), opened(f"fmu:{quiet}")
     try:
@@ -179,7 +179,7 @@ def test_states_kept_in_memory_are_lost_with_their_process(tanks: Path, tmp_path
         other.close()
 
 
-def test_parameters_and_start_values_come_from_a_file(tanks: Path, tmp_path: Path) -> None:
+def test_fmu_parameters_and_start_values_are_read_from_a_file(tanks: Path, tmp_path: Path) -> None:
     slow = opened(mapping(tmp_path, fmu=str(tanks), step=5.0, start={"flow": 0.0, "upper": 0.5, "lower": 0}))
     try:
         assert slow.time_limit == 200
@@ -190,7 +190,7 @@ def test_parameters_and_start_values_come_from_a_file(tanks: Path, tmp_path: Pat
         slow.close()
 
 
-def test_a_description_asks_for_the_reward_and_the_limits(moody: Path, tmp_path: Path) -> None:
+def test_describing_an_fmu_asks_for_reward_and_limits(moody: Path, tmp_path: Path) -> None:
     found = describe(mapping(tmp_path, fmu=str(moody), step=0.5), steps=20)
     asked = " ".join(found.asked)
     assert "reward: the environment has none. Declare one" in asked
@@ -199,19 +199,19 @@ def test_a_description_asks_for_the_reward_and_the_limits(moody: Path, tmp_path:
     assert found.spec.query == "step"
 
 
-def test_an_angle_is_known_by_its_unit(pendulum: Path) -> None:
+def test_an_fmu_variable_in_radians_is_described_as_angle(pendulum: Path) -> None:
     spec = describe(f"fmu:{pendulum}", steps=40).spec
     assert [(c.name, c.kind) for c in spec.coordinates] == [("angle", "angle"), ("speed", "linear")]
     assert spec.action.low == (-5.0,)  # type: ignore[union-attr]
     assert spec.time_limit == 100
 
 
-def test_a_description_declares_the_seconds_of_a_step(tanks: Path, tmp_path: Path) -> None:
+def test_describing_an_fmu_declares_the_step_duration(tanks: Path, tmp_path: Path) -> None:
     assert describe(f"fmu:{tanks}", steps=20).spec.sampling_period == 10.0
     assert describe(mapping(tmp_path, fmu=str(tanks), step=5.0), steps=20).spec.sampling_period == 5.0
 
 
-def test_rewards_starts_and_ends_are_the_specifications(tanks: Path) -> None:
+def test_an_fmu_episode_uses_reward_start_and_termination_of_the_specification(tanks: Path) -> None:
     name = f"fmu:{tanks}"
     full = Inequality(term=Term.linear(upper=1), relation=">", value=0.9)
     spec = rewarded(name, squared("lower", wanted=0.4)).model_copy(
@@ -231,14 +231,14 @@ def test_rewards_starts_and_ends_are_the_specifications(tanks: Path) -> None:
         episode.close()
 
 
-def test_an_environment_without_a_declared_reward_is_refused(tanks: Path) -> None:
+def test_an_fmu_without_a_declared_reward_is_refused(tanks: Path) -> None:
     name = f"fmu:{tanks}"
     spec = describe(name, steps=20).spec
     with pytest.raises(UnknownEnvironment, match=r"expected a declared reward .* surrogym describe"):
         original.make(name, spec=spec)
 
 
-def test_an_fmu_is_never_opened_for_a_server() -> None:
+def test_a_specification_from_a_server_never_opens_an_fmu() -> None:
     assert not is_known("fmu:plant.fmu")
     assert not is_known("fmu:plant.json")
 
@@ -251,7 +251,7 @@ def test_an_fmu_is_never_opened_for_a_server() -> None:
         (4.0, r"Moody.fmu: the FMU answered fmi2DoStep with status"),
     ],
 )
-def test_a_fault_of_native_code_costs_one_step(moody: Path, tmp_path: Path, push: float, message: str) -> None:
+def test_a_crash_of_fmu_native_code_costs_one_step(moody: Path, tmp_path: Path, push: float, message: str) -> None:
     plant = moody_with_limits(moody, tmp_path)
     try:
         good = plant.step_from(np.array([0.5]), np.array([-1.0]))
@@ -265,7 +265,7 @@ def test_a_fault_of_native_code_costs_one_step(moody: Path, tmp_path: Path, push
         plant.close()
 
 
-def test_a_hanging_fmu_is_ended_and_started_anew(moody: Path, tmp_path: Path) -> None:
+def test_a_hanging_fmu_is_killed_and_restarted(moody: Path, tmp_path: Path) -> None:
     plant = moody_with_limits(moody, tmp_path, step_limit=5.0)
     try:
         with pytest.raises(
@@ -277,7 +277,7 @@ def test_a_hanging_fmu_is_ended_and_started_anew(moody: Path, tmp_path: Path) ->
         plant.close()
 
 
-def test_a_crash_at_a_later_step_is_named(moody: Path, tmp_path: Path) -> None:
+def test_a_crash_of_an_fmu_at_a_later_step_is_reported(moody: Path, tmp_path: Path) -> None:
     plant = moody_with_limits(moody, tmp_path)
     try:
         plant.begin(0)
@@ -288,7 +288,7 @@ def test_a_crash_at_a_later_step_is_named(moody: Path, tmp_path: Path) -> None:
         plant.close()
 
 
-def test_an_fmu_without_snapshots_saves_what_can_be_set(moody: Path, tmp_path: Path) -> None:
+def test_an_fmu_without_native_snapshots_saves_its_settable_variables(moody: Path, tmp_path: Path) -> None:
     plant = moody_with_limits(moody, tmp_path)
     try:
         start = plant.begin(0)
@@ -299,7 +299,7 @@ def test_an_fmu_without_snapshots_saves_what_can_be_set(moody: Path, tmp_path: P
         plant.close()
 
 
-def test_a_state_that_does_not_read_back_can_only_be_reset(tmp_path: Path) -> None:
+def test_an_fmu_whose_state_cannot_be_set_exactly_is_reset_only(tmp_path: Path) -> None:
     stubborn = build_text(STUBBORN, "stubborn", tmp_path)
     fmu = opened(mapping(tmp_path, fmu=str(stubborn), step=1.0))
     try:
@@ -311,7 +311,7 @@ def test_a_state_that_does_not_read_back_can_only_be_reset(tmp_path: Path) -> No
         fmu.close()
 
 
-def test_calculated_outputs_are_reset_or_restored(tanks: Path, tmp_path: Path) -> None:
+def test_an_fmu_with_read_only_states_is_used_by_reset_and_snapshots(tanks: Path, tmp_path: Path) -> None:
     read_only = changed(tanks, tmp_path / "read.fmu", {' initial="exact"': "", ' start="0.1"': ""})
     spec = rewarded(f"fmu:{read_only}", squared("lower", wanted=0.4))
     assert spec.access == "snapshot"
@@ -329,7 +329,7 @@ def test_calculated_outputs_are_reset_or_restored(tanks: Path, tmp_path: Path) -
         plant.close()
 
 
-def test_nothing_is_left_after_closing(tanks: Path, monkeypatch, tmp_path: Path) -> None:
+def test_closing_an_fmu_leaves_no_temporary_files(tanks: Path, monkeypatch, tmp_path: Path) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     fmu = opened(f"fmu:{tanks}")
     assert os.listdir(tmp_path)
@@ -337,7 +337,7 @@ def test_nothing_is_left_after_closing(tanks: Path, monkeypatch, tmp_path: Path)
     assert os.listdir(tmp_path) == []
 
 
-def test_a_specification_fits_the_same_file_in_another_folder(tanks: Path) -> None:
+def test_an_fmu_specification_fits_the_same_file_in_another_folder(tanks: Path) -> None:
     spec = rewarded(f"fmu:{tanks}", squared("lower"), steps=20).model_copy(update={"environment": "fmu:TwoTanks.fmu"})
     original.make(f"fmu:{tanks}", spec=spec).close()
     assert fits("fmu:TwoTanks.fmu", f"fmu:{tanks}")

@@ -31,12 +31,14 @@ def tanks(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ({"</fmiModelDescription>": ""}, "modelDescription.xml of .* can't be read"),
     ],
 )
-def test_a_description_that_does_not_fit_is_named(tanks: Path, tmp_path: Path, words, message: str) -> None:
+def test_a_specification_that_does_not_fit_the_fmu_is_refused_with_the_difference(
+    tanks: Path, tmp_path: Path, words, message: str
+) -> None:
     with pytest.raises(UnknownEnvironment, match=message):
         open_simulator(f"fmu:{changed(tanks, tmp_path / 'copy.fmu', words)}")
 
 
-def test_code_for_another_platform_is_named(tanks: Path, tmp_path: Path) -> None:
+def test_an_fmu_with_code_for_another_platform_is_refused(tanks: Path, tmp_path: Path) -> None:
     foreign = changed(tanks, tmp_path / "foreign.fmu", {}, moved="win32")
     with pytest.raises(UnknownEnvironment, match=r"expected native code for \S+ in .*, got win32, win64: export it"):
         open_simulator(f"fmu:{foreign}")
@@ -45,7 +47,7 @@ def test_code_for_another_platform_is_named(tanks: Path, tmp_path: Path) -> None
         open_simulator(f"fmu:{bare}")
 
 
-def test_broken_files_are_named(tanks: Path, tmp_path: Path) -> None:
+def test_a_damaged_fmu_file_is_refused_with_the_fault(tanks: Path, tmp_path: Path) -> None:
     whole = tanks.read_bytes()
     for content, message in ((b"hello", "is not a zip archive"), (whole[: len(whole) // 2], "is not a zip archive")):
         (tmp_path / "broken.fmu").write_bytes(content)
@@ -74,12 +76,12 @@ def test_broken_files_are_named(tanks: Path, tmp_path: Path) -> None:
         ({"step": -1.0}, "step: expected a number greater than 0"),
     ],
 )
-def test_choices_that_do_not_fit_are_named(tanks: Path, tmp_path: Path, choices, message: str) -> None:
+def test_fmu_options_that_do_not_fit_the_file_are_refused(tanks: Path, tmp_path: Path, choices, message: str) -> None:
     with pytest.raises(UnknownEnvironment, match=message):
         open_simulator(mapping(tmp_path, fmu=str(tanks), **choices))
 
 
-def test_files_of_other_forms_are_named_without_words_of_python(tmp_path: Path) -> None:
+def test_files_that_are_no_fmu_are_refused_without_python_terms(tmp_path: Path) -> None:
     (tmp_path / "list.json").write_text("[1]")
     with pytest.raises(UnknownEnvironment, match=r"list.json: not a JSON object; expected fmu"):
         open_simulator(f"fmu:{tmp_path / 'list.json'}")
@@ -90,7 +92,7 @@ def test_files_of_other_forms_are_named_without_words_of_python(tmp_path: Path) 
 
 
 @pytest.mark.parametrize("name", ["resources/zeros.bin", "modelDescription.xml"])
-def test_a_bomb_is_refused_by_its_directory_before_it_is_unpacked(
+def test_a_zip_bomb_as_fmu_is_refused_before_it_is_unpacked(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
     monkeypatch.setattr(archive, "MOST_BYTES", 1_000_000)

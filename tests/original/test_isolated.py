@@ -68,11 +68,11 @@ def step(environment, mood):
     return environment.step_from(np.zeros(2), np.array([float(mood)]))
 
 
-def test_a_step_runs_in_another_process(moody):
+def test_an_isolated_environment_steps_in_another_process(moody):
     assert int(step(moody, 0).reward) != os.getpid()
 
 
-def test_a_raised_error_fails_its_step_and_the_child_continues(moody):
+def test_an_error_in_an_isolated_environment_fails_one_step_only(moody):
     child = step(moody, 0).reward
     with pytest.raises(StepFailed, match="RuntimeError: the motor is hot"):
         step(moody, 1)
@@ -80,7 +80,7 @@ def test_a_raised_error_fails_its_step_and_the_child_continues(moody):
 
 
 @pytest.mark.parametrize(("mood", "error"), [(2, StepTimedOut), (3, EnvironmentDied), (4, EnvironmentDied)])
-def test_one_that_hangs_or_dies_is_replaced(moody, mood, error):
+def test_an_isolated_environment_that_hangs_or_dies_is_replaced(moody, mood, error):
     child = int(step(moody, 0).reward)
     with pytest.raises(error):
         step(moody, mood)
@@ -88,7 +88,7 @@ def test_one_that_hangs_or_dies_is_replaced(moody, mood, error):
     assert int(step(moody, 0).reward) != child
 
 
-def test_one_that_exits_says_why_and_is_closed(tmp_path):
+def test_an_isolated_environment_that_calls_exit_reports_the_reason_and_is_closed(tmp_path):
     """Only an exit code was reported."""
     with IsolatedEnvironment(partial(Leaving, tmp_path / "closed")) as environment:
         with pytest.raises(EnvironmentDied, match=r"during step_from: SystemExit: the licence has expired \(test_iso"):
@@ -96,7 +96,7 @@ def test_one_that_exits_says_why_and_is_closed(tmp_path):
         assert (tmp_path / "closed").exists()
 
 
-def test_a_factory_that_exits_says_why():
+def test_an_environment_factory_that_calls_exit_reports_the_reason():
     with (
         IsolatedEnvironment(partial(sys.exit, "no licence")) as environment,
         pytest.raises(UnknownEnvironment, match="SystemExit: no licence"),
@@ -104,17 +104,17 @@ def test_a_factory_that_exits_says_why():
         environment.spec()
 
 
-def test_the_error_of_a_failing_factory_is_shown():
+def test_the_error_of_a_failing_environment_factory_is_reported():
     with IsolatedEnvironment(broken) as environment, pytest.raises(UnknownEnvironment, match="no robot at"):
         environment.spec()
 
 
-def test_the_specification_crosses_the_process():
+def test_an_isolated_environment_returns_its_specification_from_the_other_process():
     with IsolatedEnvironment(partial(original.make, "Pendulum-v1", budget=9)) as environment:
         assert environment.spec() == original.make("Pendulum-v1", budget=9).spec()
 
 
-def test_close_leaves_no_process_behind(moody):
+def test_closing_an_isolated_environment_leaves_no_process_behind(moody):
     child = int(step(moody, 0).reward)
     moody.close()
     assert not _alive(child)
@@ -163,7 +163,7 @@ def diary_of(folder):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGKILL])
-def test_however_its_user_ends_the_step_is_finished_and_the_machine_closed(tmp_path, number):
+def test_if_the_user_process_is_killed_an_isolated_environment_finishes_its_step_and_closes(tmp_path, number):
     with in_a_step(tmp_path) as process:
         process.send_signal(number)
         process.wait(60)
@@ -171,7 +171,7 @@ def test_however_its_user_ends_the_step_is_finished_and_the_machine_closed(tmp_p
     assert diary_of(tmp_path) == ["open", "step 0", "done", "close", "closed"]
 
 
-def test_a_second_interrupt_waits_for_no_step(tmp_path):
+def test_a_second_interrupt_does_not_wait_for_the_running_step(tmp_path):
     with in_a_step(tmp_path, seconds=60) as process:
         for _ in range(40):
             process.send_signal(signal.SIGINT)
@@ -192,7 +192,7 @@ class Numbered(Moody):
         return RealStep(coordinates, action, coordinates, reward=float(self.steps))
 
 
-def test_one_that_is_interrupted_while_it_starts_can_be_closed(monkeypatch):
+def test_an_isolated_environment_interrupted_while_starting_can_be_closed(monkeypatch):
     def interrupted(_self, _pipe):
         raise KeyboardInterrupt
 
@@ -203,7 +203,7 @@ def test_one_that_is_interrupted_while_it_starts_can_be_closed(monkeypatch):
     environment.close()
 
 
-def test_the_answer_to_an_interrupted_step_reaches_no_other_request():
+def test_the_reply_to_an_interrupted_step_is_not_taken_for_another():
     with IsolatedEnvironment(Numbered) as environment:
         environment.spec()
         threading.Timer(0.3, lambda: os.kill(os.getpid(), signal.SIGINT)).start()
@@ -212,7 +212,7 @@ def test_the_answer_to_an_interrupted_step_reaches_no_other_request():
         assert step(environment, 0).reward == 2.0
 
 
-def test_one_that_does_not_start_in_time_is_replaced(monkeypatch):
+def test_an_isolated_environment_that_does_not_start_in_time_is_replaced(monkeypatch):
     monkeypatch.setattr("surrogym_sampler.original.isolated.START_LIMIT", 0.0)
     with IsolatedEnvironment(Moody) as environment:
         with pytest.raises(StepTimedOut, match="to start"):

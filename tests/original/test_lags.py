@@ -79,7 +79,7 @@ def rolled(environment: RolloutEnvironment) -> list[np.ndarray]:
     return [environment.begin(seed=0), *(environment.act(u).next_coordinates for u in (RIGHT, LEFT, RIGHT))]
 
 
-def test_coordinates_repeat_earlier_changes_and_actions():
+def test_lagged_coordinates_contain_earlier_changes_and_actions():
     environment = answering(WithPast())
     start, one, two, three = rolled(environment)
     assert environment.spec().coordinate_names == ("x", "x.change1", "x.change2", "action0.lag1", "action0.lag2")
@@ -89,19 +89,19 @@ def test_coordinates_repeat_earlier_changes_and_actions():
     np.testing.assert_allclose(three[1:], [0.1, -0.05, 1.0, -0.5])
 
 
-def test_a_new_episode_has_no_past():
+def test_lagged_coordinates_are_zero_at_the_start_of_an_episode():
     environment = answering(WithPast())
     rolled(environment)
     np.testing.assert_array_equal(environment.begin(seed=0)[1:], 0.0)
 
 
-def test_a_policy_observes_the_lags():
+def test_a_policy_observes_the_lagged_coordinates():
     environment = answering(WithPast())
     shown = observe(environment.spec(), np.stack(rolled(environment)))
     np.testing.assert_allclose(shown[:, 1:], np.stack(rolled(environment))[:, 1:])
 
 
-def test_the_change_of_an_angle_goes_the_shorter_way():
+def test_the_lagged_change_of_an_angle_takes_the_shorter_direction():
     environment = answering(Clock())
     np.testing.assert_allclose(environment.begin(), [3.0, 0.0, 1.0])  # the action nearest to 0
     step = environment.act(np.array([1.5]))
@@ -110,17 +110,17 @@ def test_the_change_of_an_angle_goes_the_shorter_way():
     np.testing.assert_allclose(step.next_coordinates, [8.5 - 2 * math.pi, 4.0 - 2 * math.pi, 4.0])
 
 
-def test_logged_starts_get_a_past_at_rest():
+def test_logged_start_states_get_lags_of_a_system_at_rest():
     spec = EnvironmentSpec.model_validate(HAND.model_dump() | {"starts": [[1.0], [2.0]]})
     assert with_history(spec, actions=1).starts == ((1.0, 1.0), (2.0, 1.0))
 
 
-def test_lags_of_discrete_actions_are_their_numbers():
+def test_lags_of_discrete_actions_are_action_numbers():
     spec = EnvironmentSpec.model_validate(SPEC.model_dump() | {"action": DiscreteAction(n=3)})
     assert with_history(spec, actions=1).coordinates[-1].settable == (0.0, 2.0)
 
 
-def test_lags_that_the_class_reads_itself_are_refused():
+def test_an_environment_class_that_returns_lags_itself_is_refused():
     class Reads(WithPast):
         def coordinates(self, observation):
             return [observation[0], 0, 0, 0, 0]
@@ -138,18 +138,18 @@ def test_lags_that_the_class_reads_itself_are_refused():
         ({"actions": 20}, "looks 20 steps back: expected fewer than an episode's 20"),
     ],
 )
-def test_a_history_that_does_not_fit_is_refused(history, message):
+def test_a_declared_history_that_does_not_fit_the_specification_is_refused(history, message):
     with pytest.raises(ValueError, match=message):
         with_history(SPEC, **history)
 
 
-def test_a_history_where_any_state_can_be_set_is_refused():
+def test_a_declared_history_for_an_environment_with_settable_states_is_refused():
     settable = SPEC.model_copy(update={"query": "step"})
     with pytest.raises(ValueError, match="lags need one that can only be reset"):
         with_history(settable, actions=1)
 
 
-def test_steps_whose_lags_are_unknown_are_counted():
+def test_steps_since_reset_with_unknown_lags_are_counted():
     environment = answering(Moving())
     spec, counts = environment.spec(), [q[-1] for q in rolled(environment)]
     assert counts == [0, 1, 2, 2]
@@ -157,22 +157,22 @@ def test_steps_whose_lags_are_unknown_are_counted():
     assert spec.unknown_steps == 2
 
 
-def test_a_policy_does_not_observe_the_count():
+def test_a_policy_does_not_observe_the_steps_since_reset():
     assert Moving().spec().observation_names == ("x", "x.change1", "x.change2")
 
 
-def test_a_virtual_episode_starts_with_known_lags():
+def test_the_declared_start_of_an_environment_with_lags_has_known_lags():
     start = Moving().spec().start
     assert (start["steps since reset"].value, start["x.change2"].high) == (2, 0.05)
 
 
-def test_a_design_that_would_learn_nothing_is_refused():
+def test_a_design_with_fewer_initial_steps_than_unknown_lags_is_refused():
     fields = Moving().spec().model_dump()
     with pytest.raises(ValueError, match="expected initial of more than 3, got 3"):
         EnvironmentSpec.model_validate(fields | {"design": {"initial": 3}})
 
 
-def test_a_snapshot_keeps_the_past():
+def test_a_snapshot_keeps_the_lagged_coordinates():
     environment = answering(Clock())
     assert isinstance(environment, FromReset)
     environment.begin()
@@ -185,7 +185,7 @@ def test_a_snapshot_keeps_the_past():
     np.testing.assert_array_equal(two.next_coordinates, one.next_coordinates)
 
 
-def test_a_snapshot_that_is_too_short_is_refused():
+def test_a_too_short_snapshot_with_lags_is_refused():
     environment = answering(Clock())
     with pytest.raises(StepFailed, match="at least 24 bytes"):
         environment.restore(b"3.0")

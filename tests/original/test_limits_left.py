@@ -48,7 +48,7 @@ def probed(kettle: Kettle) -> tuple[Probed, int]:
     return found, counted.steps
 
 
-def test_limits_beyond_which_states_run_away_are_not_trusted():
+def test_declared_limits_that_the_states_run_away_from_are_not_trusted():
     found, steps = probed(Kettle(faster=50.0))
     assert found.settable
     assert 0.1 < found.leaving < 0.6
@@ -56,11 +56,11 @@ def test_limits_beyond_which_states_run_away_are_not_trusted():
     assert steps >= 40 + ANYWHERE, "they are counted"
 
 
-def test_limits_that_are_passed_a_little_are_trusted():
+def test_declared_limits_that_states_exceed_slightly_are_trusted():
     assert probed(Kettle(faster=1.5))[0].stays
 
 
-def test_joints_are_not_asked():
+def test_limits_of_mechanical_joints_are_trusted_without_probing():
     found, steps = probed(Kettle(faster=50.0, motion="slide"))
     assert found.stays
     assert steps < 40 + ANYWHERE

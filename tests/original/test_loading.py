@@ -50,13 +50,13 @@ def own_module(tmp_path, monkeypatch):
     return "own_cart"
 
 
-def test_design_choices_reach_the_specification():
+def test_design_options_reach_the_specification_of_a_built_in_environment():
     spec = original.make("Pendulum-v1", budget=30, initial=10, target=0.99, seed=7, bins=5).spec()
     assert (spec.design.budget, spec.design.initial, spec.design.target, spec.design.seed) == (30, 10, 0.99, 7)
     assert spec.action.bins == (5,)
 
 
-def test_a_given_specification_replaces_the_adapters_own():
+def test_a_given_specification_replaces_the_built_in_one():
     spec = original.make("Pendulum-v1", budget=17).spec()
     assert original.make("Pendulum-v1", spec=spec).spec() == spec
 
@@ -71,7 +71,7 @@ def test_a_specification_of_another_environment_is_refused():
 
 
 @pytest.mark.parametrize("name", ["Pendulum-v1", "Acrobot-v1", "MountainCar-v0"])
-def test_a_description_of_a_known_task_is_opened_as_it_was_described(name):
+def test_a_built_in_task_can_be_opened_by_its_described_specification(name):
     """Its coordinates are those of a simulator. The task's own class answered with an observation of its own, and the
     server refused every step."""
     machine = original.make(name, spec=describe(name, 40).spec)
@@ -89,7 +89,7 @@ def test_a_description_of_a_known_task_is_opened_as_it_was_described(name):
     episode.close()
 
 
-def test_a_fall_pays_the_same_after_a_fall():
+def test_the_terminating_step_of_a_described_cart_pole_pays_the_same_each_time():
     """CartPole pays nothing for steps after the end of an episode, and a query may follow a fall."""
     machine = original.make("CartPole-v1", spec=describe("CartPole-v1", 40).spec)
     falls = [machine.step_from(np.array([0, 0, 0.2, 2.0]), np.array([1])) for _ in range(2)]
@@ -97,7 +97,7 @@ def test_a_fall_pays_the_same_after_a_fall():
     machine.close()
 
 
-def test_a_known_task_shows_the_observation_that_is_declared():
+def test_a_built_in_task_returns_its_observation_only_if_declared_fully():
     spec = original.make("Pendulum-v1").spec()
     fewer = spec.model_copy(update={"observation": spec.observation[:2]})
     at, force = np.array([0.1, 0.2]), np.array([0.5])
@@ -105,7 +105,7 @@ def test_a_known_task_shows_the_observation_that_is_declared():
     assert len(original.make("Pendulum-v1", spec=spec).step_from(at, force).next_observation) == 3
 
 
-def test_coordinates_of_a_known_task_in_another_order_are_refused():
+def test_a_specification_with_reordered_coordinates_of_a_built_in_task_is_refused():
     """They were taken by their place: an angle was set as a speed."""
     spec = original.make("Pendulum-v1").spec()
     turned = spec.model_copy(update={"coordinates": spec.coordinates[::-1]})
@@ -122,27 +122,27 @@ def test_coordinates_of_a_known_task_in_another_order_are_refused():
     ],
 )
 @pytest.mark.parametrize("described", [True, False])
-def test_an_action_that_the_environment_can_not_take_is_refused(name, action, said, described):
+def test_a_specification_with_an_action_the_environment_cannot_take_is_refused(name, action, said, described):
     """Numbers of discrete actions were applied as torques, and a second entry was ignored."""
     spec = describe(name, 40).spec if described else original.make(name).spec()
     with pytest.raises(UnknownEnvironment, match=said):
         original.make(name, spec=spec.model_copy(update={"action": action, "reward": Reward()}))
 
 
-def test_an_action_may_be_narrower_than_the_environments():
+def test_a_specification_with_narrower_action_bounds_is_accepted():
     spec = original.make("Pendulum-v1").spec()
     weak = spec.model_copy(update={"action": BoxAction(low=(-0.5,), high=(0.5,), bins=(3,))})
     assert original.make("Pendulum-v1", spec=weak).spec() == weak
 
 
-def test_choices_that_contradict_are_refused():
+def test_contradicting_design_options_are_refused():
     with pytest.raises(ValueError, match="initial 20 exceeds the budget 10"):
         original.make("Pendulum-v1", budget=10, initial=20)
     with pytest.raises(ValueError, match="bins need a continuous action, got a discrete one"):
         original.make("CartPole-v1", bins=3)
 
 
-def test_ones_own_environment_is_loaded_by_name(own_module):
+def test_an_own_environment_class_is_loaded_by_module_and_name(own_module):
     environment = original.make(f"{own_module}:Cart", budget=12)
     assert environment.spec().design.budget == 12
     assert environment.spec().environment == "a cart"
@@ -160,7 +160,7 @@ def test_ones_own_environment_is_loaded_by_name(own_module):
         ("own_cart:NoEnvironment", "reset, step, coordinates and close, got a NoEnvironment"),
     ],
 )
-def test_names_that_give_nothing(own_module, name, message):
+def test_environment_names_that_cannot_be_loaded_are_refused(own_module, name, message):
     with pytest.raises(UnknownEnvironment, match=message):
         original.make(name)
 
@@ -172,7 +172,7 @@ def test_names_that_give_nothing(own_module, name, message):
         ("import sys; Cart = sys.exit", "ends:Cart ended while it was made: SystemExit"),
     ],
 )
-def test_a_module_or_a_factory_that_ends_the_program_is_named(tmp_path, monkeypatch, code, message):
+def test_the_error_for_an_environment_module_that_calls_exit_names_it(tmp_path, monkeypatch, code, message):
     """The command ended without a word."""
     (tmp_path / "ends.py").write_text(code)
     monkeypatch.syspath_prepend(str(tmp_path))
@@ -181,7 +181,7 @@ def test_a_module_or_a_factory_that_ends_the_program_is_named(tmp_path, monkeypa
         original.make("ends:Cart")
 
 
-def test_a_servers_specification_can_not_name_a_module():
+def test_a_specification_from_a_server_can_only_open_built_in_environments():
     assert is_known("Pendulum-v1")
     assert is_known("Hopper-v5")
     assert not is_known("own_cart:Cart")
@@ -192,7 +192,7 @@ def test_a_servers_specification_can_not_name_a_module():
     assert not is_known("a robot")
 
 
-def test_an_environment_without_a_specification_names_the_command_that_writes_one():
+def test_the_error_for_an_environment_without_specification_recommends_describe():
     pytest.importorskip("mujoco")
     with pytest.raises(UnknownEnvironment, match=r"Hopper-v5 has no built-in specification .*surrogym describe Hopper"):
         original.make("Hopper-v5")

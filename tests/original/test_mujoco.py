@@ -19,7 +19,7 @@ def random_place(spec, rng):
 
 
 @pytest.mark.parametrize("name", SPECIFICATIONS)
-def test_declared_observation_is_the_environments_own(name):
+def test_the_declared_observation_of_mujoco_tasks_equals_gymnasiums(name):
     """At states that were set: a step shows body positions of the last Runge-Kutta stage, not of its end."""
     environment = original.make(name)
     spec = environment.spec()
@@ -35,7 +35,7 @@ def test_declared_observation_is_the_environments_own(name):
 
 
 @pytest.mark.parametrize("name", SPECIFICATIONS)
-def test_declared_termination_is_the_environments_own(name):
+def test_the_declared_termination_of_mujoco_tasks_equals_gymnasiums(name):
     environment = original.make(name)
     spec = environment.spec()
     rng = np.random.default_rng(0)
@@ -51,7 +51,7 @@ def test_declared_termination_is_the_environments_own(name):
 
 
 @pytest.mark.parametrize("name", SPECIFICATIONS)
-def test_step_from_follows_the_environments_own_trajectory(name):
+def test_step_from_reproduces_the_mujoco_trajectory_of_gymnasium(name):
     environment = original.make(name)
     spec = environment.spec()
     columns = environment.simulator.columns(spec.coordinate_names)

@@ -33,7 +33,7 @@ SPEC = original.make("Pendulum-v1").spec()  # its environment has the attribute 
         ({}, None),
     ],
 )
-def test_an_environment_tells_its_period_by_an_attribute_or_its_metadata(told: dict, period: float | None) -> None:
+def test_the_sampling_period_is_read_from_an_attribute_or_the_metadata(told: dict, period: float | None) -> None:
     assert period_of(SimpleNamespace(**told)) == period
 
 
@@ -42,16 +42,16 @@ def declared(period: float | None):
 
 
 @pytest.mark.parametrize("period", [None, 0.05, 0.05 * (1 + 1e-9)])
-def test_the_declared_period_or_none_is_accepted(period: float | None) -> None:
+def test_a_specification_with_the_environments_period_or_none_is_accepted(period: float | None) -> None:
     original.make("Pendulum-v1", spec=declared(period)).close()
 
 
-def test_another_period_than_declared_is_refused_with_both() -> None:
+def test_a_specification_with_another_sampling_period_is_refused_with_both_values() -> None:
     with pytest.raises(UnknownEnvironment, match=r"every 0\.1 s.* got 0\.05 s"):
         original.make("Pendulum-v1", spec=declared(0.1))
 
 
-def test_two_specifications_of_different_periods_do_not_fit() -> None:
+def test_specifications_with_different_sampling_periods_do_not_fit() -> None:
     with pytest.raises(PolicyMisfit, match=r"0\.05 s.* got 0\.1 s"):
         check_policy(declared(0.05), declared(0.1))
     with pytest.raises(UnknownEnvironment, match=r"0\.05 s.* got 0\.1 s"):
@@ -59,7 +59,9 @@ def test_two_specifications_of_different_periods_do_not_fit() -> None:
     check_policy(declared(0.05), declared(None))
 
 
-def test_a_class_of_ones_own_is_checked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_sampling_period_of_an_own_environment_class_is_checked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     code = """
         from surrogym_sampler import original
 
@@ -79,12 +81,12 @@ def test_a_class_of_ones_own_is_checked(tmp_path: Path, monkeypatch: pytest.Monk
         original.make("fast_plant:Fast")
 
 
-def test_a_draft_declares_the_period_that_the_environment_tells() -> None:
+def test_describe_declares_the_sampling_period_of_the_environment() -> None:
     assert describe("Pendulum-v1", 40).spec.sampling_period == 0.05
 
 
 @pytest.mark.parametrize("name", [*TASKS, *SPECIFICATIONS])
-def test_a_built_in_environment_declares_the_period_that_it_has(name: str) -> None:
+def test_built_in_specifications_declare_the_environments_sampling_period(name: str) -> None:
     environment = gymnasium.make(name).unwrapped
     own = period_of(environment) or getattr(environment, "tau", None)  # CartPole calls it tau
     assert original.make(name).spec().sampling_period == own

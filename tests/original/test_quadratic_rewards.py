@@ -62,7 +62,7 @@ FORMULAS: dict[str, Formula] = {
 
 @pytest.mark.parametrize("timing", ["before", "after"])
 @pytest.mark.parametrize("reward", FORMULAS.values(), ids=FORMULAS)
-def test_a_quadratic_reward_is_found_and_holds_elsewhere(reward: Formula, timing: str):
+def test_a_quadratic_reward_is_found_from_samples_and_exact_on_new_ones(reward: Formula, timing: str):
     found = quadratic_reward(spec(), steps(reward, timing), steps(reward, timing, seed=1))
     assert found is not None
     assert found.timing == timing
@@ -82,24 +82,24 @@ OTHERS: dict[str, Formula] = {
 
 
 @pytest.mark.parametrize("reward", OTHERS.values(), ids=OTHERS)
-def test_another_reward_is_left_to_be_learned(reward: Formula):
+def test_a_non_quadratic_reward_is_not_declared_as_quadratic(reward: Formula):
     assert quadratic_reward(spec(), steps(reward, "after"), steps(reward, "after", seed=1)) is None
     assert not may_be_quadratic(spec(), steps(reward, "after"))
 
 
-def test_too_few_steps_for_a_fit_declare_nothing():
+def test_no_quadratic_reward_is_declared_from_too_few_steps():
     reward = FORMULAS["a setpoint"]
     assert quadratic_reward(spec(), steps(reward, "after", 30), steps(reward, "after", seed=1)) is None
 
 
-def test_a_step_that_follows_a_hidden_schedule_does_not_rule_a_form_out():
+def test_a_few_deviating_rewards_do_not_yet_exclude_a_quadratic_form():
     paid = steps(FORMULAS["a setpoint"], "after")
     paid.reward[[3, 40, 77]] -= 0.002
     assert may_be_quadratic(spec(), paid)
     assert quadratic_reward(spec(), paid, paid) is None, "but every step of the decision counts"
 
 
-def test_a_description_declares_the_reward_of_a_spiral(registered: Register):
+def test_describe_declares_the_quadratic_reward_of_an_environment(registered: Register):
     found = describe(registered("Spiral-v0"), steps=60)
     assert isinstance(found.spec.reward, DeclaredReward)
     assert any("quadratic" in line for line in found.found)
@@ -107,7 +107,7 @@ def test_a_description_declares_the_reward_of_a_spiral(registered: Register):
     assert found.steps > 60, "the steps of the check are counted"
 
 
-def test_a_spiral_with_another_reward_keeps_it_to_be_learned(registered: Register):
+def test_describe_leaves_a_non_quadratic_reward_to_be_learned(registered: Register):
     def step(self: Spiral, action: np.ndarray):
         shown, _, ended, cut, info = Spiral.step(self, action)
         return shown, float(np.exp(-(shown[0] ** 2))), ended, cut, info
@@ -116,7 +116,7 @@ def test_a_spiral_with_another_reward_keeps_it_to_be_learned(registered: Registe
 
 
 @installed("pcgym")
-def test_the_stirred_tanks_setpoint_is_found():
+def test_describe_finds_the_setpoint_reward_of_the_stirred_tank():
     found = describe("pcgym:cstr")
     [term] = found.spec.reward.terms
     assert (term.shape, term.weight) == ("square", pytest.approx(-1))

@@ -50,19 +50,19 @@ def fastest(seen: Seen) -> float:
 
 
 @pytest.mark.parametrize("down", [0.0, np.pi, 3.0])
-def test_the_range_of_a_speed_has_the_speed_of_a_fall_from_the_top(down: float) -> None:
+def test_the_described_speed_range_includes_the_speed_of_a_free_fall(down: float) -> None:
     speeds = [fastest(explored(Pendulum(down), seed)) for seed in range(30)]
     assert FASTER * min(speeds) > FALLEN
     assert max(speeds) < 1.2 * FALLEN, "nothing begins in motion, so the range has an end"
 
 
-def test_the_starts_far_from_visited_states_cost_no_step() -> None:
+def test_choosing_exploration_starts_costs_no_real_step() -> None:
     counted = Counted(Pendulum())
     seen = explore(counted, STEPS, np.random.default_rng(0))
     assert (counted.steps, len(np.unique(seen.episodes))) == (STEPS, EPISODES)
 
 
-def test_where_all_other_positions_touch_episodes_begin_as_a_reset_does() -> None:
+def test_exploration_starts_at_resets_if_other_states_are_in_contact() -> None:
     seen = explored(Pendulum(touching=True), 0)
     starts = [seen.states[np.flatnonzero(seen.episodes == number)[0]] for number in range(EPISODES)]
     assert np.abs(np.array(starts)).max() <= 0.1

@@ -19,7 +19,7 @@ RIGHT, LEFT = np.array([1.0]), np.array([-1.0])
 
 
 @pytest.mark.parametrize("name", ["Pendulum-v1", "CartPole-v1", "Acrobot-v1", "InvertedPendulum-v5"])
-def test_a_builtin_environment_rolls_out_as_gymnasium_does(name):
+def test_rollouts_of_a_built_in_environment_equal_gymnasiums(name):
     import gymnasium
 
     environment = original.make(name, access="reset")
@@ -38,7 +38,7 @@ def test_a_builtin_environment_rolls_out_as_gymnasium_does(name):
     environment.close()
 
 
-def test_a_class_with_reset_step_and_coordinates_rolls_out():
+def test_a_class_with_reset_step_and_coordinates_can_be_rolled_out():
     environment = answering(Rail())
     assert isinstance(environment, FromReset)
     start = environment.begin(seed=3)
@@ -49,7 +49,7 @@ def test_a_class_with_reset_step_and_coordinates_rolls_out():
     assert np.asarray(one.action).shape == (1,)
 
 
-def test_no_step_before_a_reset_nor_after_an_end():
+def test_a_rollout_step_before_a_reset_or_after_termination_is_refused():
     environment = answering(Rail())
     with pytest.raises(StepFailed, match="running episode"):
         environment.act(RIGHT)
@@ -61,7 +61,7 @@ def test_no_step_before_a_reset_nor_after_an_end():
         environment.act(RIGHT)
 
 
-def test_a_reset_that_is_not_gymnasiums_and_coordinates_of_the_wrong_size_say_so():
+def test_an_old_style_reset_or_wrongly_sized_coordinates_are_refused():
     class Old(Rail):
         def reset(self, *, seed=None):
             return super().reset(seed=seed)[0]
@@ -76,7 +76,7 @@ def test_a_reset_that_is_not_gymnasiums_and_coordinates_of_the_wrong_size_say_so
         answering(Wide()).begin()
 
 
-def test_what_a_specification_declares_its_class_must_be_able_to_do():
+def test_a_class_without_the_methods_its_specification_needs_is_refused():
     class Says(Rail):
         def spec(self):
             return super().spec().model_copy(update={"query": "step"})
@@ -90,7 +90,7 @@ def test_what_a_specification_declares_its_class_must_be_able_to_do():
 @pytest.mark.parametrize(
     ("factory", "error"), [(RaisesRight, StepFailed), (HangsRight, StepTimedOut), (DiesRight, EnvironmentDied)]
 )
-def test_in_a_process_of_its_own_one_that_fails_in_the_middle_begins_anew(factory, error):
+def test_an_isolated_rollout_that_fails_must_be_reset_before_the_next_step(factory, error):
     with IsolatedEnvironment(factory, step_limit=1.0) as environment:
         environment.begin(seed=0)
         environment.act(LEFT)
@@ -102,14 +102,14 @@ def test_in_a_process_of_its_own_one_that_fails_in_the_middle_begins_anew(factor
         environment.act(LEFT)
 
 
-def test_an_unknown_module_is_named_without_surrogyms_traceback():
+def test_the_error_for_an_unknown_environment_module_names_it_without_traceback():
     environment = IsolatedEnvironment(partial(original.make, "nomod:F"))
     with pytest.raises(UnknownEnvironment) as told:
         environment.spec()
     assert str(told.value) == "expected package.module:factory, got 'nomod:F': No module named 'nomod'"
 
 
-def test_an_evaluation_of_ones_own_resets_and_refuses_to_place():
+def test_evaluating_a_reset_only_class_uses_resets_and_refuses_set_states():
     episode = open_episode("rail:Rail", None, Rail)
     assert isinstance(episode, RolloutEpisode)
     start = episode.reset(10_000)
@@ -120,7 +120,7 @@ def test_an_evaluation_of_ones_own_resets_and_refuses_to_place():
     episode.close()
 
 
-def test_a_choice_can_take_teleport_away_from_ones_own_class_that_has_both():
+def test_a_class_that_supports_set_states_and_rollouts_can_be_used_either_way():
     class Both(Rail):
         def spec(self):
             return super().spec().model_copy(update={"query": "step", "max_rollout": None})
@@ -141,7 +141,9 @@ def test_a_choice_can_take_teleport_away_from_ones_own_class_that_has_both():
         (("step_from",), "spec and close"),
     ],
 )
-def test_a_class_that_lacks_methods_is_refused_with_their_names(methods: tuple[str, ...], lacking: str) -> None:
+def test_an_environment_class_that_lacks_methods_is_refused_with_their_names(
+    methods: tuple[str, ...], lacking: str
+) -> None:
     made = type("Plant", (), {name: lambda *_: None for name in methods})()
     if "spec" in methods:
         made.spec = Rail().spec

@@ -44,7 +44,7 @@ def going(environment, count, seed=0):
 
 
 @pytest.mark.parametrize("name", CLASSIC)
-def test_a_classic_task_repeats_its_steps_after_a_return(name):
+def test_a_classic_task_repeats_its_steps_after_restoring_a_snapshot(name):
     there, elsewhere = (original.make(name, access="snapshot") for _ in range(2))
     there.begin(3)
     going(there, 4)
@@ -60,7 +60,7 @@ def test_a_classic_task_repeats_its_steps_after_a_return(name):
         environment.close()
 
 
-def test_a_mujoco_task_repeats_its_steps_after_a_return():
+def test_a_mujoco_task_repeats_its_steps_after_restoring_a_snapshot():
     pytest.importorskip("mujoco")
     plant = original.make("InvertedDoublePendulum-v5", access="snapshot")
     plant.begin(0)
@@ -73,7 +73,7 @@ def test_a_mujoco_task_repeats_its_steps_after_a_return():
     plant.close()
 
 
-def test_ones_own_class_reads_its_coordinates_after_a_return():
+def test_an_own_class_returns_its_coordinates_after_restoring_a_snapshot():
     rail = answering(SavedRail())
     assert isinstance(rail, FromReset)
     start = rail.begin(0)
@@ -83,7 +83,7 @@ def test_ones_own_class_reads_its_coordinates_after_a_return():
     assert list(rail.act(np.ones(1)).coordinates) == list(start)
 
 
-def test_a_program_returns_to_what_it_saved():
+def test_an_environment_program_can_restore_its_snapshot():
     plant = original.make(f"exec:{shlex.quote(str(SHELL))}", access="snapshot")
     plant.begin()
     plant.act(np.ones(1))
@@ -95,14 +95,14 @@ def test_a_program_returns_to_what_it_saved():
 
 
 @pytest.mark.parametrize("snapshot", [b"", b"nonsense", original.make("CartPole-v1").save()])
-def test_a_snapshot_of_something_else_is_refused(snapshot):
+def test_restoring_a_foreign_snapshot_is_refused(snapshot):
     plant = original.make("Pendulum-v1", access="snapshot")
     with pytest.raises(StepFailed, match="expected a snapshot of"):
         plant.restore(snapshot)
     plant.close()
 
 
-def test_declared_snapshots_need_both_methods():
+def test_declaring_snapshots_without_save_and_restore_is_refused():
     class Half(SavedRail):
         restore = None
 
@@ -110,7 +110,7 @@ def test_declared_snapshots_need_both_methods():
         answering(Half())
 
 
-def test_a_return_brings_the_lags_back_too():
+def test_restoring_a_snapshot_restores_the_lagged_coordinates():
     spec = SPEC.model_copy(update={"snapshots": True})
     lagged = with_history(spec, changes=1, actions=1, largest={"x": 0.2})
 

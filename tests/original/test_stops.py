@@ -39,7 +39,7 @@ def ranges(monkeypatch: pytest.MonkeyPatch, push: float, spread: float = 0.1) ->
     return {c.name: limits(c.sampling) for c in description.describe("cart", 100).spec.coordinates}
 
 
-def test_no_step_from_the_range_of_a_joint_meets_a_stop(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_described_joint_range_ends_one_step_before_a_mechanical_stop(monkeypatch: pytest.MonkeyPatch) -> None:
     found = ranges(monkeypatch, push=5.0)
     (low, high), (_, fastest) = found["x"], found["x_velocity"]
     assert high + STEP * fastest <= 1 + 1e-9
@@ -47,11 +47,11 @@ def test_no_step_from_the_range_of_a_joint_meets_a_stop(monkeypatch: pytest.Monk
     assert high - low > 1.9
 
 
-def test_a_range_has_all_starts_even_those_at_a_stop(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_described_joint_range_includes_all_start_states(monkeypatch: pytest.MonkeyPatch) -> None:
     low, high = ranges(monkeypatch, push=5.0, spread=1.0)["x"]
     assert -1 < low < -0.9
     assert 0.9 < high < 1
 
 
-def test_where_one_step_crosses_much_of_the_way_stops_are_part_of_the_range(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_if_one_step_crosses_much_of_the_range_it_includes_the_stops(monkeypatch: pytest.MonkeyPatch) -> None:
     assert ranges(monkeypatch, push=500.0)["x"] == (-1.0, 1.0)

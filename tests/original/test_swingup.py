@@ -17,7 +17,7 @@ def energy(env):
     return kinetic - m * GRAVITY * length * np.cos(angle) / 2
 
 
-def test_energy_is_conserved_without_friction_and_force():
+def test_the_swing_up_conserves_energy_without_friction_and_force():
     env = CartPoleSwingUp()
     env.friction = 0.0
     env.state = np.array([0.3, -1.0, 2.0, 3.0])
@@ -27,7 +27,7 @@ def test_energy_is_conserved_without_friction_and_force():
     assert energy(env) == pytest.approx(before, abs=1e-4)
 
 
-def test_work_of_a_force_is_what_the_energy_gains():
+def test_the_energy_gain_of_the_swing_up_equals_the_work_of_the_force():
     env = CartPoleSwingUp()
     env.friction = 0.0
     env.state = np.array([0.0, 0.5, 1.0, -2.0])
@@ -38,7 +38,7 @@ def test_work_of_a_force_is_what_the_energy_gains():
 
 
 @pytest.mark.parametrize(("kind", "width"), [("smooth", 0.6), ("narrow", 0.25)])
-def test_reward_is_that_of_the_tips_distance_after_the_step(kind, width):
+def test_the_swing_up_reward_depends_on_the_tips_distance_after_the_step(kind, width):
     env = CartPoleSwingUp(kind)
     for state in (HANGING, UPRIGHT, np.array([0.4, 1.0, 2.5, -3.0])):
         env.state = state.copy()
@@ -48,7 +48,7 @@ def test_reward_is_that_of_the_tips_distance_after_the_step(kind, width):
         assert not terminated
 
 
-def test_balance_pays_one_a_step_and_hanging_next_to_nothing():
+def test_the_narrow_swing_up_pays_1_upright_and_nearly_0_hanging():
     env = CartPoleSwingUp("narrow")
     env.state = UPRIGHT.copy()
     assert env.step(np.zeros(1))[1] == pytest.approx(1.0)
@@ -56,14 +56,14 @@ def test_balance_pays_one_a_step_and_hanging_next_to_nothing():
     assert env.step(np.zeros(1))[1] < 1e-4
 
 
-def test_gymnasium_makes_both_kinds():
+def test_gymnasium_make_creates_both_swing_up_variants():
     assert gymnasium.make("surrogym/CartPoleSwingUp-v0").unwrapped.width == 0.6
     assert gymnasium.make("surrogym/CartPoleSwingUpNarrow-v0").unwrapped.width == 0.25
     with pytest.raises(ValueError, match="expected one of smooth, narrow, got 'steep'"):
         CartPoleSwingUp("steep")
 
 
-def test_the_picture_has_the_pole_where_it_stands_and_the_goal_where_it_does_not():
+def test_the_swing_up_picture_shows_pole_and_goal_at_the_right_pixels():
     env = CartPoleSwingUp(render_mode="rgb_array")
     env.state = np.array([0.5, 0, np.pi / 2, 0])  # level, from half a metre to the right of the middle
     frame = env.render()

@@ -88,7 +88,7 @@ FORMULAS: dict[str, Formula] = {
 
 @pytest.mark.parametrize("timing", ["before", "after"])
 @pytest.mark.parametrize("reward", FORMULAS.values(), ids=FORMULAS)
-def test_a_threshold_is_found_and_holds_elsewhere(reward: Formula, timing: str):
+def test_a_two_valued_reward_is_found_from_samples_and_exact_on_new_ones(reward: Formula, timing: str):
     found = Machine(reward, timing).found()
     assert found is not None
     assert found.timing == timing
@@ -109,13 +109,13 @@ OTHERS: dict[str, Formula] = {
 
 
 @pytest.mark.parametrize("reward", OTHERS.values(), ids=OTHERS)
-def test_another_reward_is_left_to_be_learned(reward: Formula):
+def test_a_reward_without_a_threshold_is_not_declared_as_two_valued(reward: Formula):
     machine = Machine(reward, "after")
     assert machine.found() is None
     assert machine.steps <= 100 + SEEK + 6 * POINTS * (HALVINGS + 1)
 
 
-def test_a_state_that_jumps_hides_no_box():
+def test_a_box_shaped_reward_is_found_although_states_jump_at_contacts():
     """At a contact the next state jumps, so some points of the boundary lie on no face."""
     machine = Machine(FORMULAS["a box"], "after")
 
@@ -130,7 +130,7 @@ def test_a_state_that_jumps_hides_no_box():
     assert sorted(round(one.value, 4) for one in found.terms[0].when) == [-1.1, 0.0, 0.1, 1.0]
 
 
-def test_the_paid_steps_of_one_pass_are_enough():
+def test_a_ball_shaped_reward_is_found_from_one_pass_through_it():
     """All paid steps of an episode may lie near one place of the boundary, which alone does not tell its form."""
     machine = Machine(FORMULAS["a disc"], "after")
     towards = np.column_stack([np.linspace(1, 0.5, 100), np.zeros(100), np.zeros(100)])
@@ -142,7 +142,7 @@ def test_the_paid_steps_of_one_pass_are_enough():
     assert machine.steps <= 100 + BATCH + POINTS * HALVINGS
 
 
-def test_what_holds_everywhere_is_no_boundary():
+def test_an_identity_that_always_holds_is_not_taken_for_a_reward_boundary():
     """The squares of a cosine and a sine add up to 1 in every state: rounding would decide who is inside."""
     turning, shown = spec(), (Term.cos(turn=1), Term.sin(turn=1))
     q, _ = Machine(FORMULAS["a disc"], "after").draw(100)
@@ -154,7 +154,7 @@ def test_what_holds_everywhere_is_no_boundary():
     )
 
 
-def test_two_places_decide_no_ellipsoid():
+def test_two_boundary_points_do_not_determine_an_ellipsoidal_reward():
     """Two places of an angle, met again and again: many ellipsoids go through them, and pay differently elsewhere."""
     q, _ = Machine(FORMULAS["a height"], "after").draw(100)
     edge = q[:POINTS].copy()
@@ -165,7 +165,7 @@ def test_two_places_decide_no_ellipsoid():
     assert [term.shape for term in regions(spec(), (cos,), edge, q)] == ["one"]
 
 
-def test_a_description_declares_a_bonus_near_a_goal(registered: Register):
+def test_describe_declares_a_bonus_reward_near_a_goal(registered: Register):
     def step(self: Spiral, action: np.ndarray):
         shown, _, ended, cut, info = Spiral.step(self, action)
         return shown, float(np.hypot(*self.state) < 0.3), ended, cut, info
@@ -187,7 +187,7 @@ def test_a_description_declares_a_bonus_near_a_goal(registered: Register):
         ("ball_in_cup-catch", 1, "one"),
     ],
 )
-def test_rewards_of_the_control_suite_are_found(task: str, seed: int, shape: str):
+def test_describe_finds_the_two_valued_rewards_of_dm_control_tasks(task: str, seed: int, shape: str):
     found = describe(f"dm_control:{task}", seed=seed)
     assert isinstance(found.spec.reward, DeclaredReward)
     [term] = found.spec.reward.terms

@@ -23,6 +23,8 @@ UNKNOWN = {"name": "unknown", "skip_reason": "not found"}
         (json.dumps({"dependencies": [SOUND, HOLED]}), 1, "holed 2: PYSEC-1"),
     ],
 )
-def test_what_is_made_of_what_was_found(output: str, status: int, said: str):
+def test_the_dependency_audit_fails_for_known_vulnerabilities_but_not_without_network(
+    output: str, status: int, said: str
+):
     assert verdict(output)[0] == status
     assert said in verdict(output)[1]

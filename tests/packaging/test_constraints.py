@@ -20,16 +20,16 @@ def lines() -> list[str]:
     return [line for line in text.splitlines() if line and not line.startswith("#")]
 
 
-def test_every_line_is_an_exact_pin_without_an_address_or_a_local_build() -> None:
+def test_every_constraint_line_pins_an_exact_released_version() -> None:
     assert [line for line in lines() if not PIN.fullmatch(line)] == []
 
 
-def test_no_package_is_pinned_twice() -> None:
+def test_no_package_is_pinned_twice_in_the_constraints() -> None:
     names = [canonicalize_name(line.partition("==")[0]) for line in lines()]
     assert len(names) == len(set(names))
 
 
-def test_everything_the_extras_need_is_pinned_to_the_installed_version() -> None:
+def test_every_dependency_of_the_extras_is_pinned_to_its_installed_version() -> None:
     pins = {canonicalize_name(name): version for name, version in (line.split("==") for line in lines())}
     try:
         names = needed("surrogym[dev]", {}).keys() - {"surrogym"}

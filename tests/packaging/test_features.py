@@ -87,7 +87,7 @@ def without(checkout: Path, tmp_path: Path) -> Iterator[Callable[[str], None]]:
 
 @pytest.mark.timeout(3_600)
 @pytest.mark.parametrize("feature", sorted(FEATURES))
-def test_what_remains_without_a_feature_passes_its_tests(
+def test_the_remaining_tests_pass_after_deleting_an_optional_server_feature(
     feature: str, checkout: Path, without: Callable[[str], None]
 ) -> None:
     without(feature)

@@ -17,18 +17,18 @@ def project() -> dict[str, object]:
     return found
 
 
-def test_the_files_agree_about_version_and_python() -> None:
+def test_the_release_files_agree_about_version_and_supported_pythons() -> None:
     assert list(metadata_faults(project())) == []
 
 
-def test_another_version_and_an_untried_python_are_faults() -> None:
+def test_the_release_check_finds_a_wrong_version_and_an_untested_python() -> None:
     faults = list(
         metadata_faults(project() | {"version": "9.9.9", "classifiers": ["Programming Language :: Python :: 3.99"]})
     )
     assert [fault.partition(":")[0] for fault in faults] == ["CITATION.cff", "classifiers"]
 
 
-def test_archives_without_licence_are_faults(tmp_path: Path) -> None:
+def test_the_release_check_finds_archives_without_licence(tmp_path: Path) -> None:
     wheel, source = tmp_path / "a.whl", tmp_path / "a.tar.gz"
     ZipFile(wheel, "w").writestr("surrogym/__init__.py", "")
     with tarfile.open(source, "w:gz") as archive:

@@ -28,10 +28,10 @@ def sources() -> Iterator[Path]:
     yield from (path for package in PACKAGES for path in package.rglob("*.py"))
 
 
-def test_tests_of_the_server_mirror_its_rooms():
+def test_server_test_folders_mirror_the_server_packages():
     """A reader finds the tests of a room under the room's name, and no tests stay behind when a room goes."""
     assert rooms(TESTS / "server") <= rooms(Path(str(surrogym_server.__file__)).parent)
 
 
-def test_nothing_is_marked_as_unfinished():
+def test_no_source_file_contains_a_todo_mark():
     assert [str(path) for path in sources() if UNFINISHED.search(path.read_text(encoding="utf-8"))] == []

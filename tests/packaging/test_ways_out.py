@@ -16,7 +16,7 @@ PROJECT = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text
 
 
 @pytest.mark.parametrize("extra", ["server", "train", "export", "render", "mujoco"])
-def test_a_missing_package_is_named_with_its_extra(extra: str):
+def test_every_package_of_an_extra_is_known_to_the_missing_package_hint(extra: str):
     modules: dict[str, set[str]] = {}
     for module, names in packages_distributions().items():
         for name in names:
@@ -27,7 +27,7 @@ def test_a_missing_package_is_named_with_its_extra(extra: str):
             assert any(missing(module) for module in modules[name]), name
 
 
-def test_the_way_out_names_package_and_extra():
+def test_the_missing_package_hint_names_package_and_extra():
     assert missing("cmaes") == "this needs cmaes, which is not installed: pip install 'surrogym[train]'"
     assert missing("json") is None
     assert set(EXTRAS) <= set(PROJECT["optional-dependencies"])

@@ -29,7 +29,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> ZipFile:
     return ZipFile(file)
 
 
-def test_it_holds_every_source_file_and_nothing_else(wheel: ZipFile) -> None:
+def test_the_wheel_contains_every_source_file_and_nothing_else(wheel: ZipFile) -> None:
     expected = {
         path.relative_to(ROOT / folder).as_posix()
         for package, folder in PACKAGES.items()
@@ -49,11 +49,11 @@ def test_it_holds_every_source_file_and_nothing_else(wheel: ZipFile) -> None:
         *(f"{package}/py.typed" for package in PACKAGES),
     ],
 )
-def test_it_holds_what_is_easily_forgotten(wheel: ZipFile, name: str) -> None:
+def test_the_wheel_contains_easily_forgotten_files(wheel: ZipFile, name: str) -> None:
     assert name in wheel.namelist()
 
 
-def test_it_brings_the_commands(wheel: ZipFile) -> None:
+def test_the_wheel_declares_its_command_entry_points(wheel: ZipFile) -> None:
     (entry_points,) = (name for name in wheel.namelist() if name.endswith("entry_points.txt"))
     text = wheel.read(entry_points).decode()
     assert "surrogym = surrogym.cli:main" in text

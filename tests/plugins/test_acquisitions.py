@@ -24,7 +24,7 @@ def designed(settings: dict[str, float | str]) -> Design:
     return Design(acquisition=Choice(name="focused_variance", settings=settings), target=0.99999)
 
 
-def test_the_design_asks_by_an_installed_acquisition(plugin_server: ServerProcess):
+def test_the_design_uses_an_installed_acquisition_plugin(plugin_server: ServerProcess):
     """Near a speed of 6, as its settings say; the ranges are -8 to 8."""
     settings = {"coordinate": "speed", "near": 6.0, "width": 0.5}
     spec = pendulum().model_copy(update={"design": designed(settings)})
@@ -65,7 +65,7 @@ def test_the_design_asks_by_an_installed_acquisition(plugin_server: ServerProces
         ("variance", {"width": 1.0}, "expected no settings, got 'width'"),
     ],
 )
-def test_missing_packages_and_wrong_settings_are_refused(
+def test_missing_acquisition_plugins_and_invalid_settings_are_refused(
     plugin_server: ServerProcess, name: str, settings: dict[str, object], said: str
 ):
     spec = pendulum().model_dump(mode="json")
@@ -76,13 +76,13 @@ def test_missing_packages_and_wrong_settings_are_refused(
     assert httpx.get(f"{plugin_server.url}/v1/surrogates/refused", timeout=60).status_code == 404
 
 
-def test_a_server_starts_without_a_broken_package_and_names_it(plugin_server: ServerProcess):
+def test_the_server_starts_without_a_broken_acquisition_plugin_and_logs_it(plugin_server: ServerProcess):
     assert "the acquisition 'broken' is left out" in plugin_server.log
     assert "No module named 'nowhere_to_be_found'" in plugin_server.log
     assert "focused_variance" in plugin_server.log
 
 
-def test_the_page_shows_the_example():
+def test_the_plugin_page_shows_the_code_of_the_example_acquisition():
     """Every line of the page's class stands in the package's module."""
     page = (ROOT / "docs" / "how-to" / "plugins.md").read_text()
     shown = page.partition("```python\n")[2].partition("```")[0]

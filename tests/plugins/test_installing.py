@@ -21,7 +21,7 @@ def modules_and_entry_points(folder: Path) -> tuple[dict[str, bytes], set[tuple[
 
 
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.name)
-def test_an_example_package_is_installed_by_pip(tmp_path: Path, example: Path):
+def test_an_example_plugin_package_can_be_installed_with_pip(tmp_path: Path, example: Path):
     options = ["--quiet", "--no-deps", "--no-build-isolation", "--disable-pip-version-check", "--no-compile"]
     command = [sys.executable, "-m", "pip", "install", *options, "--target", str(tmp_path / "pip"), str(example)]
     subprocess.run(command, check=True, capture_output=True)

@@ -47,7 +47,7 @@ def taught(plugin_server: ServerProcess) -> str:
 
 
 @pytest.mark.timeout(600)  # on a machine that others use as well
-def test_the_whole_loop_on_pendulum_runs_with_an_installed_family(
+def test_sampling_fitting_and_training_work_with_an_installed_model_plugin(
     plugin_server: ServerProcess, taught: str, tmp_path: Path
 ):
     status = json.loads(surrogym(plugin_server, tmp_path, "status", taught, "--json"))
@@ -67,7 +67,7 @@ def predicted(server: ServerProcess, name: str, q: list[float], u: list[float]) 
     return made
 
 
-def test_a_file_of_one_family_is_not_taken_by_a_surrogate_of_another(plugin_server: ServerProcess, taught: str):
+def test_a_surrogate_refuses_a_model_file_of_another_model_plugin(plugin_server: ServerProcess, taught: str):
     for name, model in (("mine", "bayesian_linear"), ("default", "gaussian_process")):
         body = {"name": name, "spec": designed(model).model_dump(mode="json")}
         httpx.post(f"{plugin_server.url}/v1/surrogates", json=body, timeout=60).raise_for_status()
@@ -96,7 +96,7 @@ def test_a_file_of_one_family_is_not_taken_by_a_surrogate_of_another(plugin_serv
         ("bayesian_linear", {"ridge": -1.0}, "expected a positive ridge, got -1.0"),
     ],
 )
-def test_missing_packages_and_wrong_settings_are_refused(
+def test_missing_model_plugins_and_invalid_settings_are_refused(
     plugin_server: ServerProcess, name: str, settings: dict[str, float], said: str
 ):
     spec = designed(ModelChoice(name=name, settings=settings)).model_dump(mode="json")
@@ -106,7 +106,7 @@ def test_missing_packages_and_wrong_settings_are_refused(
     assert httpx.get(f"{plugin_server.url}/v1/surrogates/refused", timeout=60).status_code == 404
 
 
-def test_a_server_starts_without_a_broken_package_and_names_it(plugin_server: ServerProcess):
+def test_the_server_starts_without_a_broken_model_plugin_and_logs_it(plugin_server: ServerProcess):
     assert "the model 'broken' is left out" in plugin_server.log
     assert "models: gaussian_process, ensemble, bayesian_linear" in plugin_server.log
 
@@ -122,11 +122,11 @@ def cases(installed: Path) -> Iterator[dict[str, ModelCase]]:
 
 @pytest.mark.parametrize("name", CASES)
 @pytest.mark.parametrize("law", LAWS_OF_MODELS, ids=lambda law: law.__name__)
-def test_the_example_keeps_the_laws(cases: dict[str, ModelCase], law, name: str):
+def test_the_example_model_plugin_passes_the_model_laws(cases: dict[str, ModelCase], law, name: str):
     law(cases[name])
 
 
-def test_the_page_names_the_entry_point_of_the_example():
+def test_the_plugin_page_names_the_entry_point_of_the_example_model():
     page = (ROOT / "docs" / "how-to" / "plugins.md").read_text()
     assert 'bayesian_linear = "bayesian_linear:BayesianLinear"' in page
     assert 'bayesian_linear = "bayesian_linear:BayesianLinear"' in (EXAMPLE / "pyproject.toml").read_text()

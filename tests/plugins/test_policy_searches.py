@@ -73,7 +73,7 @@ def surrogate() -> LocalSurrogate:
 @pytest.mark.parametrize("law", POLICY_SEARCH_LAWS)
 @pytest.mark.parametrize("name", SEARCHED)
 @pytest.mark.usefixtures("installed")
-def test_every_search_keeps_the_laws(
+def test_every_policy_search_passes_the_policy_search_laws(
     surrogate: LocalSurrogate, tmp_path: Path, name: str, law: Callable[[SurrogatePort, TrainSettings, Path], None]
 ):
     settings = TrainSettings(algorithm=name, total_steps=1_280, num_envs=8, hyperparameters=SEARCHED[name])
@@ -90,26 +90,26 @@ def test_every_search_keeps_the_laws(
     ],
 )
 @pytest.mark.usefixtures("installed")
-def test_an_unknown_or_broken_search_is_one_sentence(name: str, said: str):
+def test_an_unknown_or_broken_policy_search_gives_a_one_sentence_error(name: str, said: str):
     with pytest.raises(ValueError, match=f"got '{name}'") as refused:
         SEARCHES.get(name)
     assert said in str(refused.value)
 
 
 @pytest.mark.usefixtures("installed")
-def test_no_package_takes_the_name_of_a_built_in_search():
+def test_a_plugin_cannot_take_the_name_of_a_built_in_policy_search():
     assert SEARCHES.get("ppo").__module__.startswith("surrogym_trainer.")
     assert "expected a name that differs from the built-in" in SEARCHES.broken["ppo"]
 
 
 @pytest.mark.usefixtures("installed")
-def test_the_doctor_names_packages_that_can_not_be_used():
+def test_doctor_names_policy_search_plugins_that_cannot_be_used():
     problems = [finding for finding in installation() if finding.way_out]
     assert [finding.name for finding in problems] == ["plug-in"] * 3
     assert "package 'package_of_no_search', entry point no_search = " in " ".join(f.said for f in problems)
 
 
-def test_the_doctor_names_packages_of_the_server_too_one_line_each(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_doctor_names_broken_server_plugins_in_one_line_each(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     (tmp_path / "talkative.py").write_text("raise RuntimeError('one line\\nand another')\n")
     (tmp_path / "leaving.py").write_text("import sys\nsys.exit(3)\n")
     broken(tmp_path, "talkative", "talkative:Missing", "acquisitions")
@@ -133,7 +133,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServerProcess]:
         yield server
 
 
-def test_a_strangers_search_solves_pendulum_over_http(server: ServerProcess, site: Path, tmp_path: Path):
+def test_an_installed_policy_search_plugin_solves_pendulum_over_http(server: ServerProcess, site: Path, tmp_path: Path):
     """Register, sample, train, evaluate, export: the commands of a person who installed the package."""
 
     def surrogym(*arguments: str) -> str:
@@ -162,6 +162,6 @@ def test_a_strangers_search_solves_pendulum_over_http(server: ServerProcess, sit
     assert (tmp_path / "policy.pt2").exists()
 
 
-def test_the_page_names_the_example_and_its_entry_point_exists():
+def test_the_plugin_page_names_the_existing_entry_point_of_the_example_search():
     assert "`examples/plugins/policy_search`" in PAGE.read_text()
     assert 'cross_entropy = "cross_entropy:CrossEntropy"' in (EXAMPLE / "pyproject.toml").read_text()

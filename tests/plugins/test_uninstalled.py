@@ -124,7 +124,7 @@ def surrogym(left: ServerProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     ],
     ids=" ".join,
 )
-def test_commands_that_need_no_model_work_without_the_plug_in(
+def test_commands_that_need_no_model_work_after_the_plugin_was_uninstalled(
     surrogym: Callable[..., Result], words: tuple[str, ...], name: str
 ):
     done = surrogym(words[0], name, *words[1:])
@@ -136,7 +136,7 @@ def refusal(reply: httpx.Response) -> tuple[int, str, str]:
     return reply.status_code, reply.json()["code"], reply.json()["detail"]
 
 
-def test_requests_that_need_a_missing_family_are_refused(left: ServerProcess):
+def test_requests_that_need_an_uninstalled_model_plugin_are_refused(left: ServerProcess):
     at = f"{left.url}/v1/surrogates/lin"
     points = {"coordinates": [[1.0, 2.0]], "action": [[0.5]]}
     model = httpx.get(f"{at}/models/1?format=safetensors", timeout=60).raise_for_status().content
@@ -150,20 +150,20 @@ def test_requests_that_need_a_missing_family_are_refused(left: ServerProcess):
         assert refusal(reply) == (501, "not_installed", LIN)
 
 
-def test_a_model_serves_without_the_acquisition(left: ServerProcess):
+def test_a_model_can_be_served_after_its_acquisition_plugin_was_uninstalled(left: ServerProcess):
     points = {"coordinates": [[1.0, 2.0]], "action": [[0.5]]}
     httpx.post(f"{left.url}/v1/surrogates/foc/predict", json=points, timeout=60).raise_for_status()
     opened = httpx.post(f"{left.url}/v1/surrogates/foc/sessions", json={"num_envs": 2}, timeout=60)
     assert opened.status_code == 201
 
 
-def test_the_log_names_missing_packages_at_the_start(left: ServerProcess):
+def test_the_server_logs_uninstalled_plugins_at_start(left: ServerProcess):
     assert LIN in left.log
     assert FOC in left.log
 
 
 @pytest.mark.parametrize(("name", "lacks"), [("lin", LIN), ("foc", FOC)])
-def test_a_round_that_is_due_fails_and_says_what_to_do(
+def test_a_due_fit_with_an_uninstalled_plugin_fails_with_a_remedy(
     left: ServerProcess, surrogym: Callable[..., Result], name: str, lacks: str
 ):
     with Api(left.url) as api:
@@ -179,7 +179,9 @@ def test_a_round_that_is_due_fails_and_says_what_to_do(
     assert f"last error: {lacks}; then: surrogym change {name} --resume" in seen
 
 
-def test_the_samples_go_along_to_a_new_design(left: ServerProcess, surrogym: Callable[..., Result]):
+def test_samples_of_a_surrogate_with_an_uninstalled_plugin_can_be_moved(
+    left: ServerProcess, surrogym: Callable[..., Result]
+):
     assert surrogym("register", "Pendulum-v1", "--name", "new", "--initial", "2").exit_code == 0
     fields = set(NewSample.model_fields) - {"query_id", "lease_token"}
     with Api(left.url) as api:
@@ -188,12 +190,12 @@ def test_the_samples_go_along_to_a_new_design(left: ServerProcess, surrogym: Cal
         assert api.surrogate("new").ledger.manual == api.surrogate("foc").ledger.total
 
 
-def test_it_can_be_deleted(left: ServerProcess, surrogym: Callable[..., Result]):
+def test_a_surrogate_with_an_uninstalled_plugin_can_be_deleted(left: ServerProcess, surrogym: Callable[..., Result]):
     assert surrogym("delete", "lin", "--yes").exit_code == 0
     assert httpx.get(f"{left.url}/v1/surrogates/lin", timeout=60).status_code == 404
 
 
-def test_the_design_continues_after_reinstallation(left: ServerProcess, packages: Path, tmp_path: Path):
+def test_the_design_continues_after_its_plugin_was_reinstalled(left: ServerProcess, packages: Path, tmp_path: Path):
     """The way out that the status names: install, restart, resume."""
     left.stop()
     shutil.copy(left.folder / "surrogym.db", tmp_path / "surrogym.db")

@@ -67,12 +67,12 @@ def fitted(server: ServerProcess, name: str) -> dict[str, Any]:
         ("nan", "the fit failed: the model family 'unruly': next coordinates: expected finite numbers, got nan"),
     ],
 )
-def test_a_failing_fit_affects_no_other(server: ServerProcess, mode: str, said: str):
+def test_a_model_plugin_that_fails_fails_only_its_own_fit(server: ServerProcess, mode: str, said: str):
     status = fitted(server, taught(server, mode))
     assert (status["phase"], status["error"]) == ("failed", said)
 
 
-def test_a_fit_that_blocks_for_ever_ends_with_its_surrogate(server: ServerProcess):
+def test_deleting_a_surrogate_ends_the_blocked_fit_of_its_model_plugin(server: ServerProcess):
     """Others wait for it, and are fitted once it is deleted."""
     name = taught(server, "learn.block")
     other = taught(server, unruly.ORDERLY)
@@ -84,7 +84,7 @@ def test_a_fit_that_blocks_for_ever_ends_with_its_surrogate(server: ServerProces
 
 
 @pytest.mark.parametrize("mode", ["raise", "exit", "interrupt", "shape", "nothing"])
-def test_a_request_that_it_fails_is_a_problem_that_names_it(server: ServerProcess, mode: str):
+def test_a_request_that_fails_in_a_model_plugin_returns_an_error_naming_it(server: ServerProcess, mode: str):
     name = taught(server, f"served.{mode}")
     assert fitted(server, name)["phase"] == "sampling"
     point = {"coordinates": [[0.1, 0.2]], "action": [[0.5]]}

@@ -10,7 +10,7 @@ from surrogym_trainer.policies.card import PolicyCard, UnusablePolicy, require_c
 
 
 @pytest.mark.parametrize("content", ["{}", '{"model": "cstr"}', "[1, 2]", "3", "level, valve", ""])
-def test_a_file_that_is_no_card_is_not_replaced(content: str, tmp_path: Path) -> None:
+def test_writing_a_policy_description_never_replaces_a_foreign_file(content: str, tmp_path: Path) -> None:
     other = tmp_path / "tank.json"
     other.write_text(content)
     with pytest.raises(UnusablePolicy, match=r"tank\.json, which is not a card: choose another name"):
@@ -18,7 +18,7 @@ def test_a_file_that_is_no_card_is_not_replaced(content: str, tmp_path: Path) ->
     assert other.read_text() == content
 
 
-def test_an_earlier_card_may_be_replaced(tmp_path: Path) -> None:
+def test_writing_a_policy_description_replaces_an_earlier_one(tmp_path: Path) -> None:
     policy = tmp_path / "tank.zip"
     require_card_or_none(policy)
     write_card(policy, PolicyCard())

@@ -20,7 +20,7 @@ def check() -> StoredCheck:
     )
 
 
-def test_a_check_is_read_as_it_was_written(tmp_path: Path):
+def test_a_stored_controller_check_is_read_back_unchanged(tmp_path: Path):
     write_check(tmp_path, check())
     assert read_check(tmp_path, POLICY) == check()
 
@@ -29,13 +29,13 @@ def test_a_check_is_read_as_it_was_written(tmp_path: Path):
     "changes",
     [{"faults": -1}, {"faults": True}, {"steps": 10**40}, {"largest_difference": -1.0}, {"microseconds": -1.0}],
 )
-def test_an_impossible_check_is_refused(tmp_path: Path, changes: dict[str, object]):
+def test_an_invalid_stored_controller_check_is_refused(tmp_path: Path, changes: dict[str, object]):
     (tmp_path / FILE).write_text(json.dumps(check().model_dump() | changes))
     with pytest.raises(UnusableCheck, match="not the check"):
         read_check(tmp_path, POLICY)
 
 
-def test_a_file_that_is_too_long_is_refused_by_its_size(tmp_path: Path):
+def test_a_too_long_controller_check_file_is_refused_by_its_size(tmp_path: Path):
     (tmp_path / FILE).write_text(check().model_dump_json() + " " * 100_000)
     with pytest.raises(UnusableCheck, match="at most 65536 bytes"):
         read_check(tmp_path, POLICY)

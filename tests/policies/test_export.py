@@ -75,7 +75,7 @@ def same(ours: np.ndarray, theirs: np.ndarray) -> None:
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_a_program_of_torch_gives_the_policys_actions(tmp_path: Path, case: str):
+def test_a_policy_exported_to_torch_gives_the_same_actions(tmp_path: Path, case: str):
     policy = saved(tmp_path, case)
     export_policy(policy, tmp_path / "policy.pt2", CASES[case][0], trust=True)
     program = torch.export.load(tmp_path / "policy.pt2").module()
@@ -89,7 +89,7 @@ def test_a_program_of_torch_gives_the_policys_actions(tmp_path: Path, case: str)
 
 
 @pytest.mark.parametrize("case", ["PPO, continuous", "PPO, noise by the state", "PPO, several discrete", "SAC"])
-def test_onnx_gives_the_policys_actions(tmp_path: Path, case: str):
+def test_a_policy_exported_to_onnx_gives_the_same_actions(tmp_path: Path, case: str):
     policy = saved(tmp_path, case)
     export_policy(policy, tmp_path / "policy.onnx", CASES[case][0], trust=True)
     session = onnxruntime.InferenceSession(tmp_path / "policy.onnx", providers=["CPUExecutionProvider"])
@@ -99,7 +99,7 @@ def test_onnx_gives_the_policys_actions(tmp_path: Path, case: str):
 
 
 @pytest.mark.parametrize("spec", [pendulum(), acrobot()], ids=["continuous", "discrete"])
-def test_a_network_of_arrays_leaves_too(tmp_path: Path, spec):
+def test_a_policy_stored_as_arrays_can_be_exported_to_torch(tmp_path: Path, spec):
     d, rng = len(spec.observation), np.random.default_rng(0)
     network = Network.of(spec, np.ones(d), np.full(d, 2.0), 8, rng.normal(size=Network.size(spec, 8)))
     network.save(tmp_path / "policy.zip")
@@ -109,7 +109,7 @@ def test_a_network_of_arrays_leaves_too(tmp_path: Path, spec):
     same(network(observations), program(torch.as_tensor(observations)).numpy())
 
 
-def test_a_file_whose_actions_differ_is_not_kept(tmp_path: Path, monkeypatch):
+def test_an_exported_policy_file_whose_actions_differ_is_deleted(tmp_path: Path, monkeypatch):
     policy = saved(tmp_path, "PPO, continuous")
     read = policy_export._from_program
     monkeypatch.setattr(policy_export, "_from_program", lambda content: lambda o: read(content)(o) + 1e-3)
@@ -118,7 +118,7 @@ def test_a_file_whose_actions_differ_is_not_kept(tmp_path: Path, monkeypatch):
     assert not (tmp_path / "policy.pt2").exists()
 
 
-def test_an_export_that_is_impossible_is_refused_with_a_reason(tmp_path: Path):
+def test_an_impossible_policy_export_is_refused_with_a_reason(tmp_path: Path):
     policy = saved(tmp_path, "DQN")
     with pytest.raises(NotExportable, match=r"ending in \.onnx or \.pt2, got '\.txt'"):
         export_policy(policy, tmp_path / "policy.txt", "DQN")

@@ -123,7 +123,9 @@ def mark(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_a_policy_acts_as_the_one_that_was_unpickled(tmp_path: Path, monkeypatch, case: str):
+def test_a_policy_read_without_unpickling_gives_the_same_actions_as_an_unpickled_one(
+    tmp_path: Path, monkeypatch, case: str
+):
     policy, algorithm = saved(tmp_path, case), CASES[case][0]
     theirs = load_policy(policy, algorithm, trust=True)(OBSERVATIONS)
     monkeypatch.setattr(cloudpickle, "loads", lambda *_: pytest.fail("something was unpickled"))
@@ -134,7 +136,7 @@ def test_a_policy_acts_as_the_one_that_was_unpickled(tmp_path: Path, monkeypatch
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_an_algorithm_learns_on_as_the_one_that_was_unpickled(tmp_path: Path, case: str):
+def test_an_algorithm_read_without_unpickling_trains_on_like_an_unpickled_one(tmp_path: Path, case: str):
     policy, (algorithm, action_space, _) = saved(tmp_path, case), CASES[case]
     learned = []
     for trust in (True, False):
@@ -147,7 +149,7 @@ def test_an_algorithm_learns_on_as_the_one_that_was_unpickled(tmp_path: Path, ca
 
 
 @pytest.mark.parametrize("algorithm", ["ppo", "fastppo"])
-def test_policies_of_train_are_read_without_unpickling(tmp_path: Path, no_unpickling, algorithm: str):
+def test_policies_written_by_train_are_read_without_unpickling(tmp_path: Path, no_unpickling, algorithm: str):
     port, policy = ExactPendulum(), tmp_path / "policy"
     small = {"algorithm": algorithm, "total_steps": 256, "num_envs": 4, "hyperparameters": {"n_steps": 16}}
     train(port, policy, TrainSettings(**small))
@@ -157,7 +159,7 @@ def test_policies_of_train_are_read_without_unpickling(tmp_path: Path, no_unpick
 
 
 @pytest.mark.parametrize("needs", ["load_policy", "load_learner", "export_policy", "train"])
-def test_a_gift_is_not_unpickled(tmp_path: Path, mark: Path, needs: str):
+def test_a_policy_file_with_pickled_objects_is_refused_by_every_reader(tmp_path: Path, mark: Path, needs: str):
     policy = gift(tmp_path / "policy.zip", mark)
     readers = {
         "load_policy": lambda: load_policy(policy),
@@ -170,7 +172,7 @@ def test_a_gift_is_not_unpickled(tmp_path: Path, mark: Path, needs: str):
     assert not mark.exists()
 
 
-def test_a_policy_of_stable_baselines3_is_read_when_it_is_trusted(tmp_path: Path):
+def test_a_stable_baselines3_policy_is_read_only_if_trusted(tmp_path: Path):
     policy = tmp_path / "policy.zip"
     made = stable_baselines3.PPO("MlpPolicy", Idle(TORQUES), n_steps=8, batch_size=8, device="cpu")
     made.save(policy)
@@ -180,14 +182,14 @@ def test_a_policy_of_stable_baselines3_is_read_when_it_is_trusted(tmp_path: Path
     np.testing.assert_array_equal(load_policy(policy, trust=True)(OBSERVATIONS), expected)
 
 
-def test_a_trusted_gift_runs(tmp_path: Path, mark: Path):
+def test_a_trusted_policy_file_with_a_malicious_pickle_is_executed(tmp_path: Path, mark: Path):
     with pytest.raises(UnusablePolicy, match="not a policy of PPO"):
         load_policy(gift(tmp_path / "policy.zip", mark), trust=True)
     assert mark.exists(), "else the other tests would show nothing"
 
 
 @pytest.mark.parametrize("name", ["policy_class", "lr_schedule", "learning_rate", "ep_info_buffer", "seed"])
-def test_a_gift_within_a_policy_that_is_described_stays_pickled(tmp_path: Path, mark: Path, name: str):
+def test_pickled_objects_in_the_settings_of_a_policy_file_are_not_unpickled(tmp_path: Path, mark: Path, name: str):
     policy = saved(tmp_path, "PPO, continuous")
     data = json.loads(read_entries(policy, LIMIT)["data"]) | {name: pickled(mark)}
     changed(policy, data=json.dumps(data).encode())
@@ -200,7 +202,7 @@ def test_a_gift_within_a_policy_that_is_described_stays_pickled(tmp_path: Path, 
 
 
 @pytest.mark.parametrize("trust", [False, True])
-def test_a_gift_among_the_weights_stays_pickled(tmp_path: Path, mark: Path, trust: bool):
+def test_pickled_objects_among_the_weights_of_a_policy_file_are_not_unpickled(tmp_path: Path, mark: Path, trust: bool):
     file = io.BytesIO()
     torch.save([Touches(mark), torch.zeros(10_000)], file)
     policy = changed(saved(tmp_path, "PPO, continuous"), policy__pth=file.getvalue())
@@ -209,7 +211,7 @@ def test_a_gift_among_the_weights_stays_pickled(tmp_path: Path, mark: Path, trus
     assert not mark.exists()
 
 
-def test_an_unknown_schedule_matters_only_for_learning(tmp_path: Path):
+def test_an_unknown_learning_rate_schedule_is_refused_only_for_further_training(tmp_path: Path):
     learner = stable_baselines3.PPO(
         PaperPolicy, Idle(TORQUES), n_steps=8, batch_size=8, learning_rate=LinearSchedule(1, 0, 1), device="cpu"
     )
@@ -232,14 +234,14 @@ def bomb(name: str) -> bytes:
     return file.getvalue()
 
 
-def test_weights_that_would_inflate_are_refused(tmp_path: Path):
+def test_policy_weights_that_decompress_to_too_many_bytes_are_refused(tmp_path: Path):
     policy = changed(saved(tmp_path, "PPO, continuous"), policy__pth=bomb("archive/data/0"))
     assert policy.stat().st_size < 2**20
     with pytest.raises(UnusablePolicy, match=rf"expected at most \d+ bytes after decompression, got {2**25}"):
         load_policy(policy)
 
 
-def test_a_policy_that_would_inflate_is_refused(tmp_path: Path, monkeypatch):
+def test_a_policy_file_that_decompresses_to_too_many_bytes_is_refused(tmp_path: Path, monkeypatch):
     monkeypatch.setattr("surrogym_trainer.policies.structure.MAX_BYTES", 2**20)
     (tmp_path / "policy.zip").write_bytes(bomb("policy.pth"))
     with pytest.raises(UnusablePolicy, match=f"expected at most {2**20} bytes after decompression, got {2**25}"):
@@ -257,7 +259,9 @@ def test_a_policy_that_would_inflate_is_refused(tmp_path: Path, monkeypatch):
         ({"version": 2}, "version"),
     ],
 )
-def test_a_description_that_lies_is_refused(tmp_path: Path, change: dict[str, Any], message: str):
+def test_a_policy_file_whose_description_contradicts_its_weights_is_refused(
+    tmp_path: Path, change: dict[str, Any], message: str
+):
     policy = saved(tmp_path, "PPO, continuous")
     described = json.loads(read_entries(policy, LIMIT)[ENTRY])
     policy.write_bytes(stored(read_entries(policy, LIMIT) | {ENTRY: json.dumps(described | change).encode()}))
@@ -270,7 +274,7 @@ def with_data(policy: Path, /, **settings: Any) -> Path:
     return changed(policy, data=json.dumps(data | settings).encode())
 
 
-def test_entries_that_are_no_settings_never_become_attributes(tmp_path: Path):
+def test_unknown_entries_of_a_policy_file_never_become_attributes_of_the_algorithm(tmp_path: Path):
     policy = saved(tmp_path, "PPO, continuous")
     expected = load_policy(policy)(OBSERVATIONS)
     gifts = dict.fromkeys(("predict", "learn", "policy", "get_env", "device", "verbose", "start_time"), "x")
@@ -281,7 +285,7 @@ def test_entries_that_are_no_settings_never_become_attributes(tmp_path: Path):
     assert (learner.n_envs, learner.verbose) == (1, 0)
 
 
-def test_a_pickled_environment_does_not_replace_the_one_given(tmp_path: Path, mark: Path):
+def test_a_pickled_environment_in_a_policy_file_is_ignored(tmp_path: Path, mark: Path):
     policy = with_data(saved(tmp_path, "PPO, continuous"), env=pickled(mark))
     load_learner(policy, "PPO", env=Idle(TORQUES)).learn(16)
     assert not mark.exists()
@@ -291,7 +295,9 @@ def test_a_pickled_environment_does_not_replace_the_one_given(tmp_path: Path, ma
     ("case", "setting"),
     [("PPO, continuous", {"n_steps": 10**12}), ("SAC", {"buffer_size": 10**12}), ("DQN", {"buffer_size": 10**9})],
 )
-def test_experience_beyond_its_bound_is_refused_for_learning_alone(tmp_path: Path, case: str, setting: dict[str, int]):
+def test_a_too_large_replay_buffer_is_refused_only_for_further_training(
+    tmp_path: Path, case: str, setting: dict[str, int]
+):
     policy, (algorithm, action_space, _) = with_data(saved(tmp_path, case), **setting), CASES[case]
     assert len(load_policy(policy, algorithm)(OBSERVATIONS)) == len(OBSERVATIONS)
     with pytest.raises(
@@ -311,12 +317,12 @@ def test_experience_beyond_its_bound_is_refused_for_learning_alone(tmp_path: Pat
     ],
     ids=str,
 )
-def test_a_setting_of_another_type_is_named(tmp_path: Path, setting: dict[str, Any], message: str):
+def test_the_error_for_a_policy_setting_of_wrong_type_names_it(tmp_path: Path, setting: dict[str, Any], message: str):
     with pytest.raises(UnusablePolicy, match=message):
         load_policy(with_data(saved(tmp_path, "PPO, continuous"), **setting))
 
 
-def test_variables_that_would_overwrite_the_policy_are_refused(tmp_path: Path):
+def test_a_policy_file_with_variables_that_overwrite_its_weights_is_refused(tmp_path: Path):
     file = io.BytesIO()
     torch.save({"policy.log_std": torch.zeros(7)}, file)
     policy = changed(saved(tmp_path, "PPO, continuous"), pytorch_variables__pth=file.getvalue())
@@ -327,7 +333,7 @@ def test_variables_that_would_overwrite_the_policy_are_refused(tmp_path: Path):
 
 
 @pytest.mark.parametrize("missing", ["data", "policy.pth"])
-def test_an_incomplete_file_is_refused_with_the_missing_part(tmp_path: Path, missing: str):
+def test_an_incomplete_policy_file_is_refused_with_the_missing_entry(tmp_path: Path, missing: str):
     policy = saved(tmp_path, "PPO, continuous")
     entries = read_entries(policy, LIMIT)
     del entries[missing]
@@ -336,7 +342,7 @@ def test_an_incomplete_file_is_refused_with_the_missing_part(tmp_path: Path, mis
         load_policy(policy)
 
 
-def test_a_policy_of_another_make_is_not_described():
+def test_only_policy_networks_of_this_project_get_a_structure_description():
     plain = stable_baselines3.PPO("MlpPolicy", Idle(TORQUES), n_steps=8, batch_size=8, device="cpu")
     assert describe(plain) is None
     described = describe(learner_of("PPO, continuous"))
@@ -345,7 +351,7 @@ def test_a_policy_of_another_make_is_not_described():
     assert described.objects()["action_space"] == TORQUES
 
 
-def test_an_address_from_a_card_is_never_connected_to(tmp_path: Path):
+def test_a_server_address_from_a_policy_description_is_never_connected_to(tmp_path: Path):
     policy = tmp_path / "policy.zip"
     policy.touch()
     card = PolicyCard(server=NotedAddress("http://127.0.0.1:9"))
@@ -356,7 +362,7 @@ def test_an_address_from_a_card_is_never_connected_to(tmp_path: Path):
         Api(read_card(policy).server)  # type: ignore[arg-type]
 
 
-def test_a_card_is_read_to_its_bound_alone(tmp_path: Path):
+def test_a_too_large_policy_description_is_refused_without_reading_all_of_it(tmp_path: Path):
     (tmp_path / "policy.zip").touch()
     with (tmp_path / "policy.json").open("wb") as card:
         card.truncate(2**28)
@@ -368,7 +374,7 @@ def test_a_card_is_read_to_its_bound_alone(tmp_path: Path):
     assert peak < 8 * MAX_CARD_BYTES
 
 
-def test_a_plain_pickle_is_no_policy(tmp_path: Path, mark: Path):
+def test_a_plain_pickle_file_is_refused_as_policy(tmp_path: Path, mark: Path):
     (tmp_path / "policy.zip").write_bytes(pickle.dumps(Touches(mark)))
     with pytest.raises(UnusablePolicy, match="not a policy of PPO: expected a zip"):
         load_policy(tmp_path / "policy.zip")

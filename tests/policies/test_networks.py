@@ -47,7 +47,7 @@ def layers(module: nn.Module, kind: type[nn.Module]) -> list[nn.Module]:
     ("space", "activation", "outputs"),
     [(TORQUES, nn.Tanh, 2), (spaces.Discrete(3), nn.ReLU, 3), (spaces.MultiDiscrete([3, 2]), nn.ReLU, 5)],
 )
-def test_the_actor_has_one_hidden_layer_of_32(space, activation, outputs):
+def test_the_papers_actor_network_has_one_hidden_layer_of_32_units(space, activation, outputs):
     made = policy(space)
     hidden = layers(made.mlp_extractor.policy_net, nn.Linear)
     assert [(layer.in_features, layer.out_features) for layer in hidden] == [(3, HIDDEN)]
@@ -56,13 +56,13 @@ def test_the_actor_has_one_hidden_layer_of_32(space, activation, outputs):
     assert [(layer.in_features, layer.out_features) for layer in layers(made.action_net, nn.Linear)] == [(32, outputs)]
 
 
-def test_a_continuous_output_is_tanh_scaled_to_the_bounds():
+def test_continuous_policy_outputs_are_tanh_scaled_to_the_action_bounds():
     bounded = Bounded(TORQUES)
     made = bounded(torch.tensor([[0.0, 0.0], [50.0, 50.0], [-50.0, -50.0], [np.arctanh(0.5), 0.0]]).float())
     np.testing.assert_allclose(made.numpy(), [[0, 5], [2, 10], [-2, 0], [1, 5]], atol=1e-6)
 
 
-def test_no_observation_leads_out_of_the_bounds():
+def test_policy_actions_stay_within_bounds_for_any_observation():
     made = policy(TORQUES)
     with torch.no_grad():
         made.action_net[0].weight.mul_(1e3)
@@ -72,12 +72,12 @@ def test_no_observation_leads_out_of_the_bounds():
     assert np.ptp(actions, axis=0).min() > 1
 
 
-def test_the_first_exploration_is_half_of_half_the_range():
+def test_the_initial_exploration_noise_is_a_quarter_of_the_action_range():
     np.testing.assert_allclose(policy(TORQUES).log_std.exp().detach(), [1.0, 2.5], rtol=1e-6)
 
 
 @pytest.mark.parametrize("space", [spaces.Discrete(3), spaces.MultiDiscrete([3, 2])])
-def test_evaluation_takes_the_most_probable_action_of_each_dimension(space):
+def test_evaluation_uses_the_most_probable_discrete_action_of_each_dimension(space):
     made, observation = policy(space), np.random.default_rng(0).normal(size=(40, 3)).astype(np.float32)
     actions, _ = made.predict(observation, deterministic=True)
     with torch.no_grad():
@@ -88,7 +88,7 @@ def test_evaluation_takes_the_most_probable_action_of_each_dimension(space):
     assert len(np.unique(actions)) > 1
 
 
-def test_observations_are_standardised_by_fixed_statistics():
+def test_the_policy_network_standardises_observations_by_fixed_statistics():
     made = Standardise(OBSERVED, **STATISTICS)
     np.testing.assert_allclose(made(torch.tensor([[3.0, 1.0, 2.0]])), [[1.0, 1.0, 1.0]])
     np.testing.assert_allclose(Standardise(OBSERVED)(torch.tensor([[3.0, 1.0, 2.0]])), [[3.0, 1.0, 2.0]])
@@ -96,7 +96,7 @@ def test_observations_are_standardised_by_fixed_statistics():
 
 
 @pytest.mark.parametrize("space", [TORQUES, spaces.MultiDiscrete([3, 2])])
-def test_a_saved_policy_is_complete(tmp_path: Path, space):
+def test_a_saved_policy_gives_the_same_actions_after_loading(tmp_path: Path, space):
     extractor = {"features_extractor_kwargs": STATISTICS}
     learner = PPO(PaperPolicy, Idle(space), n_steps=8, batch_size=8, seed=1, device="cpu", policy_kwargs=extractor)
     learner.learn(8)

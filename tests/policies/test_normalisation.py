@@ -31,7 +31,7 @@ def learned() -> tuple[PPO, VecNormalize]:
     return PPO("MlpPolicy", env, **SETTINGS).learn(16), env
 
 
-def test_without_statistics_it_is_refused_and_with_them_acts_as_it_learned(learned, tmp_path: Path) -> None:
+def test_a_vecnormalize_policy_is_refused_without_its_statistics(learned, tmp_path: Path) -> None:
     model, env = learned
     policy = tmp_path / "mine.zip"
     model.save(policy)
@@ -47,7 +47,7 @@ def test_without_statistics_it_is_refused_and_with_them_acts_as_it_learned(learn
         load_learner(policy, trust=True)
 
 
-def test_a_file_without_the_arrays_is_refused(learned, tmp_path: Path) -> None:
+def test_a_normalisation_file_without_the_needed_arrays_is_refused(learned, tmp_path: Path) -> None:
     model, _ = learned
     policy = tmp_path / "mine.zip"
     model.save(policy)
@@ -56,7 +56,7 @@ def test_a_file_without_the_arrays_is_refused(learned, tmp_path: Path) -> None:
         load_policy(policy, trust=True)
 
 
-def test_other_policies_are_not_concerned(learned, tmp_path: Path) -> None:
+def test_policies_without_vecnormalize_need_no_statistics(learned, tmp_path: Path) -> None:
     """Those of surrogym train learn in a VecNormalize of rewards alone."""
     model, env = learned
     save_policy(model, tmp_path / "ours.zip")

@@ -108,7 +108,7 @@ def looping() -> onnx.ModelProto:
         (looping, "expected one graph, got a loop or a branch"),
     ],
 )
-def test_a_file_without_bounds_is_refused_before_it_runs(
+def test_an_onnx_policy_with_unbounded_resource_use_is_refused_before_it_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, made: Callable[[], onnx.ModelProto], said: str
 ):
     monkeypatch.chdir(tmp_path)
@@ -119,7 +119,7 @@ def test_a_file_without_bounds_is_refused_before_it_runs(
     assert said in str(refused.value)
 
 
-def test_a_file_with_functions_is_read_once_they_are_inlined_as_the_refusal_says():
+def test_an_onnx_policy_with_functions_is_refused_with_a_remedy_that_works():
     opset = [helper.make_opsetid("", 18)]
     own = helper.make_function("own", "Shift", ["x", "b"], ["y"], [helper.make_node("Add", ["x", "b"], ["y"])], opset)
     made = model([helper.make_node("Shift", ["observation", "bias"], ["action"], domain="own")], [BIAS])
@@ -131,13 +131,13 @@ def test_a_file_with_functions_is_read_once_they_are_inlined_as_the_refusal_says
     np.testing.assert_array_equal(policy(np.zeros((1, 3), np.float32)), np.ones((1, 3), np.float32))
 
 
-def test_a_file_of_too_many_bytes_is_refused_and_not_read_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_too_large_onnx_policy_is_refused_without_reading_all_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(onnx_files, "MAX_BYTES", 1_000)
     (tmp_path / "policy.onnx").write_bytes(bytes(10_000))
     with pytest.raises(UnusableOnnx, match="got 1001 bytes: expected at most 1000 bytes"):
         load_policy(tmp_path / "policy.onnx")
 
 
-def test_more_observations_than_one_call_takes_are_split_and_joined():
+def test_many_observations_of_an_onnx_policy_are_split_into_several_calls():
     policy, many = from_onnx(model([ADDED], [BIAS]).SerializeToString()), np.zeros((2 * LANES + 1, 3), np.float32)
     np.testing.assert_array_equal(policy(many), np.ones((2 * LANES + 1, 3), np.float32))

@@ -30,7 +30,7 @@ def api(server_process: ServerProcess) -> Iterator[Api]:
         opened.delete_surrogate(NAME)
 
 
-def test_a_video_beside_the_policy_is_sent_once_and_a_broken_one_is_named(api: Api, policy: Path):
+def test_pushing_a_policy_sends_its_video_once_and_reports_a_broken_one(api: Api, policy: Path):
     video = policy.with_suffix(".mp4")
     video.write_bytes(b"\0\0\0\x20ftypisom" + bytes(500))
     assert pushing.push(api, policy).refused == ""
@@ -67,7 +67,7 @@ def evaluation(key: str) -> wire.AddEvaluation:
     return wire.AddEvaluation(first_seed=1, returns=[-1.0, -2.0], lengths=[3, 4], idempotency_key=key)
 
 
-def test_results_are_sent_later_if_the_server_is_unreachable(api: Api, away: Api, policy: Path):
+def test_evaluations_are_sent_later_if_the_server_is_unreachable(api: Api, away: Api, policy: Path):
     pushing.keep(policy, evaluation("a"))
     pushing.keep(policy, evaluation("b"))
     with pytest.raises(ServerUnreachable):
@@ -84,7 +84,9 @@ def test_results_are_sent_later_if_the_server_is_unreachable(api: Api, away: Api
     assert api.policies.file(NAME, 1, "zip") == policy.read_bytes()
 
 
-def test_an_evaluation_kept_during_a_push_still_waits(api: Api, policy: Path, monkeypatch: pytest.MonkeyPatch):
+def test_an_evaluation_stored_during_a_push_is_kept_for_the_next_push(
+    api: Api, policy: Path, monkeypatch: pytest.MonkeyPatch
+):
     pushing.keep(policy, evaluation("a"))
     send = type(api.policies).evaluate
 
@@ -97,12 +99,12 @@ def test_an_evaluation_kept_during_a_push_still_waits(api: Api, policy: Path, mo
     assert [one["idempotency_key"] for one in json.loads(pushing.waiting_path(policy).read_text())] == ["b"]
 
 
-def test_the_address_of_a_card_is_not_passed_on(api: Api, policy: Path):
+def test_pushing_a_policy_does_not_send_the_server_address_of_its_description(api: Api, policy: Path):
     pushing.push(api, policy)
     assert "secret" not in api.policies.get(NAME).model_dump_json()
 
 
-def test_a_policy_for_another_specification_stays_with_what_waits(api: Api, tmp_path: Path):
+def test_a_refused_push_keeps_the_policys_unsent_evaluations(api: Api, tmp_path: Path):
     other = written(tmp_path / "other.zip", cartpole())
     pushing.keep(other, evaluation("a"))
     with pytest.raises(SpecConflict):
@@ -112,14 +114,14 @@ def test_a_policy_for_another_specification_stays_with_what_waits(api: Api, tmp_
 
 
 @pytest.mark.parametrize("content", ["", "[{}]", '{"returns": 1}', "[" * 1000])
-def test_a_broken_list_of_evaluations_is_named_and_left_alone(api: Api, policy: Path, content: str):
+def test_a_damaged_file_of_unsent_evaluations_is_reported_and_kept(api: Api, policy: Path, content: str):
     pushing.waiting_path(policy).write_text(content)
     with pytest.raises(UnusablePolicy, match=r"policy\.evaluations\.json is not a list of evaluations"):
         pushing.push(api, policy)
     assert pushing.waiting_path(policy).read_text() == content
 
 
-def test_a_policy_without_a_surrogate_or_of_an_unknown_form_is_refused(away: Api, tmp_path: Path):
+def test_pushing_a_policy_without_surrogate_or_of_unknown_format_is_refused(away: Api, tmp_path: Path):
     plain = tmp_path / "plain.zip"
     plain.write_bytes(b"x")
     with pytest.raises(UnusablePolicy, match="no card beside"):
@@ -133,13 +135,15 @@ def test_a_policy_without_a_surrogate_or_of_an_unknown_form_is_refused(away: Api
 @pytest.mark.parametrize(
     ("fields", "named"), [({"reason": "r" * 2_001}, "reason"), ({"versions": {"torch": "2\n"}}, "versions.torch")]
 )
-def test_a_card_that_no_server_takes_is_named(away: Api, policy: Path, fields: dict[str, object], named: str):
+def test_pushing_an_invalid_policy_description_names_the_invalid_field(
+    away: Api, policy: Path, fields: dict[str, object], named: str
+):
     write_card(policy, PolicyCard(surrogate=NAME, **fields))
     with pytest.raises(UnusablePolicy, match=f"the card beside .* can't be stored: {named}"):
         pushing.push(away, policy)
 
 
-def test_a_card_with_a_long_curve_is_sent_with_a_thin_one(api: Api, policy: Path):
+def test_pushing_a_policy_sends_a_long_learning_curve_thinned(api: Api, policy: Path):
     curve = tuple(wire.CurvePoint(steps=n) for n in range(501))
     write_card(policy, PolicyCard(surrogate=NAME, curve=curve))
     pushing.push(api, policy)
@@ -147,7 +151,7 @@ def test_a_card_with_a_long_curve_is_sent_with_a_thin_one(api: Api, policy: Path
 
 
 @pytest.mark.parametrize("count", [0, 1, 199, 200, 201, 999])
-def test_a_curve_is_thinned_and_keeps_its_last_point(count: int):
+def test_a_thinned_learning_curve_keeps_its_last_point(count: int):
     curve = [wire.CurvePoint(steps=n) for n in range(count)]
     thin = pushing.thinned(curve)
     assert len(thin) <= pushing.CURVE_POINTS

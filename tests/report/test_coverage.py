@@ -16,13 +16,13 @@ def steps(speeds: tuple[float, float], rows: int = 4_000) -> tuple[np.ndarray, n
     return q, rng.uniform(-2, 2, (rows, 1))
 
 
-def test_a_log_of_everywhere_fills_every_cell() -> None:
+def test_the_coverage_map_of_a_log_over_the_whole_range_is_full() -> None:
     coverage = coverage_of(pendulum(), *steps((-8, 8)))
     assert {pair: coverage.share(pair) for pair in coverage.counts} == {(0, 1): 1.0, (0, 2): 1.0, (1, 2): 1.0}
     assert all(int(counts.sum()) == 4_000 for counts in coverage.counts.values())
 
 
-def test_a_log_of_slow_speeds_leaves_the_fast_ones_empty() -> None:
+def test_the_coverage_map_of_a_log_of_slow_speeds_is_empty_at_fast_speeds() -> None:
     coverage = coverage_of(pendulum(), *steps((-1.6, 1.6)))
     assert coverage.share((0, 1)) == pytest.approx(2 / CELLS)
     assert coverage.share((0, 2)) == 1.0
@@ -30,19 +30,19 @@ def test_a_log_of_slow_speeds_leaves_the_fast_ones_empty() -> None:
     assert "at least 20 % of the cells" in coverage.words()
 
 
-def test_a_discrete_action_has_a_cell_for_each_value() -> None:
+def test_the_coverage_map_has_one_cell_per_discrete_action() -> None:
     q = np.zeros((2, 4))
     coverage = coverage_of(cartpole(), q, np.array([[0.0], [1.0]]))
     assert int((coverage.counts[3, 4] > 0).sum()) == 2
 
 
-def test_the_picture_has_a_panel_for_each_pair() -> None:
+def test_the_coverage_picture_has_a_panel_for_each_pair_of_columns() -> None:
     figure = draw_coverage(coverage_of(pendulum(), *steps((-8, 8))))
     drawn = [axes for axes in figure.axes if axes.images]
     assert len(drawn) == 3
     assert {axes.get_title() for axes in drawn} == {"100 %"}
 
 
-def test_many_columns_keep_the_actions_in_the_picture() -> None:
+def test_the_coverage_picture_of_many_columns_includes_the_actions() -> None:
     names = [*(f"s{i}" for i in range(12)), "action 0", "action 1"]
     assert columns_shown(names) == [0, 1, 2, 3, 4, 5, 12, 13]

@@ -129,7 +129,7 @@ def test_the_report_of_a_tested_policy_is_complete(modelled: Known):
     assert "What could not be read" not in parts
 
 
-def test_every_real_step_has_a_purpose_and_counts(modelled: Known):
+def test_the_report_lists_every_real_step_by_purpose(modelled: Known):
     wide = evaluation(4, declared=False, note="starts anywhere", steps=3_000)
     older = policy(version=2, evaluations=[evaluation(5, steps=500)])
     known = replace(modelled, policy=policy(evaluations=[evaluation(), without(), wide]), others=(older,))
@@ -143,7 +143,7 @@ def test_every_real_step_has_a_purpose_and_counts(modelled: Known):
     assert sum(parts) == total == 28_014
 
 
-def test_more_steps_than_planned_are_explained(modelled: Known):
+def test_the_report_explains_why_more_steps_than_planned_were_taken(modelled: Known):
     ledger = wire.Ledger(initial=5, adaptive=55, total=60)
     design = modelled.view.spec.design.model_copy(update={"budget": 24})
     spec = modelled.view.spec.model_copy(update={"design": design})
@@ -153,7 +153,7 @@ def test_more_steps_than_planned_are_explained(modelled: Known):
     assert "60 were taken. Then learning ended, although the model was not yet known well enough" in words
 
 
-def test_other_starts_that_were_tested_are_shown_with_their_results(modelled: Known):
+def test_the_report_shows_evaluations_from_other_start_ranges(modelled: Known):
     wide = evaluation(4, declared=False, note="starts anywhere, from seed 10000", mean=-113.6)
     tried = told(replace(modelled, policy=policy(evaluations=[evaluation(), wide]), real=evaluation()))
     assert "starts anywhere 100 -113.6" in tried["What it gives"]
@@ -174,12 +174,14 @@ def test_other_starts_that_were_tested_are_shown_with_their_results(modelled: Kn
         (-250.0, -260.0, -240.0, "worse"),
     ],
 )
-def test_only_a_difference_beyond_both_intervals_is_one(mean: float, low: float, high: float, verdict: str):
+def test_the_report_calls_returns_different_only_beyond_both_intervals(
+    mean: float, low: float, high: float, verdict: str
+):
     promise = wire.PolicyPromise(median=-151.9, low=-169.8, high=-134.0)
     assert outcome(promise, evaluation(mean=mean, mean_interval=wire.Interval(low=low, high=high))).verdict == verdict
 
 
-def test_no_difference_between_controllers_is_claimed_within_the_interval(modelled: Known):
+def test_the_report_claims_no_difference_between_controllers_within_the_interval(modelled: Known):
     returns = [-140.0, -139.0] * 50
     other = without(episodes=100, returns=returns)
     real = evaluation(returns=[-139.0, -140.0] * 50)
@@ -188,7 +190,7 @@ def test_no_difference_between_controllers_is_claimed_within_the_interval(modell
     assert " more with it" not in beside
 
 
-def test_starts_that_cannot_be_matched_are_not_called_the_same(modelled: Known):
+def test_the_report_does_not_call_unmatched_start_states_the_same(modelled: Known):
     few = without(returns=[], traces=[])
     parts = told(replace(modelled, policy=policy(), real=evaluation(returns=[]), without=few))
     assert "can't be compared one by one" in parts["With and without the controller"]
@@ -198,12 +200,12 @@ def test_starts_that_cannot_be_matched_are_not_called_the_same(modelled: Known):
 @pytest.mark.parametrize(
     ("deviation", "words"), [(0.5, "show no region where the model is unsure"), (2.0, "show where: in up to 100 %")]
 )
-def test_the_sentence_about_maps_is_what_they_show(modelled: Known, deviation: float, words: str):
+def test_the_reports_sentence_about_model_uncertainty_matches_its_maps(modelled: Known, deviation: float, words: str):
     cut = Cut(0, 1, np.full((3, 3), deviation), np.ones((3, 3)), np.zeros((3, 3)))
     assert words in told(modelled, [cut])["Where the model is unsure"]
 
 
-def test_an_environment_of_ones_own_gets_commands_that_run(modelled: Known):
+def test_the_report_of_an_own_environment_class_recommends_valid_commands(modelled: Known):
     spec = modelled.view.spec.model_copy(update={"success": None, "environment": "rail"})
     view = modelled.view.model_copy(update={"spec": spec, "environment": "rail"})
     bare = evaluation(success_rate=None, success_interval=None)
@@ -215,7 +217,7 @@ def test_an_environment_of_ones_own_gets_commands_that_run(modelled: Known):
     assert "--perturb" not in parts["What to do next"]
 
 
-def test_success_and_reality_are_explained_by_the_specification(modelled: Known):
+def test_the_report_explains_success_criteria_and_the_real_environment(modelled: Known):
     parts = told(replace(modelled, policy=policy(), real=evaluation()))
     assert "which is the simulator Pendulum-v1 here. No machine was used." in parts[""]
     assert "An episode succeeds if cos(theta) > 0.95 in each of its last 20 steps." in parts[""]
@@ -227,13 +229,13 @@ def test_success_and_reality_are_explained_by_the_specification(modelled: Known)
     )
 
 
-def test_a_video_is_inside_the_report(modelled: Known):
+def test_the_report_contains_the_evaluation_video(modelled: Known):
     known = replace(modelled, policy=policy(), real=evaluation(), video=("video/mp4", b"a video"))
     assert f'src="data:video/mp4;base64,{base64.b64encode(b"a video").decode()}"' in decision(known, [])
     assert "drawn from their states" in told(known)["What it gives"]
 
 
-def test_a_reference_controller_stands_beside_the_policy(modelled: Known):
+def test_the_report_shows_the_reference_controller_beside_the_policy(modelled: Known):
     other = evaluation(3, controller="reference", mean=-214.0, returns=[-150.0] * 60 + [-310.0] * 40)
     listed = policy(evaluations=[evaluation(), other])
     found = chosen_reference(listed, evaluation())
@@ -248,7 +250,7 @@ def test_a_reference_controller_stands_beside_the_policy(modelled: Known):
     assert "--reference" not in parts["What to do next"]
 
 
-def test_a_broken_promise_comes_first_in_the_next_steps(modelled: Known):
+def test_the_report_lists_a_missed_promise_first_among_the_next_steps(modelled: Known):
     worse = evaluation(mean=-250.0, mean_interval=wire.Interval(low=-260.0, high=-240.0), promise_kept=False)
     parts = told(replace(modelled, policy=policy(evaluations=[worse]), real=worse))
     assert "worse than predicted, by 80.2 beyond" in parts["Was it predicted?"]
@@ -256,7 +258,7 @@ def test_a_broken_promise_comes_first_in_the_next_steps(modelled: Known):
     assert "were not run without the controller" in parts["With and without the controller"]
 
 
-def test_a_policy_that_is_not_trusted_is_not_named_for_production(modelled: Known):
+def test_the_report_does_not_recommend_an_untrusted_policy_for_production(modelled: Known):
     """It earned what was promised, but the first next step says not to use it."""
     parts = told(replace(modelled, policy=policy(trusted=False, reason="the audit failed"), real=evaluation()))
     assert parts["What to do next"].startswith("Don't use it yet")
@@ -265,7 +267,7 @@ def test_a_policy_that_is_not_trusted_is_not_named_for_production(modelled: Know
 
 
 @pytest.mark.parametrize("tested", [True, False])
-def test_after_a_drift_the_only_step_is_to_begin_again(modelled: Known, tested: bool):
+def test_after_drift_the_report_only_recommends_starting_again(modelled: Known, tested: bool):
     """Real steps of the changed machine would be mixed with those of the old one."""
     drifted = policy(trusted=False, reason="since today, drift: speed is off", drifted_at=1.0)
     parts = told(replace(modelled, policy=drifted, real=evaluation() if tested else None))
@@ -274,7 +276,7 @@ def test_after_a_drift_the_only_step_is_to_begin_again(modelled: Known, tested: 
     assert "surrogym" not in parts["What to do next"]
 
 
-def test_without_a_policy_each_section_says_so_and_the_model_is_shown(modelled: Known):
+def test_the_report_without_a_policy_says_so_and_shows_the_model(modelled: Known):
     parts = told(modelled)
     assert parts[""] == "There is a model of pendulum from 6 real steps, and no controller yet."
     assert parts["What it gives"] == "There is no controller yet."
@@ -282,14 +284,14 @@ def test_without_a_policy_each_section_says_so_and_the_model_is_shown(modelled: 
     assert "typical error" in parts["Where the model is unsure"]
 
 
-def test_a_policy_without_real_episodes_says_how_to_get_some(modelled: Known):
+def test_the_report_of_an_unevaluated_policy_tells_how_to_evaluate(modelled: Known):
     parts = told(replace(modelled, policy=policy(evaluations=[], promise=None, trusted=None)))
     assert "has not been tested in the original environment" in parts[""]
     assert parts["Was it predicted?"] == "Nothing was predicted."
     assert "surrogym evaluate policy.zip --compare zero" in parts["What to do next"]
 
 
-def test_missing_traces_leave_the_numbers(modelled: Known):
+def test_the_report_shows_numbers_although_episode_traces_are_missing(modelled: Known):
     bare = evaluation(returns=[], lengths=[], traces=[], missing="gone")
     parts = told(replace(modelled, policy=policy(), real=bare, without=without(), missing=("the episodes are gone",)))
     assert "-143.2" in parts["What it gives"]
@@ -297,7 +299,7 @@ def test_missing_traces_leave_the_numbers(modelled: Known):
     assert parts["What could not be read"] == "the episodes are gone"
 
 
-def test_declared_starts_are_preferred_and_the_comparison_has_the_same(modelled: Known):
+def test_the_report_prefers_evaluations_from_declared_starts_with_equal_seeds(modelled: Known):
     wide = evaluation(5, declared=False, note="starts anywhere")
     other = without(first_seed=7)
     listed = policy(evaluations=[evaluation(1), without(), other, wide])
@@ -310,7 +312,7 @@ def test_declared_starts_are_preferred_and_the_comparison_has_the_same(modelled:
     assert chosen_without(listed, wide) is None
 
 
-def test_episodes_in_another_environment_are_listed_apart(modelled: Known):
+def test_the_report_lists_episodes_in_another_environment_separately(modelled: Known):
     heavy = {"own": False, "environment": "maglev:Heavy"}
     elsewhere, other = evaluation(8, mean=-3.7, **heavy), without(**heavy)
     listed = policy(evaluations=[evaluation(1), elsewhere, other])
@@ -324,17 +326,17 @@ def test_episodes_in_another_environment_are_listed_apart(modelled: Known):
     assert chosen_real(policy(evaluations=[elsewhere])) is None
 
 
-def test_starts_that_no_seed_repeats_are_not_compared() -> None:
+def test_the_report_does_not_compare_episodes_without_seeds() -> None:
     unseeded = [evaluation(1, seeded=False), without(seeded=False)]
     assert chosen_without(policy(evaluations=unseeded), unseeded[0]) is None
 
 
 @pytest.mark.parametrize(("value", "words"), [(1, "100 %"), (0.99999, "99.9 %"), (0.5, "50 %"), (0.0, "0 %")])
-def test_a_share_is_never_rounded_to_all(value: float, words: str):
+def test_a_percentage_in_the_report_is_never_rounded_up_to_100(value: float, words: str):
     assert share(value) == words
 
 
-def test_a_pdf_is_printed_where_chromium_is(monkeypatch: pytest.MonkeyPatch):
+def test_the_report_is_printed_as_pdf_if_chromium_is_installed(monkeypatch: pytest.MonkeyPatch):
     page = "<!doctype html><title>Report</title><p>words</p>"
     if shutil.which("chromium") is not None:
         assert as_pdf(page).startswith(b"%PDF-")

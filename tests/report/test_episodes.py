@@ -20,7 +20,7 @@ def trace(coordinates: list[list[float]]) -> EpisodeTrace:
 
 
 @pytest.mark.parametrize(("meet", "at"), [("start", 0), ("end", -1)])
-def test_angles_are_drawn_without_a_jump_and_meet_where_asked(meet: Meet, at: int):
+def test_episode_pictures_draw_angles_without_jumps(meet: Meet, at: int):
     figure = draw_episodes(pendulum(), [("one", trace(ONE)), ("other", trace(OTHER))], meet)
     drawn = [np.asarray(line.get_ydata()) for line in figure.axes[0].get_lines()]
     for values, given in zip(drawn, (ONE, OTHER), strict=True):
@@ -30,7 +30,7 @@ def test_angles_are_drawn_without_a_jump_and_meet_where_asked(meet: Meet, at: in
     assert abs(drawn[1][at] - drawn[0][at]) <= np.pi
 
 
-def test_traces_of_another_shape_are_left_out_and_said():
+def test_episode_traces_of_wrong_shape_are_left_out_and_reported():
     ragged = EpisodeTrace.model_construct(coordinates=[[0.0, 0.0], [0.0]], action=[[0.0]], reward=[0.0])
     wide = EpisodeTrace.model_construct(coordinates=[[0.0] * 3] * 2, action=[[0.0]], reward=[0.0])
     missing: list[str] = []

@@ -66,7 +66,7 @@ def text(known: Both) -> str:
     return page(*known)
 
 
-def test_it_says_what_is_known(known: Both, text: str) -> None:
+def test_the_report_contains_ledger_fidelity_samples_and_model_sections(known: Both, text: str) -> None:
     view, models = known[0].view, known[0].models
     read = Page(text)
     titles = [
@@ -88,7 +88,7 @@ def test_it_says_what_is_known(known: Both, text: str) -> None:
     assert not {"over_budget", "from_log"} & set(re.findall(r"\w+", " ".join(read.texts)))
 
 
-def test_scores_of_new_samples_have_a_table_where_there_are_any(known: Both, text: str) -> None:
+def test_the_report_has_a_table_of_prediction_scores_if_there_are_any(known: Both, text: str) -> None:
     title = "New samples, predicted before the model learned from them: shares in intervals, or within the tolerance"
     assert title not in Page(text).texts
     *before, model = known[0].models
@@ -101,7 +101,7 @@ def test_scores_of_new_samples_have_a_table_where_there_are_any(known: Both, tex
     assert {"17", "0.8125", "3.375"} <= set(read.texts)
 
 
-def test_the_encoding_of_angles_is_shown_only_where_there_are_angles(known: Both, text: str) -> None:
+def test_the_report_explains_angle_encoding_only_if_there_are_angles(known: Both, text: str) -> None:
     about, shown = known
     straight = tuple(one.model_copy(update={"kind": "linear"}) for one in about.view.spec.coordinates)
     view = about.view.model_copy(update={"spec": about.view.spec.model_copy(update={"coordinates": straight})})
@@ -110,7 +110,7 @@ def test_the_encoding_of_angles_is_shown_only_where_there_are_angles(known: Both
     assert not encoding.search(page(replace(about, view=view), shown))
 
 
-def test_it_loads_nothing_and_its_policy_lets_nothing_load(text: str) -> None:
+def test_the_report_loads_nothing_and_its_content_security_policy_forbids_it(text: str) -> None:
     read = Page(text)
     assert {tag for tag, _ in read.tags} & {"script", "link", "iframe", "object", "a"} == set()
     for _, attributes in read.tags:
@@ -123,7 +123,7 @@ def test_it_loads_nothing_and_its_policy_lets_nothing_load(text: str) -> None:
     assert policy == f"default-src 'none'; img-src data:; media-src data:; style-src 'sha256-{digest}'"
 
 
-def test_its_figures_are_whole_pictures_with_words_for_who_can_not_see_them(text: str) -> None:
+def test_figures_of_the_report_have_alternative_texts(text: str) -> None:
     images = Page(text).of("img")
     assert len(images) == 3
     for image in images:
@@ -133,11 +133,11 @@ def test_its_figures_are_whole_pictures_with_words_for_who_can_not_see_them(text
         assert re.findall(r"(?:href|src)=\"(?!#|data:image/png;)", drawn) == []
 
 
-def test_the_same_figure_is_the_same_text(known: Both) -> None:
+def test_drawing_a_report_figure_twice_gives_the_same_svg(known: Both) -> None:
     assert svg(draw_fidelity(known[0].models, 0.999)) == svg(draw_fidelity(known[0].models, 0.999))
 
 
-def test_a_map_equals_the_servers_answers_at_its_points(known: Both, pendulum_server: ServerProcess) -> None:
+def test_a_map_in_the_report_equals_the_servers_predictions(known: Both, pendulum_server: ServerProcess) -> None:
     (cut,) = known[-1]
     tolerances = np.array([output.tolerance for output in known[0].models[-1].fidelity.outputs])
     with Api(pendulum_server.url) as api:
@@ -147,7 +147,7 @@ def test_a_map_equals_the_servers_answers_at_its_points(known: Both, pendulum_se
     assert cut.log_index[0, -1] == pytest.approx(max(corner.log_uncertainty_index[0]))
 
 
-def test_foreign_text_stays_text(known: Both) -> None:
+def test_the_report_escapes_html_in_foreign_text(known: Both) -> None:
     hostile = "</td><script>alert(1)</script>"
     model = known[0].models[0].model_copy(update={"description": {"outputs": [{"name": hostile, hostile: [hostile]}]}})
     view = known[0].view.model_copy(update={"error": hostile, "environment": hostile})
@@ -156,14 +156,14 @@ def test_foreign_text_stays_text(known: Both) -> None:
     assert hostile in Page(text).texts
 
 
-def test_a_surrogate_without_samples_or_models_has_a_page(known: Both) -> None:
+def test_the_report_of_a_surrogate_without_samples_or_models_can_be_made(known: Both) -> None:
     view = known[0].view.model_copy(update={"confidence_index": None, "model_version": None, "fidelity": None})
     read = Page(page(Known(view, [], [], "here")))
     assert "no model yet, target 0.999" in read.texts
     assert read.of("img") == []
 
 
-def test_the_command_writes_it(pendulum_server: ServerProcess, tmp_path, monkeypatch, capsys) -> None:
+def test_the_report_command_writes_the_report(pendulum_server: ServerProcess, tmp_path, monkeypatch, capsys) -> None:
     from surrogym.cli import main
 
     monkeypatch.chdir(tmp_path)

@@ -45,7 +45,7 @@ def _no_delay(monkeypatch):
 
 
 @pytest.mark.parametrize("batch", [2, 4])
-def test_a_machine_that_is_off_ends_the_sampler_before_every_query_is_set_aside(api, line, batch):
+def test_the_sampler_stops_before_a_broken_environment_uses_up_every_query(api, line, batch):
     machine = Switched()
     settings = SamplerSettings(name="worker", until_done=True, batch=batch, time_limit=60.0)
     with pytest.raises(MachineFails, match=r"different queries in a row.*the bus is off; repair it"):
@@ -57,7 +57,7 @@ def test_a_machine_that_is_off_ends_the_sampler_before_every_query_is_set_aside(
     assert (report.answered, report.failed) == (6, 0)
 
 
-def test_a_design_that_a_machine_failed_continues_when_resumed(api, line, monkeypatch):
+def test_a_design_that_failed_by_its_environment_continues_when_resumed(api, line, monkeypatch):
     """Somebody started the sampler again and again beside the broken machine."""
     monkeypatch.setattr(limits, "FIRST_DELAY", 0.01)
     machine = Switched()
@@ -77,7 +77,7 @@ def test_a_design_that_a_machine_failed_continues_when_resumed(api, line, monkey
     assert (report.answered, report.phase in ("ready", "over_budget")) == (6, True)
 
 
-def test_a_machine_that_answers_in_between_is_never_taken_for_broken():
+def test_an_environment_that_answers_between_failures_is_not_taken_for_broken():
     failures = Failures()
     for query in range(100):
         failures.failed(query, "a wall")
@@ -86,14 +86,14 @@ def test_a_machine_that_answers_in_between_is_never_taken_for_broken():
         failures.answered()
 
 
-def test_one_query_alone_never_ends_the_sampler():
+def test_a_single_failing_query_never_stops_the_sampler():
     failures = Failures()
     for _ in range(10):
         failures.failed(1, "a wall")
         failures.check([1])
 
 
-def test_after_answers_the_sampler_waits_longer_and_longer_and_then_ends(monkeypatch):
+def test_on_repeated_failures_the_sampler_waits_longer_and_finally_stops(monkeypatch):
     monkeypatch.setattr(limits, "FIRST_DELAY", 1.0)
     failures = Failures()
     failures.failed(0, "a wall")
@@ -113,7 +113,7 @@ def test_after_answers_the_sampler_waits_longer_and_longer_and_then_ends(monkeyp
 
 
 @pytest.mark.parametrize("machine", [Careful, lambda: IsolatedEnvironment(Careful)], ids=["here", "isolated"])
-def test_a_refusal_is_no_attempt_and_leaves_the_budget(api, line, machine):
+def test_a_query_refused_by_the_environment_counts_as_no_attempt(api, line, machine):
     """The initial queries are spread over both sides. The design then asks on the other one."""
     told = []
     environment = machine()
@@ -127,7 +127,7 @@ def test_a_refusal_is_no_attempt_and_leaves_the_budget(api, line, machine):
     assert all(query.attempts == 1 for query in api.queries(line) if query.status == "refused")
 
 
-def test_a_design_whose_first_queries_are_all_refused_says_so(api, line):
+def test_a_design_whose_initial_queries_are_all_refused_reports_it(api, line):
     report = Sampler(api, line, Refusing(), UNTIL_DONE).run()
     view = api.surrogate(line)
     assert (report.phase, view.phase, report.failed, view.ledger.unresolved) == ("failed", "failed", 0, 0)

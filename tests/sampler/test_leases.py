@@ -63,13 +63,13 @@ def leases(server, clock):
     return leases
 
 
-def test_a_fresh_lease_costs_no_request(leases, server, clock):
+def test_a_step_under_a_fresh_lease_sends_no_renewal_request(leases, server, clock):
     clock.now += 0.8 * LEASE
     leases.check(QUERY)
     assert server.asked == 0
 
 
-def test_a_lease_that_is_nearly_over_is_renewed_before_the_step(leases, server, clock):
+def test_a_nearly_expired_lease_is_renewed_before_the_step(leases, server, clock):
     clock.now += 0.95 * LEASE
     leases.check(QUERY)
     clock.now += 0.8 * LEASE
@@ -77,7 +77,7 @@ def test_a_lease_that_is_nearly_over_is_renewed_before_the_step(leases, server, 
     assert server.asked == 1
 
 
-def test_a_lease_that_others_may_hold_allows_no_step(leases, server, clock):
+def test_no_real_step_is_taken_under_an_expired_lease(leases, server, clock):
     clock.now += 2 * LEASE
     server.error = ENDED
     for _ in range(2):
@@ -86,7 +86,7 @@ def test_a_lease_that_others_may_hold_allows_no_step(leases, server, clock):
     assert server.asked == 1
 
 
-def test_a_server_that_is_away_leaves_the_lease_its_time_and_no_more(leases, server, clock):
+def test_with_an_unreachable_server_steps_are_taken_only_until_the_lease_expires(leases, server, clock):
     server.error = ServerUnreachable("nobody answers")
     clock.now += 0.95 * LEASE
     leases.check(QUERY)
@@ -97,13 +97,13 @@ def test_a_server_that_is_away_leaves_the_lease_its_time_and_no_more(leases, ser
     leases.check(QUERY)
 
 
-def test_a_query_that_is_not_held_allows_no_step(leases):
+def test_no_real_step_is_taken_for_a_query_without_lease(leases):
     leases.release(QUERY)
     with pytest.raises(LeaseEnded):
         leases.check(QUERY)
 
 
 @pytest.mark.skipif(not hasattr(time, "CLOCK_BOOTTIME"), reason="this system has no clock that counts its sleep")
-def test_the_clock_counts_the_sleep_of_the_machine(monkeypatch):
+def test_the_lease_clock_includes_the_time_the_computer_sleeps(monkeypatch):
     monkeypatch.setattr(time, "clock_gettime", {time.CLOCK_BOOTTIME: 7.0}.__getitem__)
     assert seconds_awake_or_asleep() == 7.0

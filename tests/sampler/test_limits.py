@@ -70,7 +70,7 @@ def rollout(actions):
     return RolloutQuery(**LEASE, actions=actions)
 
 
-def test_a_server_that_gives_more_than_was_claimed_moves_nothing(server_process, line):
+def test_a_server_that_returns_more_queries_than_claimed_causes_no_real_step(server_process, line):
     machine = Machine()
     settings = SamplerSettings(max_queries=1, until_done=True, wait_seconds=5.0)
     with (
@@ -89,7 +89,7 @@ def test_a_server_that_gives_more_than_was_claimed_moves_nothing(server_process,
         ({"coordinates": [0.0, 0.0]}, "coordinates: expected 1 numbers, got 2"),
     ],
 )
-def test_a_query_beyond_the_environment_is_given_back_unbegun(server_process, line, change, why):
+def test_a_query_outside_the_environments_limits_is_refused_without_a_step(server_process, line, change, why):
     machine, told = Machine(), []
 
     def forge(query):
@@ -114,7 +114,7 @@ def test_repeatedly_refused_queries_are_reported_once(server_process, line):
     assert report.refused == len(told) == 2
 
 
-def test_the_time_limit_holds_between_the_queries_of_a_claim(server_process, line):
+def test_the_samplers_time_limit_is_checked_between_queries_of_a_claim(server_process, line):
     machine = Machine(seconds=1.0)
     with Api(server_process.url) as api:
         Sampler(api, line, machine, SamplerSettings(batch=6, wait_seconds=5.0, time_limit=0.5)).run()
@@ -123,7 +123,7 @@ def test_the_time_limit_holds_between_the_queries_of_a_claim(server_process, lin
     assert (view.ledger.total, view.ledger.unresolved, view.queries.pending) == (1, 0, 5)
 
 
-def test_a_bound_extends_the_sampling_range_and_float32_may_round():
+def test_queries_may_use_the_whole_bounds_up_to_float32_rounding():
     spec = SPEC.model_copy(update={"coordinates": WIDE})
     for x in (-1.0, -1.0 - 1e-7, 2.9, 3.0 + 2e-7):
         check_query(spec, step([x], [1.0 + 1e-7]))
@@ -139,7 +139,7 @@ def test_a_bound_extends_the_sampling_range_and_float32_may_round():
         (MultiDiscreteAction(nvec=(2, 3)), [1.0, 2.0], [[2.0, 0.0], [0.0], [0.0, 1.5]]),
     ],
 )
-def test_a_discrete_action_is_one_of_its_numbers(action, good, bad):
+def test_a_query_with_an_invalid_discrete_action_is_refused(action, good, bad):
     spec = SPEC.model_copy(update={"action": action})
     check_query(spec, step([0.0], good))
     for numbers in bad:
@@ -147,7 +147,7 @@ def test_a_discrete_action_is_one_of_its_numbers(action, good, bad):
             check_query(spec, step([0.0], numbers))
 
 
-def test_a_rollout_is_checked_whole_before_its_first_step():
+def test_all_actions_of_a_rollout_are_checked_before_its_first_step():
     check_query(RAIL, rollout([[1.0]] * 20))
     for actions, why in (([[1.0]] * 21, "1 to 20 actions, got 21"), ([], "got 0"), ([[0.0], [9.0]], "got 9")):
         with pytest.raises(QueryRefused, match=why):
@@ -156,7 +156,7 @@ def test_a_rollout_is_checked_whole_before_its_first_step():
         check_query(RAIL, step([0.0], [0.0]))
 
 
-def test_a_surrogate_sampled_beyond_the_environment_is_refused():
+def test_sampling_a_surrogate_with_wider_ranges_than_the_environment_is_refused():
     wide = SPEC.model_copy(update={"coordinates": (Coordinate(name="x", sampling=Uniform(low=-1, high=2)),)})
     with pytest.raises(UnknownEnvironment, match=r"expected coordinates from \[-1\] to \[1\], got \[-1\] to \[2\]"):
         check_environment("line", wide, SPEC)

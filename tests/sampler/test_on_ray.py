@@ -47,7 +47,7 @@ def plan(api: Api, line: str) -> SamplerPlan:
     return SamplerPlan(api.url, None, line, "support.moody:Unhurried", None, 30.0, settings)
 
 
-def test_samplers_share_a_design_and_one_that_is_killed_starts_again(cluster: None, api: Api, plan: SamplerPlan):
+def test_samplers_on_ray_share_a_design_and_restart_when_killed(cluster: None, api: Api, plan: SamplerPlan):
     """The design takes ten seconds of the other sampler, so it lasts until the killed one is back."""
     name = f"{plan.surrogate}-long"
     api.create_surrogate(name, SPEC.model_copy(update={"design": Design(initial=LONG, budget=LONG)}))
@@ -70,7 +70,7 @@ def test_samplers_share_a_design_and_one_that_is_killed_starts_again(cluster: No
     assert sum("was started again" in text for text in texts) == 1
 
 
-def test_ctrl_c_finishes_running_steps_and_leaves_no_lease(
+def test_ctrl_c_of_samplers_on_ray_finishes_running_steps_and_returns_leases(
     cluster: None, api: Api, plan: SamplerPlan, capfd: pytest.CaptureFixture[str]
 ):
     capfd.readouterr()
@@ -90,24 +90,24 @@ def test_ctrl_c_finishes_running_steps_and_leaves_no_lease(
     assert said[-1:] == ["waiting for the running steps of 1 samplers; Ctrl-C again ends them at once"]
 
 
-def test_a_sampler_whose_environment_fails_ends_with_its_error(plan: SamplerPlan):
+def test_a_sampler_on_ray_whose_environment_fails_ends_with_its_error(plan: SamplerPlan):
     ended = SamplerActor(replace(plan, environment="support.moody:Nobody")).run()
     assert "expected package.module:factory, got 'support.moody:Nobody'" in str(ended.error)
     assert ended.look.report.steps == 0
 
 
-def test_a_module_that_a_machine_lacks_comes_with_the_option_that_brings_it(plan: SamplerPlan):
+def test_the_error_for_a_module_missing_on_a_ray_machine_names_the_option(plan: SamplerPlan):
     ended = SamplerActor(replace(plan, environment="no_such_module:Cart")).run()
     assert "No module named 'no_such_module'; " in str(ended.error)
     assert "--runtime-env FILE, a YAML file with working_dir: ." in str(ended.error)
 
 
-def test_a_machine_with_another_version_takes_no_step(plan: SamplerPlan):
+def test_a_ray_machine_with_another_package_version_takes_no_real_step(plan: SamplerPlan):
     ended = SamplerActor(replace(plan, version="0.0.1")).run()
     assert str(ended.error).startswith("expected surrogym 0.0.1 on every machine of the cluster, got ")
 
 
-def test_samplers_that_find_no_room_are_mentioned_and_the_time_limit_ends_them(
+def test_samplers_waiting_for_ray_resources_are_reported_and_end_at_the_time_limit(
     cluster: None, plan: SamplerPlan, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ):
     monkeypatch.setattr("surrogym.cli.sampling_on_ray.ROOM_SECONDS", 0.5)
@@ -120,9 +120,7 @@ def test_samplers_that_find_no_room_are_mentioned_and_the_time_limit_ends_them(
     assert capfd.readouterr().out == ""  # it may be read as JSON
 
 
-def test_without_a_free_cpu_a_way_out_is_named_and_ctrl_c_speaks_of_no_running_step(
-    cluster: None, plan: SamplerPlan, monkeypatch: pytest.MonkeyPatch
-):
+def test_without_a_free_ray_cpu_a_remedy_is_shown(cluster: None, plan: SamplerPlan, monkeypatch: pytest.MonkeyPatch):
     """Session hosts may have taken all CPUs of a small machine."""
     monkeypatch.setattr("surrogym.cli.sampling_on_ray.ROOM_SECONDS", 0.5)
     samplers, said = RaySamplers(plan, 1, {"CPU": 3.0}), []

@@ -59,7 +59,7 @@ class Watched(Api):
         return super().add_samples(*args, **options)
 
 
-def test_a_step_begins_before_the_answer_before_it_is_acknowledged(server_process, line):
+def test_a_real_step_starts_while_the_previous_sample_is_being_sent(server_process, line):
     """The first answer shows that the server accepts answers, so only later ones overlap with steps."""
     machine = Noting()
     with Watched(server_process.url, lambda number: number == 1 or awaited(machine.begun[min(number + 1, 6)])) as api:
@@ -67,7 +67,7 @@ def test_a_step_begins_before_the_answer_before_it_is_acknowledged(server_proces
         assert (report.answered, report.failed, api.surrogate(line).ledger.total) == (6, 0, 6)
 
 
-def test_no_third_step_begins_while_an_answer_waits(server_process, line):
+def test_at_most_one_real_step_starts_before_the_previous_sample_is_acknowledged(server_process, line):
     machine, held = Noting(), threading.Event()
 
     def before(number: int) -> None:
@@ -92,7 +92,7 @@ class InTurns(Pipeline):
 
 
 @pytest.mark.parametrize("batch", [1, 4])
-def test_real_steps_are_those_of_a_sampler_without_a_pipeline(api, monkeypatch, batch):
+def test_a_pipelined_sampler_takes_the_same_real_steps_as_a_sequential_one(api, monkeypatch, batch):
     taken = []
     design = SPEC.design.model_copy(update={"initial": 5, "budget": 9})
     spec = SPEC.model_copy(update={"design": design, "tolerances": {"x": 1e-9, "reward": 1e-9}})
@@ -109,14 +109,14 @@ def test_real_steps_are_those_of_a_sampler_without_a_pipeline(api, monkeypatch, 
     assert taken[0] == taken[1]
 
 
-def test_a_limit_of_queries_counts_those_under_way(server_process, line):
+def test_the_samplers_query_limit_counts_queries_in_progress(server_process, line):
     with Api(server_process.url) as api:
         report = Sampler(api, line, Noting(), SamplerSettings(batch=1, max_queries=4, wait_seconds=5.0)).run()
         view = api.surrogate(line)
     assert (report.answered, view.queries.pending, view.queries.leased) == (4, 2, 0)
 
 
-def test_a_query_claimed_ahead_goes_to_others_if_the_step_takes_longer(server_process, line, monkeypatch):
+def test_a_query_claimed_ahead_is_released_if_the_current_step_takes_long(server_process, line, monkeypatch):
     monkeypatch.setattr(pipeline, "HELD_SECONDS", 0.0)
     with Watched(server_process.url) as api:
 
@@ -136,7 +136,7 @@ def test_a_query_claimed_ahead_goes_to_others_if_the_step_takes_longer(server_pr
 
 
 @pytest.mark.parametrize("error", [None, KeyboardInterrupt])
-def test_a_stopped_sampler_gives_back_what_it_claimed_ahead_and_loses_no_answer(server_process, line, error):
+def test_a_stopped_sampler_returns_queries_claimed_ahead_and_loses_no_sample(server_process, line, error):
     with Watched(server_process.url) as api:
 
         def stop() -> None:
@@ -158,7 +158,7 @@ def test_a_stopped_sampler_gives_back_what_it_claimed_ahead_and_loses_no_answer(
     assert view.ledger.unresolved == 3 - done, "only the interrupted step may have moved the robot"
 
 
-def test_a_refused_answer_fails_its_query_and_at_most_one_step_follows(server_process, line):
+def test_a_sample_refused_by_the_server_fails_its_query(server_process, line):
     def before(number: int) -> None:
         if number == 2:
             awaited(machine.begun[3])
@@ -182,7 +182,7 @@ def flowing(settled: list[int], given_back: list[ClaimedQueries]) -> Pipeline[in
     return made
 
 
-def test_an_answer_that_can_not_be_sent_is_raised_once():
+def test_the_error_of_a_sample_that_cannot_be_sent_is_raised_once():
     def away() -> int:
         raise ServerUnreachable("nobody answers")
 
@@ -195,7 +195,7 @@ def test_an_answer_that_can_not_be_sent_is_raised_once():
     assert settled == [0]
 
 
-def test_a_step_that_ends_early_claims_nothing_ahead():
+def test_a_real_step_that_ends_early_claims_no_query_ahead():
     made = flowing([], [])
     made._step_seconds = 3_600.0
 

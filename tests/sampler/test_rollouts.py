@@ -54,7 +54,7 @@ def asked(api, rail):
     return rail
 
 
-def test_a_design_is_answered_by_resetting_and_acting(api, rail):
+def test_a_rollout_design_is_answered_by_resets_and_actions(api, rail):
     with IsolatedEnvironment(Rail) as environment:
         report = Sampler(api, rail, environment, SamplerSettings(until_done=True, time_limit=90.0)).run()
     view, samples = api.surrogate(rail), list(api.samples(rail))
@@ -71,7 +71,7 @@ def test_a_design_is_answered_by_resetting_and_acting(api, rail):
         assert all(before.next_coordinates == after.coordinates for before, after in pairwise(steps))
 
 
-def test_an_episode_that_ends_early_gives_the_rest_of_its_steps_back(api, rail):
+def test_a_rollout_that_terminates_early_returns_its_unused_budget(api, rail):
     api.add_queries(rail, rollouts=[[RIGHT] * 20])
     Sampler(api, rail, Rail(), SamplerSettings(max_queries=4, wait_seconds=5.0, time_limit=60.0)).run()
     last = list(api.samples(rail))[-1]
@@ -80,7 +80,7 @@ def test_an_episode_that_ends_early_gives_the_rest_of_its_steps_back(api, rail):
     assert api.surrogate(rail).ledger.manual == last.step + 1
 
 
-def test_a_failure_in_the_middle_leaves_the_steps_before_it_as_the_answer(api, asked):
+def test_a_rollout_that_fails_midway_submits_the_steps_before_the_failure(api, asked):
     told = []
     report = Sampler(api, asked, RaisesRight(), ONE, lambda *seen: told.append(seen)).run()
     assert (report.answered, report.failed, report.steps) == (1, 0, 2)
@@ -89,13 +89,13 @@ def test_a_failure_in_the_middle_leaves_the_steps_before_it_as_the_answer(api, a
     assert api.surrogate(asked).ledger.manual == 2
 
 
-def test_a_hang_in_the_middle_is_killed_and_the_steps_before_it_are_the_answer(api, asked):
+def test_a_rollout_that_hangs_midway_is_killed_and_submits_earlier_steps(api, asked):
     with IsolatedEnvironment(HangsRight, step_limit=0.5) as environment:
         assert Sampler(api, asked, environment, ONE).run().steps == 2
     assert api.surrogate(asked).ledger.manual == 2
 
 
-def test_a_failure_at_the_first_step_fails_the_query(api, asked):
+def test_a_rollout_that_fails_at_the_first_step_fails_its_query(api, asked):
     api.add_queries(asked, rollouts=[[RIGHT, LEFT]])
     settings = SamplerSettings(name="worker", max_queries=2, batch=1, wait_seconds=5.0)
     report = Sampler(api, asked, RaisesRight(), settings).run()
@@ -126,7 +126,7 @@ def test_an_interrupted_rollout_submits_its_finished_steps(api, asked):
     assert api.queries(asked)[-1].status == "answered"
 
 
-def test_a_sampler_killed_in_a_rollout_may_have_taken_all_its_steps_and_the_next_takes_them(api, server_process, asked):
+def test_the_rollout_of_a_killed_sampler_counts_fully_and_is_repeated_by_the_next(api, server_process, asked):
     command = [sys.executable, "-c", KILLED, server_process.url, asked]
     paths = os.pathsep.join(path for path in sys.path if path)
     with subprocess.Popen(command, env={**os.environ, "PYTHONPATH": paths}) as killed:
@@ -142,9 +142,7 @@ def test_a_sampler_killed_in_a_rollout_may_have_taken_all_its_steps_and_the_next
     assert {(s.sampler, s.attempt, s.late) for s in samples} == {("next", 2, False)}
 
 
-def test_a_sampler_that_sleeps_beyond_its_lease_in_a_rollout_stops_there_and_hands_in_what_it_took(
-    api, server_process, asked
-):
+def test_a_sampler_asleep_beyond_its_lease_stops_its_rollout_and_submits_its_steps(api, server_process, asked):
     command = [sys.executable, "-c", KILLED, server_process.url, asked]
     paths = os.pathsep.join(path for path in sys.path if path)
     with subprocess.Popen(command, env={**os.environ, "PYTHONPATH": paths}) as slept:
@@ -168,7 +166,7 @@ def _until(happened):
         time.sleep(0.05)
 
 
-def test_a_trajectory_with_a_jump_or_steps_after_an_end_is_refused(api, asked):
+def test_a_rollout_with_a_jump_or_steps_after_termination_is_refused(api, asked):
     [query] = api.claim(asked, "worker", max_queries=1).queries
     values = {"query_id": query.id, "lease_token": query.lease_token, "action": LEFT, "reward": 0.0}
 
@@ -185,7 +183,7 @@ def test_a_trajectory_with_a_jump_or_steps_after_an_end_is_refused(api, asked):
     assert len(api.add_samples(asked, "worker", [step(0, 0.0, 0.1), step(1, 0.1, 0.2)]).sample_ids) == 2
 
 
-def test_a_query_of_the_wrong_kind_or_too_long_is_refused(api, rail):
+def test_a_rollout_query_of_wrong_kind_or_length_is_refused(api, rail):
     with pytest.raises(InvalidInput, match="can't be set to a state"):
         api.add_queries(rail, [[0.0]], [[0.0]])
     with pytest.raises(InvalidInput, match="at most 20 actions, got 21"):
@@ -201,14 +199,14 @@ def test_an_environment_that_answers_another_kind_of_query_is_refused(api, rail)
         Sampler(api, rail, Line()).run()
 
 
-def test_starts_differ_between_attempts_queries_and_designs_and_are_the_same_again(api, rail):
+def test_rollout_reset_seeds_depend_on_query_and_design_and_are_reproducible(api, rail):
     queries = api.claim(rail, "worker", max_queries=3).queries
     seeds = {reset_seed(query, design) for query in queries for design in (0, 1)}
     assert len(seeds) == 2 * len(queries)
     assert reset_seed(queries[0], 0) == reset_seed(queries[0].model_copy(update={"lease_token": "other"}), 0)
 
 
-def test_a_design_does_not_depend_on_other_requests(api):
+def test_two_equal_rollout_designs_take_the_same_real_steps(api):
     taken = []
     for number in range(2):
         name = f"rail-{uuid.uuid4().hex[:8]}"
@@ -221,7 +219,7 @@ def test_a_design_does_not_depend_on_other_requests(api):
     assert taken[0] == taken[1]
 
 
-def test_classic_control_without_teleport_is_learned_from_resets(api):
+def test_classic_control_tasks_are_learned_from_rollouts_only(api):
     name = f"pendulum-{uuid.uuid4().hex[:8]}"
     environment = original.make("Pendulum-v1", access="reset", budget=24, seed=1)
     api.create_surrogate(name, environment.spec())

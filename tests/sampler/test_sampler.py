@@ -20,7 +20,7 @@ from surrogym_shared.spec import BoxAction
 ONE_ROUND = SamplerSettings(name="worker", max_queries=6, wait_seconds=5.0, time_limit=60.0)
 
 
-def test_every_query_is_answered_and_the_worker_stops_when_the_design_is_done(api, line):
+def test_the_sampler_answers_every_query_and_stops_when_the_design_is_done(api, line):
     told, ended = [], []
     settings = SamplerSettings(until_done=True, time_limit=90.0)
     report = Sampler(api, line, Line(), settings, lambda *seen: told.append(seen), ended.append).run()
@@ -55,7 +55,7 @@ class StorageAway(Api):
         return super().add_samples(name, sampler, samples, **options)
 
 
-def test_a_storage_that_is_away_is_waited_for_and_no_step_is_taken_twice(server_process, line):
+def test_the_sampler_waits_for_an_unavailable_storage_without_repeating_steps(server_process, line):
     with StorageAway(server_process.url) as api:
         report = Sampler(api, line, Line(), ONE_ROUND).run()
         assert len(api.refused) == 7
@@ -96,13 +96,13 @@ def stopped(api: Away, line: str) -> tuple[list[SamplerReport], list[Exception]]
     return reports, errors
 
 
-def test_a_server_that_is_away_keeps_no_stopped_worker_waiting(server_process, line):
+def test_a_stopped_sampler_does_not_wait_for_an_unreachable_server(server_process, line):
     with Away(server_process.url, "claim") as api:
         [report], errors = stopped(api, line)
     assert (report.answered, errors) == (0, [])
 
 
-def test_a_real_step_that_can_not_be_submitted_is_reported(server_process, line, monkeypatch):
+def test_the_sampler_reports_a_real_step_it_cannot_submit(server_process, line, monkeypatch):
     monkeypatch.setattr("surrogym_sampler.queries.worker.LAST_SECONDS", 0.2)
     with Away(server_process.url, "add_samples") as api:
         reports, [error] = stopped(api, line)
@@ -110,13 +110,13 @@ def test_a_real_step_that_can_not_be_submitted_is_reported(server_process, line,
     assert "nobody answers" in str(error)
 
 
-def test_once_stops_after_the_first_claim(api, line):
+def test_the_option_once_stops_the_sampler_after_one_claim(api, line):
     report = Sampler(api, line, Line(), SamplerSettings(once=True, batch=2, wait_seconds=5.0)).run()
     assert report.answered == 2
     assert api.surrogate(line).queries.pending == 4
 
 
-def test_an_environment_that_raises_fails_the_query_with_its_error(api, line):
+def test_an_exception_in_the_environment_fails_the_query_with_its_error(api, line):
     report = Sampler(api, line, RaisesLeft(), ONE_ROUND).run()
     assert report.answered + report.failed == 6
     assert report.failed > 0
@@ -125,7 +125,7 @@ def test_an_environment_that_raises_fails_the_query_with_its_error(api, line):
     assert all("there is a wall on the left" in error for error in errors)
 
 
-def test_a_hanging_environment_is_killed_and_the_worker_continues(api, line):
+def test_a_hanging_environment_is_killed_and_the_sampler_continues(api, line):
     settings = SamplerSettings(name="worker", batch=6, max_queries=6, wait_seconds=5.0)
     with IsolatedEnvironment(HangsLeft, step_limit=0.5) as environment:
         report = Sampler(api, line, environment, settings).run()
@@ -144,7 +144,7 @@ def test_a_step_of_the_wrong_shape_fails_the_query(api, line):
     assert "expected the shape (1,) for next_coordinates of a real step, got (2,)" in failed
 
 
-def test_a_lease_shorter_than_the_step_is_kept_alive(api, line):
+def test_the_sampler_renews_a_lease_shorter_than_the_step(api, line):
     settings = SamplerSettings(name="slow", batch=1, once=True, lease_seconds=0.9, wait_seconds=5.0)
     Sampler(api, line, Slow(), settings).run()
     (sample,) = api.samples(line)
@@ -152,7 +152,7 @@ def test_a_lease_shorter_than_the_step_is_kept_alive(api, line):
     assert sample.attempt == 1
 
 
-def test_stop_ends_the_worker_and_gives_back_what_it_holds(api, line):
+def test_a_stopped_sampler_returns_its_leased_queries(api, line):
     settings = SamplerSettings(batch=6, wait_seconds=5.0)
     sampler = Sampler(api, line, Line(), settings, lambda *_: sampler.stop())
     report = sampler.run()
@@ -175,7 +175,7 @@ class Interrupted(Line):
         return super().step_from(coordinates, action)
 
 
-def test_an_interrupted_step_may_have_been_taken_and_those_behind_it_were_not(api, line):
+def test_an_interrupted_step_counts_as_unresolved_and_later_queries_are_returned(api, line):
     with pytest.raises(KeyboardInterrupt):
         Sampler(api, line, Interrupted(), SamplerSettings(batch=6, wait_seconds=5.0)).run()
     view = api.surrogate(line)
@@ -183,7 +183,7 @@ def test_an_interrupted_step_may_have_been_taken_and_those_behind_it_were_not(ap
     assert (view.queries.leased, view.queries.pending) == (0, 5)
 
 
-def test_two_workers_share_the_queries(api, line):
+def test_two_samplers_share_the_queries(api, line):
     settings = [SamplerSettings(name=name, batch=1, until_done=True, time_limit=90.0) for name in ("first", "second")]
     threads = [threading.Thread(target=Sampler(api, line, Line(), s).run) for s in settings]
     for thread in threads:
@@ -193,19 +193,19 @@ def test_two_workers_share_the_queries(api, line):
     assert api.surrogate(line).ledger.total == 6
 
 
-def test_another_environment_than_the_surrogates_is_refused(api, line):
+def test_sampling_with_another_environment_than_the_surrogates_is_refused(api, line):
     with pytest.raises(UnknownEnvironment, match=r"expected coordinates \(x\)"):
         Sampler(api, line, original.make("Pendulum-v1")).run()
 
 
-def test_a_factory_that_fails_ends_the_worker_at_once(api, line):
+def test_a_failing_environment_factory_ends_the_sampler_at_once(api, line):
     environment = IsolatedEnvironment(partial(original.make, "Nowhere-v1"))
     with pytest.raises(UnknownEnvironment, match="Nowhere-v1 can't be made"):
         Sampler(api, line, environment).run()
     assert api.surrogate(line).queries.leased == 0
 
 
-def test_an_unknown_surrogate_and_a_missing_server_are_reported(server_process):
+def test_the_sampler_reports_an_unknown_surrogate_or_unreachable_server(server_process):
     with Api(server_process.url) as api, pytest.raises(UnknownSurrogate):
         Sampler(api, "nobody", Line()).run()
     with Api("http://127.0.0.1:9", retries=Retries(seconds=0)) as api, pytest.raises(ServerUnreachable):
@@ -219,7 +219,7 @@ class Careful(Line):
         return SPEC.model_copy(update={"action": BoxAction(low=(-0.5,), high=(1.0,))})
 
 
-def test_actions_that_the_environment_does_not_allow_are_refused_before_a_step(api, line):
+def test_a_surrogate_with_actions_the_environment_forbids_is_refused_before_a_step(api, line):
     with pytest.raises(UnknownEnvironment, match=r"expected actions from \[-0.5\] to \[1\], got \[-1\] to \[1\]"):
         Sampler(api, line, Careful()).run()
     assert api.surrogate(line).queries.leased == 0

@@ -85,7 +85,7 @@ def sample(api, rail, folder, told=None, environment=SavedRail, **settings):
     return Sampler(api, rail, environment(), chosen, report).run()
 
 
-def test_a_design_returns_to_saved_states_after_a_restart_and_past_damage(api, rail, tmp_path):
+def test_a_design_uses_saved_snapshots_after_a_sampler_restart_and_damage(api, rail, tmp_path):
     """The first sampler answers the initial queries. Then one of its snapshots is damaged and one is lost."""
     told: list = []
     sample(api, rail, tmp_path, once=True)
@@ -108,7 +108,7 @@ def test_a_design_returns_to_saved_states_after_a_restart_and_past_damage(api, r
     assert {query.id for query, outcome, _ in told if outcome == "answered"} >= {query.id for query in returned}
 
 
-def test_a_query_whose_snapshot_no_longer_loads_is_chosen_anew(api, rail, tmp_path):
+def test_a_query_whose_snapshot_cannot_be_loaded_is_replaced(api, rail, tmp_path):
     class OtherVersion(SavedRail):
         def restore(self, snapshot):
             raise ValueError("made by another version")
@@ -132,7 +132,7 @@ def test_a_query_whose_snapshot_no_longer_loads_is_chosen_anew(api, rail, tmp_pa
         StepTimedOut("restore took longer than 30 s and was killed"),
     ],
 )
-def test_a_snapshot_at_which_the_environment_dies_or_hangs_is_gone_if_it_can_be_reset(tmp_path, fault):
+def test_a_snapshot_at_which_the_environment_dies_or_hangs_is_dropped(tmp_path, fault):
     class Dies(SavedRail):
         asked = 0
 
@@ -154,7 +154,7 @@ def test_a_snapshot_at_which_the_environment_dies_or_hangs_is_gone_if_it_can_be_
         assert (returning.gone, folder.names()) == (([name], []) if gone else ([], [name]))
 
 
-def test_a_snapshot_stays_if_the_environment_is_broken(tmp_path):
+def test_no_snapshot_is_dropped_if_the_environment_itself_is_broken(tmp_path):
     class Broken(SavedRail):
         def restore(self, snapshot):
             raise EnvironmentDied("the program could not be started anew: no licence")
@@ -170,7 +170,7 @@ def test_a_snapshot_stays_if_the_environment_is_broken(tmp_path):
     assert (returning.gone, list(folder.names())) == ([], [name])
 
 
-def test_a_folder_keeps_states_for_the_next_sampler(tmp_path):
+def test_a_snapshot_folder_keeps_states_for_the_next_sampler(tmp_path):
     name, dropped = SnapshotFolder(tmp_path, SAVED).add(b"state", [0.5])
     again = SnapshotFolder(tmp_path, SAVED)
     assert (again.names(), again.read(name), dropped) == ([name], ((0.5,), b"state"), [])
@@ -185,7 +185,7 @@ def test_a_folder_keeps_states_for_the_next_sampler(tmp_path):
         (lambda file: file.write_bytes(file.read_bytes().replace(b'"form": 1', b'"form": 2')), "in form 2"),
     ],
 )
-def test_a_snapshot_that_is_not_as_written_is_gone(tmp_path, change, message):
+def test_a_modified_snapshot_file_is_treated_as_lost(tmp_path, change, message):
     folder = SnapshotFolder(tmp_path, SAVED)
     name, _ = folder.add(b"state", [0.5])
     change(tmp_path / f"{name}.snapshot")
@@ -193,7 +193,7 @@ def test_a_snapshot_that_is_not_as_written_is_gone(tmp_path, change, message):
         folder.read(name)
 
 
-def test_a_full_folder_drops_one_of_the_nearest_and_never_the_newest(tmp_path):
+def test_a_full_snapshot_folder_drops_one_of_the_nearest_states_but_not_the_newest(tmp_path):
     folder = SnapshotFolder(tmp_path, SAVED, Bounds(count=3))
     names = [folder.add(b"", [x])[0] for x in (-0.9, 0.0, 0.8)]
     newest, dropped = folder.add(b"", [0.05])
@@ -201,7 +201,7 @@ def test_a_full_folder_drops_one_of_the_nearest_and_never_the_newest(tmp_path):
     assert set(folder.names()) == {names[0], names[2], newest}
 
 
-def test_a_folder_holds_no_more_bytes_than_it_may(tmp_path):
+def test_a_snapshot_folder_never_exceeds_its_size_limit(tmp_path):
     folder = SnapshotFolder(tmp_path, SAVED, Bounds(size=2_000))
     for x in np.linspace(-1, 1, 9):
         folder.add(bytes(400), [float(x)])
@@ -209,7 +209,7 @@ def test_a_folder_holds_no_more_bytes_than_it_may(tmp_path):
     assert 400 < sum(sizes) <= 2_000
 
 
-def test_the_older_one_of_the_nearest_two_is_least_useful():
+def test_of_the_two_nearest_snapshots_the_older_is_dropped():
     assert least_useful(np.array([[0.0], [1.0], [1.1], [5.0]]), keep=3) == 1
     assert least_useful(np.array([[0.0], [1.0], [1.1], [5.0]]), keep=1) == 2
 
@@ -223,7 +223,7 @@ def test_the_older_one_of_the_nearest_two_is_least_useful():
         (ReturnsElsewhere, "restore leads to another state than was saved"),
     ],
 )
-def test_what_costs_no_step_is_told_once(api, rail, tmp_path, environment, sentence):
+def test_a_snapshot_problem_that_costs_no_real_step_is_reported_once(api, rail, tmp_path, environment, sentence):
     told: list = []
     report = sample(api, rail, tmp_path, told, environment, bounds=Bounds(size=4_000), until_done=True)
     errors = [error for _, outcome, error in told if outcome == "answered" and error]
@@ -235,7 +235,7 @@ def test_what_costs_no_step_is_told_once(api, rail, tmp_path, environment, sente
     assert view.phase in ("ready", "over_budget")
 
 
-def test_a_save_that_hangs_ends_its_rollout_and_then_all_saving(api, rail, tmp_path):
+def test_a_hanging_snapshot_save_ends_its_rollout_and_stops_further_saving(api, rail, tmp_path):
     """No step may follow in the same query: it would begin elsewhere, and the server would refuse the whole answer."""
     told: list = []
     report = sample(api, rail, tmp_path, told, HangsInSave, until_done=True)
@@ -246,7 +246,7 @@ def test_a_save_that_hangs_ends_its_rollout_and_then_all_saving(api, rail, tmp_p
     assert (report.steps, view.ledger.unresolved) == (view.ledger.total, 0)
 
 
-def test_a_return_to_nowhere_costs_no_step(api, rail, tmp_path):
+def test_restoring_a_snapshot_to_nan_coordinates_costs_no_real_step(api, rail, tmp_path):
     told: list = []
     sample(api, rail, tmp_path, told, ReturnsNowhere, until_done=True)
     errors = [error for _, outcome, error in told if outcome == "impossible"]
@@ -255,7 +255,7 @@ def test_a_return_to_nowhere_costs_no_step(api, rail, tmp_path):
     assert api.surrogate(rail).ledger.unresolved == 0
 
 
-def test_samplers_share_a_full_folder(tmp_path):
+def test_samplers_can_share_a_full_snapshot_folder(tmp_path):
     """Each drops the newest files of the other at any moment."""
     spawn = multiprocessing.get_context("spawn")
     both = [spawn.Process(target=fill, args=(tmp_path, SAVED, seed)) for seed in range(2)]
@@ -267,7 +267,7 @@ def test_samplers_share_a_full_folder(tmp_path):
     assert {file.suffix for file in tmp_path.iterdir()} == {".snapshot"}
 
 
-def test_a_snapshot_that_another_sampler_dropped_before_its_sample_was_sent_is_reported(tmp_path):
+def test_a_snapshot_dropped_by_another_sampler_before_its_sample_was_sent_is_reported(tmp_path):
     folder = SnapshotFolder(tmp_path, SAVED)
     returning = Returning(SavedRail(), SAVED, folder)
     names = [folder.add(b"", [x])[0] for x in (0.1, 0.2)]
@@ -276,7 +276,7 @@ def test_a_snapshot_that_another_sampler_dropped_before_its_sample_was_sent_is_r
     assert returning.gone == [names[0]]
 
 
-def test_what_the_server_does_not_know_is_dropped_first(tmp_path):
+def test_snapshots_unknown_to_the_server_are_dropped_first(tmp_path):
     """A killed sampler did not send its sample, or the surrogate was deleted and made again."""
     folder = SnapshotFolder(tmp_path, SAVED, Bounds(count=3))
     names = [folder.add(b"", [x])[0] for x in (0.0, 0.01, 0.9)]
@@ -284,7 +284,7 @@ def test_what_the_server_does_not_know_is_dropped_first(tmp_path):
     assert folder.add(b"", [-0.9])[1] == [names[2]]
 
 
-def test_what_a_killed_sampler_left_unfinished_is_removed_once_nobody_writes_it(tmp_path):
+def test_unfinished_snapshot_files_of_a_killed_sampler_are_removed(tmp_path):
     old, new = (tmp_path / f"{name}.part" for name in ("old", "new"))
     for path in (old, new):
         path.write_bytes(b"{")
@@ -293,7 +293,7 @@ def test_what_a_killed_sampler_left_unfinished_is_removed_once_nobody_writes_it(
     assert [path.exists() for path in (old, new)] == [False, True]
 
 
-def test_a_state_that_can_not_be_written_leaves_the_others_alone(tmp_path):
+def test_a_snapshot_that_cannot_be_written_leaves_the_others_unchanged(tmp_path):
     resource = pytest.importorskip("resource")
     folder = SnapshotFolder(tmp_path, SAVED, Bounds(size=1_000_000))
     name, _ = folder.add(b"state", [0.5])
@@ -309,7 +309,7 @@ def test_a_state_that_can_not_be_written_leaves_the_others_alone(tmp_path):
     assert [file.name for file in tmp_path.iterdir()] == [f"{name}.snapshot"]
 
 
-def test_a_folder_that_is_a_file_is_refused(tmp_path):
+def test_a_snapshot_folder_that_is_a_file_is_refused(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(
         UnusableFolder, match=r"expected a folder for snapshots that can be written to, got .*/file/rail"
@@ -317,7 +317,7 @@ def test_a_folder_that_is_a_file_is_refused(tmp_path):
         SnapshotFolder(tmp_path / "file" / "rail", SAVED)
 
 
-def test_a_full_folder_leaves_no_snapshot_known_without_its_file(api, rail, tmp_path):
+def test_the_server_lists_no_snapshot_whose_file_was_dropped_from_a_full_folder(api, rail, tmp_path):
     """Snapshots are dropped while the samples of others, and their own, are on the way to the server."""
     report = sample(api, rail, tmp_path, bounds=Bounds(count=2), until_done=True)
     files = {file.stem for file in (tmp_path / rail).iterdir()}

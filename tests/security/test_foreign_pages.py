@@ -103,7 +103,7 @@ def changing(openapi: dict[str, Any]) -> list[tuple[str, str]]:
     ]
 
 
-def test_no_route_that_changes_something_takes_it_from_a_foreign_page(server: ServerProcess, foreign_page: Page):
+def test_every_changing_route_refuses_requests_from_a_foreign_web_page(server: ServerProcess, foreign_page: Page):
     with httpx.Client(base_url=server.url, timeout=60) as client:
         client.post(PATH, json={"name": "pendulum", "spec": pendulum.spec()}).raise_for_status()
         routes = changing(client.get("/openapi.json").json())
@@ -121,7 +121,7 @@ def test_no_route_that_changes_something_takes_it_from_a_foreign_page(server: Se
     assert sum(posted.values()) >= 4 * len(routes), "each was sent, and refused"
 
 
-def test_a_foreign_page_gets_no_stream(server: ServerProcess, foreign_page: Page):
+def test_a_foreign_web_page_cannot_open_a_stream(server: ServerProcess, foreign_page: Page):
     url = server.url.replace("http", "ws", 1)
     assert foreign_page.evaluate(STREAM, [f"{url}/v1/sessions/none/stream"]) == "refused"
     assert until(lambda: "/v1/sessions/none/stream -> 403" in server.log), "its line may come after the refusal"
@@ -132,7 +132,7 @@ def sent(url: str, **headers: str) -> int:
     return httpx.post(f"{url}{PATH}", json={}, headers=named, timeout=60).status_code
 
 
-def test_an_own_page_and_a_program_may(server: ServerProcess):
+def test_the_servers_own_page_and_programs_can_send_changing_requests(server: ServerProcess):
     assert sent(server.url) == 422
     assert sent(server.url, origin=server.url, sec_fetch_site="same-origin") == 422
     for foreign in ("http://127.0.0.1:1", "https" + server.url[4:], "null", "http://evil.example"):
@@ -141,7 +141,7 @@ def test_an_own_page_and_a_program_may(server: ServerProcess):
         assert sent(server.url, sec_fetch_site=site) == 403
 
 
-def test_behind_a_proxy_pages_of_the_public_url_are_own_and_others_foreign(tmp_path: Path):
+def test_behind_a_proxy_only_pages_of_the_public_url_can_send_changing_requests(tmp_path: Path):
     token = "the-token-behind-a-proxy"
     with running_server(tmp_path, "--public-url", "https://Plant.example", SURROGYM_TOKEN=token) as server:
         bearer = {"authorization": f"Bearer {token}"}

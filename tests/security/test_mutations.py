@@ -79,19 +79,23 @@ FRAMES = [frames.step_request(None, ACTION, None, True), frames.reset_request(No
 
 
 @pytest.mark.parametrize(("what", "body"), BODIES)
-def test_json_of_steps(server: ServerProcess, client: httpx.Client, session: str, what: str, body: object):
+def test_mutated_json_requests_of_sessions_are_refused_without_a_crash(
+    server: ServerProcess, client: httpx.Client, session: str, what: str, body: object
+):
     send = posting(client, f"/v1/sessions/{session}/{what}", "application/json")
     attack(server, send, json.dumps(body).encode(), seed=1)
 
 
 @pytest.mark.parametrize("frame", FRAMES, ids=["step", "reset"])
-def test_frames_of_steps(server: ServerProcess, client: httpx.Client, session: str, frame: frames.Request):
+def test_mutated_binary_requests_of_sessions_are_refused_without_a_crash(
+    server: ServerProcess, client: httpx.Client, session: str, frame: frames.Request
+):
     what = type(frame).__struct_config__.tag
     send = posting(client, f"/v1/sessions/{session}/{what}", frames.MEDIA_TYPE)
     attack(server, send, frames.encode(frame), seed=2)
 
 
-def test_samples(server: ServerProcess, client: httpx.Client):
+def test_mutated_samples_are_refused_without_a_crash(server: ServerProcess, client: httpx.Client):
     client.post("/v1/surrogates", json={"name": "open", "spec": pendulum.spec(initial=200, budget=300)})
     query = pendulum.claim(client, "open", max_queries=1)["queries"][0]
     body = {"sampler": "hostile", "samples": [pendulum.answer(query)]}
@@ -102,7 +106,9 @@ def test_samples(server: ServerProcess, client: httpx.Client):
     client.delete("/v1/surrogates/open").raise_for_status()
 
 
-def test_the_stream(server: ServerProcess, client: httpx.Client, session: str):
+def test_mutated_stream_messages_are_refused_and_the_stream_continues(
+    server: ServerProcess, client: httpx.Client, session: str
+):
     """A refused message leaves its connection open; the one after it is answered."""
     address = f"{server.url.replace('http', 'ws', 1)}/v1/sessions/{session}/stream"
     good = frames.encode(FRAMES[0])
@@ -130,7 +136,7 @@ def websocket_frames(source: random.Random) -> bytes:
     return (head + bytes(4) + content) * source.randint(1, 4)
 
 
-def test_random_websocket_frames_leave_no_error_in_the_log(server: ServerProcess, session: str):
+def test_random_websocket_frames_cause_no_server_error(server: ServerProcess, session: str):
     source, stream = random.Random(SEED), upgraded(server.url, session)
     for _ in range(MUTATIONS):
         try:

@@ -23,7 +23,7 @@ ENDLESS = "/events$"  # a stream of server-sent events, which tests/server/api/t
 
 
 @pytest.mark.timeout(3_600)
-def test_every_reply_is_one_that_the_openapi_describes(tmp_path: Path):
+def test_every_reply_to_generated_requests_matches_the_openapi_description(tmp_path: Path):
     command = [sys.executable, "-m", "schemathesis.cli", "--config-file", str(CONFIG), "run"]
     options = {
         "--header": f"Authorization: Bearer {TOKEN}",

@@ -81,7 +81,7 @@ def step_seconds(client: httpx.Client, session: str, steps: int = 60) -> float:
     return statistics.median(taken)
 
 
-def test_the_memory_of_all_sessions_is_bounded(client: httpx.Client):
+def test_the_total_memory_of_all_sessions_is_limited(client: httpx.Client):
     particles = {"variant": "probabilistic", "particles": 1_000_000}  # of two coordinates: 15.3 MiB
     refused(opened(client, **particles, num_envs=5), Code.TOO_LARGE, "4000000 particles")
     ids = [opened(client, **particles).raise_for_status().json()["id"] for _ in range(4)]
@@ -93,7 +93,7 @@ def test_the_memory_of_all_sessions_is_bounded(client: httpx.Client):
     client.delete(f"/v1/sessions/{opened(client, **particles).raise_for_status().json()['id']}")
 
 
-def test_a_step_that_would_be_late_is_not_computed(client: httpx.Client, session: str):
+def test_a_step_that_cannot_meet_its_deadline_is_not_computed(client: httpx.Client, session: str):
     step_seconds(client, session, steps=5)  # now the server knows what one takes
     path, seq = f"/v1/sessions/{session}", client.get(f"/v1/sessions/{session}").json()["seq"]
     body = {"seq": seq + 1, "actions": [[[0.5]]] * 2_000}
@@ -118,12 +118,12 @@ def test_invalid_action_numbers_are_refused(client: httpx.Client, session: str, 
 
 
 @pytest.mark.parametrize("action", [5e-324, -5e-324, 0.0, -0.0])
-def test_the_smallest_numbers_are_numbers(client: httpx.Client, session: str, action: float):
+def test_denormal_action_numbers_are_accepted(client: httpx.Client, session: str, action: float):
     reply = client.post(f"/v1/sessions/{session}/step", json={"action": [[action]]}).raise_for_status().json()
     assert np.isfinite(reply["observation"]).all()
 
 
-def test_arrays_of_another_size_are_refused(client: httpx.Client, session: str):
+def test_action_arrays_of_wrong_size_are_refused(client: httpx.Client, session: str):
     for action in ([], [[0.5]] * 5_000, [[0.5] * 5_000]):
         reply = client.post(f"/v1/sessions/{session}/step", json={"action": action})
         refused(reply, Code.INVALID_REQUEST, "action", "got")
@@ -131,7 +131,7 @@ def test_arrays_of_another_size_are_refused(client: httpx.Client, session: str):
     refused(reply, Code.TOO_LARGE, "at most 65536 bytes", "send a larger body as application/vnd.msgpack")
 
 
-def test_an_announced_gigabyte_is_refused_unread(server: ServerProcess):
+def test_a_body_announced_as_a_gigabyte_is_refused_unread(server: ServerProcess):
     with connected(server.url) as attacker:
         started = time.monotonic()
         attacker.sendall(head(PATH, f"content-length: {GIGABYTE}", "", ""))
@@ -143,7 +143,7 @@ def test_an_announced_gigabyte_is_refused_unread(server: ServerProcess):
     assert time.monotonic() - started < REQUEST_SECONDS
 
 
-def test_a_chunked_gigabyte_is_refused_at_the_limit(server: ServerProcess):
+def test_a_chunked_body_of_a_gigabyte_is_refused_at_the_limit(server: ServerProcess):
     """What is still read of it is thrown away, until the time for a request is over."""
     before, sent, chunk = resident_mib(server.process.pid), 0, b"x" * 2**20
     with connected(server.url) as attacker, contextlib.suppress(ConnectionError):
@@ -259,13 +259,13 @@ def test_idle_connections_are_closed_and_others_are_served(server: ServerProcess
 
 
 @pytest.mark.parametrize("frame", [b"\x00\x80\0\0\0\0", b"\x89\x80\0\0\0\0", b"\x82\x80\0\0\0\0"])
-def test_a_flood_of_empty_frames_ends_its_stream(server: ServerProcess, session: str, frame: bytes):
+def test_many_empty_websocket_frames_close_their_stream(server: ServerProcess, session: str, frame: bytes):
     with upgraded(server.url, session) as attacker, contextlib.suppress(ConnectionError):
         attacker.sendall(b"\x02\x80\0\0\0\0" + frame * 40_000)
         assert b"at most 256 frames in one message and in one read" in read_all(attacker)
 
 
-def test_unfinished_messages_have_a_bound_together(narrow: ServerProcess):
+def test_the_total_size_of_unfinished_stream_messages_is_limited(narrow: ServerProcess):
     """128 KiB in all streams there."""
     with Api(narrow.url) as api, httpx.Client(base_url=narrow.url, timeout=60) as client:
         teach(api, "pendulum", pendulum(), queries=6)
@@ -275,26 +275,26 @@ def test_unfinished_messages_have_a_bound_together(narrow: ServerProcess):
         assert b"unfinished messages of at most 131072 bytes" in read_all(attacker)
 
 
-def test_an_unfinished_message_is_waited_for_as_long_as_a_request(server: ServerProcess, session: str):
+def test_an_unfinished_stream_message_times_out_like_a_request(server: ServerProcess, session: str):
     with upgraded(server.url, session) as attacker:
         attacker.sendall(b"\x82\x8a\0\0\0\0abc")
         assert f"a whole message within {REQUEST_SECONDS} s".encode() in read_all(attacker)
 
 
-def test_few_requests_may_wait_for_the_one_before_them(server: ServerProcess):
+def test_the_number_of_pipelined_requests_on_a_connection_is_limited(server: ServerProcess):
     with connected(server.url) as attacker, contextlib.suppress(ConnectionError):
         attacker.sendall(b"GET /v1/surrogates HTTP/1.1\r\nhost: 127.0.0.1\r\n\r\n" * 4_000)
         assert b"at most 16 unanswered requests on one connection" in read_all(attacker)
 
 
-def test_a_stream_is_opened_by_get_alone(server: ServerProcess):
+def test_a_stream_upgrade_with_another_method_than_get_is_refused(server: ServerProcess):
     lines = ("connection: Upgrade", "upgrade: websocket", "sec-websocket-version: 13", f"sec-websocket-key: {KEY}")
     with connected(server.url) as attacker:
         attacker.sendall(head("/v1/sessions/x/stream", *lines, "content-length: 3", "", "") + b"abc")
         assert b"expected GET to open a stream" in read_all(attacker)
 
 
-def test_many_readers_are_refused_while_others_are_served(server: ServerProcess, client: httpx.Client):
+def test_too_many_concurrent_readers_are_refused_while_others_are_served(server: ServerProcess, client: httpx.Client):
     body = {"coordinates": [0.1, 0.0], "actions": [[0.5]] * 40, "draws": 2}
     with ThreadPoolExecutor(50) as pool, httpx.Client(base_url=server.url, timeout=120) as lookers:
         asked = [pool.submit(lookers.post, "/v1/surrogates/pendulum/imagine", json=body) for _ in range(50)]
@@ -306,7 +306,7 @@ def test_many_readers_are_refused_while_others_are_served(server: ServerProcess,
     refused(beyond, Code.TOO_MANY_REQUESTS, "at most 34 predictions at work or waiting")
 
 
-def test_an_unexpected_body_is_ignored(server: ServerProcess, client: httpx.Client):
+def test_the_body_of_a_get_request_is_ignored(server: ServerProcess, client: httpx.Client):
     for path in ("/v1/surrogates", "/healthz"):
         assert client.request("GET", path, content=b"x" * 100).status_code == 200
     with client.stream("GET", "/v1/events", content=b"x" * 10) as events:
@@ -314,7 +314,7 @@ def test_an_unexpected_body_is_ignored(server: ServerProcess, client: httpx.Clie
     assert "Traceback" not in server.log, server.log[-6000:]
 
 
-def test_a_sampler_that_has_gone_gets_no_lease(server: ServerProcess, client: httpx.Client):
+def test_a_sampler_that_disconnected_while_waiting_gets_no_lease(server: ServerProcess, client: httpx.Client):
     client.post(
         "/v1/surrogates", json={"name": "idle", "spec": wire_pendulum.spec(initial=2, budget=2)}
     ).raise_for_status()

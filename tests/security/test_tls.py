@@ -49,12 +49,12 @@ def test_a_client_that_trusts_the_certificate_is_served(
         assert api.surrogates() == []
 
 
-def test_a_client_that_does_not_trust_it_goes_no_further(server: ServerProcess):
+def test_a_client_that_does_not_trust_the_certificate_refuses_the_server(server: ServerProcess):
     with pytest.raises(httpx.ConnectError, match="CERTIFICATE_VERIFY_FAILED"):
         httpx.get(f"{server.url}/healthz", trust_env=False)
 
 
-def test_the_stream_steps_over_the_same_certificate(
+def test_steps_over_a_tls_stream_use_the_same_certificate(
     server: ServerProcess, certificate: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setenv("SSL_CERT_FILE", str(certificate))
@@ -70,12 +70,12 @@ def test_the_stream_steps_over_the_same_certificate(
             assert isinstance(frames.read_reply(bytes(stream.recv(timeout=60))), reply)
 
 
-def test_plain_http_is_not_answered(server: ServerProcess):
+def test_a_tls_server_does_not_answer_plain_http(server: ServerProcess):
     with pytest.raises(httpx.TransportError):
         httpx.get(server.url.replace("https", "http", 1), trust_env=False)
 
 
 @pytest.mark.parametrize("alone", ["tls_certificate", "tls_key"])
-def test_a_certificate_and_its_key_come_together(certificate: Path, alone: str):
+def test_a_tls_certificate_without_key_or_key_without_certificate_is_refused(certificate: Path, alone: str):
     with pytest.raises(InvalidInput, match="expected a certificate and its key"):
         read_settings({}, **{alone: certificate})

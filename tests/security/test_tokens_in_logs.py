@@ -41,7 +41,7 @@ def requests(url: str, token: str) -> None:
 
 
 @pytest.mark.parametrize("form", ["text", "json"])
-def test_no_log_names_a_token(tmp_path: Path, form: str):
+def test_no_token_appears_in_any_server_log(tmp_path: Path, form: str):
     options = ("--log-level", "debug", "--log-format", form)
     with running_server(tmp_path, *options, SURROGYM_TOKEN=TOKEN) as server:
         for token in (TOKEN, MISTYPED):

@@ -25,7 +25,7 @@ def observations(lanes: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("counts", [(), (4,), (3, 2)], ids=["continuous", "one choice", "two choices"])
-def test_without_noise_it_acts_as_its_network(counts: tuple[int, ...]):
+def test_a_policy_without_noise_gives_the_actions_of_its_network(counts: tuple[int, ...]):
     policy = random_policy((3, 8, sum(counts) or 2), np.float64, continuous=not counts)
     low, high = (NONE, NONE) if counts else (LOW, HIGH)
     network = Network(policy.mean, policy.deviation, policy.layers, low, high, counts, policy.activation)
@@ -36,7 +36,7 @@ def test_without_noise_it_acts_as_its_network(counts: tuple[int, ...]):
 
 
 @pytest.mark.parametrize("counts", [(), (4,), (3, 2)], ids=["continuous", "one choice", "two choices"])
-def test_noise_depends_on_seed_step_and_lane_alone(counts: tuple[int, ...]):
+def test_action_noise_depends_only_on_seed_step_and_environment_number(counts: tuple[int, ...]):
     """Not on the other lanes, nor on what was drawn before."""
     few, many = (actor(counts).act(observations(lanes), NoiseKey(5, 70)) for lanes in (4, 900))
     np.testing.assert_allclose(few.action, many.action[:4], atol=1e-6)
@@ -46,14 +46,14 @@ def test_noise_depends_on_seed_step_and_lane_alone(counts: tuple[int, ...]):
     assert NoiseKey(5, 60).later(10) == NoiseKey(5, 70)
 
 
-def test_held_noise_is_the_same_for_that_many_steps():
+def test_held_action_noise_is_constant_for_the_given_number_of_steps():
     drawn = [actor().act(observations(4), NoiseKey(5, step, hold=4)).action for step in range(9)]
     for step in range(1, 9):
         assert np.array_equal(drawn[step], drawn[step - 1]) == (step % 4 != 0)
     assert NoiseKey(5, 60, 4).later(10) == NoiseKey(5, 70, 4)
 
 
-def test_noise_is_numpys_philox_with_the_step_in_the_third_word():
+def test_action_noise_equals_numpys_philox_keyed_by_seed_and_step():
     keyed = KeyedGenerator()
     keyed.at(NoiseKey(9, 9)).standard_normal(3, dtype=np.float32)
     drawn = keyed.at(NoiseKey(2**63 - 1, 5)).standard_normal(7)
@@ -61,7 +61,7 @@ def test_noise_is_numpys_philox_with_the_step_in_the_third_word():
     np.testing.assert_array_equal(drawn, made.standard_normal(7))
 
 
-def test_log_probabilities_are_those_of_the_actions():
+def test_log_probabilities_of_noisy_actions_equal_the_normal_density():
     acted = actor().act(observations(50), NoiseKey(1))
     policy, x = actor().policy, observations(50)
     middle = np.array([0, 0.5]) + np.array([2, 0.5]) * np.tanh(
@@ -76,7 +76,7 @@ def test_log_probabilities_are_those_of_the_actions():
     assert (acted.action > HIGH).any()
 
 
-def test_both_precisions_draw_by_the_same_distribution():
+def test_noisy_actions_have_the_same_distribution_in_both_float_precisions():
     for dtype in (np.float32, np.float64):
         made = Actor(random_policy((3, 2), dtype), 3, LOW, HIGH, noisy=True)
         rows = np.zeros((20_000, 3), dtype=np.float32)
@@ -86,14 +86,14 @@ def test_both_precisions_draw_by_the_same_distribution():
         np.testing.assert_allclose(action.mean(0), middle[0], atol=0.05)
 
 
-def test_arrays_of_two_precisions_are_refused():
+def test_a_policy_with_mixed_float_precisions_is_refused():
     policy = random_policy((3, 2))
     mixed = (Layer(policy.layers[0].weights.astype(np.float64), policy.layers[0].bias),)
     with pytest.raises(ValueError, match=r"expected layers\[0\].weights as float32, got float64"):
         ActingPolicy(policy.mean, policy.deviation, mixed)
 
 
-def test_a_choice_whose_draw_is_zero_wins_without_a_warning():
+def test_a_zero_random_draw_for_a_discrete_action_raises_no_warning():
     class Draws:
         def standard_exponential(self, shape: tuple[int, int], dtype: type) -> np.ndarray:
             return np.array([[1.0, 0.0, 1.0]], dtype=dtype)

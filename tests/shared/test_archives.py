@@ -57,7 +57,7 @@ def array_file(header: str, body: bytes) -> bytes:
 
 
 @pytest.mark.filterwarnings("ignore:Duplicate name")
-def test_a_name_that_stands_twice_is_refused():
+def test_an_archive_with_a_repeated_entry_name_is_refused():
     """The last entry was read, where another program that reads the same policy takes the first."""
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w") as archive:
@@ -74,14 +74,14 @@ def array_of(value: float) -> bytes:
     return file.getvalue()
 
 
-def test_what_is_stored_is_read(tmp_path: Path):
+def test_archive_entries_are_read_back_unchanged(tmp_path: Path):
     entries = {"a": b"1", "folder/b": b"", "c": bytes(1_000)}
     (tmp_path / "a.zip").write_bytes(stored(entries))
     assert read_entries(tmp_path / "a.zip", 1_001) == read_entries(stored(entries), 1_001) == entries
 
 
 @pytest.mark.parametrize("write", [np.savez, np.savez_compressed])
-def test_the_arrays_of_an_npz_are_read(write):
+def test_arrays_of_an_npz_are_read(write):
     arrays = {"a": np.arange(6.0).reshape(2, 3), "b": np.zeros(0), "c": np.array(3), "d": np.asfortranarray(np.eye(3))}
     file = io.BytesIO()
     write(file, **arrays)
@@ -92,7 +92,7 @@ def test_the_arrays_of_an_npz_are_read(write):
         assert read[name].dtype == array.dtype
 
 
-def test_a_zip_that_would_inflate_beyond_its_bound_is_refused_unread():
+def test_a_zip_that_decompresses_beyond_its_limit_is_refused_unread():
     bomb = deflated("a", bytes(BOMB))
     with (
         little_memory(),
@@ -102,19 +102,19 @@ def test_a_zip_that_would_inflate_beyond_its_bound_is_refused_unread():
 
 
 @pytest.mark.parametrize("size", [10, 2 * MEBIBYTE])
-def test_a_header_that_names_too_small_a_size_inflates_nothing_more(size: int):
+def test_a_zip_entry_larger_than_its_header_says_is_not_decompressed_further(size: int):
     bomb = lying("a", bytes(BOMB), size)
     with little_memory(8):
         assert len(read_entries(bomb, 2 * MEBIBYTE)["a"]) == size
 
 
-def test_a_header_that_names_too_large_a_size_is_refused():
+def test_a_zip_entry_smaller_than_its_header_says_is_refused():
     with pytest.raises(ValueError, match="expected 2000 bytes of 'a', got 1000"):
         read_entries(lying("a", bytes(1_000), 2_000), MEBIBYTE)
 
 
 @pytest.mark.parametrize("kind", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
-def test_compression_that_can_not_be_bounded_is_refused(kind: int):
+def test_a_zip_with_an_unbounded_compression_method_is_refused(kind: int):
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w", kind) as archive:
         archive.writestr("a", b"content")
@@ -131,13 +131,13 @@ def test_an_invalid_zip_is_refused(content: bytes):
 @pytest.mark.parametrize(
     ("shape", "dtype"), [("(1000000000000,)", "<f8"), ("(-1, -1)", "<f8"), ("(1,)", "|O"), ("(1,)", "<f4")]
 )
-def test_an_array_of_another_size_than_its_header_names_is_refused(shape: str, dtype: str):
+def test_an_npz_array_of_other_size_than_its_header_says_is_refused(shape: str, dtype: str):
     content = array_file(f"{{'descr': '{dtype}', 'fortran_order': False, 'shape': {shape}, }}", bytes(8))
     with little_memory(), pytest.raises(ValueError, match="expected an array"):
         read_arrays(stored({"a.npy": content}), MEBIBYTE)
 
 
-def test_pickled_objects_in_an_npz_stay_pickled():
+def test_pickled_objects_in_an_npz_are_not_unpickled():
     file = io.BytesIO()
     np.savez(file, a=np.array([{"code": 1}], dtype=object))
     with pytest.raises(ValueError, match="expected an array 'a' of numbers"):
@@ -149,7 +149,7 @@ def network_file(path: Path, npz: bytes) -> Path:
     return path
 
 
-def test_a_network_whose_arrays_would_fill_the_memory_is_refused(tmp_path: Path):
+def test_a_network_file_with_huge_arrays_is_refused(tmp_path: Path):
     file = io.BytesIO()
     np.savez_compressed(file, hidden=np.zeros(BOMB // 8))
     path = network_file(tmp_path / "policy.zip", file.getvalue())
@@ -162,7 +162,7 @@ def test_a_network_whose_arrays_would_fill_the_memory_is_refused(tmp_path: Path)
 
 
 @pytest.mark.parametrize("units", [3, 4])
-def test_a_network_whose_arrays_do_not_fit_together_is_refused(tmp_path: Path, units: int):
+def test_a_network_file_with_inconsistent_array_shapes_is_refused(tmp_path: Path, units: int):
     file = io.BytesIO()
     parts = {"mean": 2, "deviation": 2, "hidden": (2, 3), "hidden_bias": 3, "output": (units, 1), "output_bias": 1}
     np.savez(file, **{name: np.ones(shape) for name, shape in parts.items()}, low=[-1.0], high=[1.0])
@@ -174,7 +174,7 @@ def test_a_network_whose_arrays_do_not_fit_together_is_refused(tmp_path: Path, u
         Network.load(path)
 
 
-def test_a_pickle_in_the_place_of_a_network_is_refused(tmp_path: Path):
+def test_a_pickle_instead_of_a_network_file_is_refused(tmp_path: Path):
     with pytest.raises(ValueError, match="not a policy of"):
         Network.load(network_file(tmp_path / "policy.zip", pickle.dumps([1])))
 
@@ -197,7 +197,7 @@ MANY = 500_000
     ],
     ids=str,
 )
-def test_arrays_that_would_broadcast_are_refused_before_they_are_made(tmp_path: Path, monkeypatch, shapes, message):
+def test_network_arrays_that_would_broadcast_to_a_huge_size_are_refused(tmp_path: Path, monkeypatch, shapes, message):
     file = io.BytesIO()
     np.savez_compressed(file, **{name: np.zeros(shape) for name, shape in (PENDULUM | shapes).items()})
     path = network_file(tmp_path / "policy.zip", file.getvalue())
@@ -219,7 +219,7 @@ def test_arrays_that_would_broadcast_are_refused_before_they_are_made(tmp_path: 
     ],
     ids=["too many", "negative", "text", "version", "names", "layers", "long"],
 )
-def test_a_network_whose_head_does_not_fit_is_refused(tmp_path: Path, head, message):
+def test_a_network_file_whose_output_layer_does_not_fit_is_refused(tmp_path: Path, head, message):
     file = io.BytesIO()
     np.savez(file, **{name: np.zeros(shape) for name, shape in PENDULUM.items()})
     path = tmp_path / "policy.zip"
@@ -228,7 +228,7 @@ def test_a_network_whose_head_does_not_fit_is_refused(tmp_path: Path, head, mess
         Network.load(path)
 
 
-def test_a_network_that_finds_no_memory_is_refused_in_a_sentence(tmp_path: Path, monkeypatch):
+def test_a_network_file_too_large_for_the_memory_is_refused_in_a_sentence(tmp_path: Path, monkeypatch):
     def full(*_: object) -> None:
         raise MemoryError("Unable to allocate 1 GiB")
 

@@ -20,11 +20,11 @@ WRONG: list[tuple[type[BaseModel], dict[str, Any]]] = [
 
 
 @pytest.mark.parametrize(("model", "body"), WRONG)
-def test_errors_do_not_grow_with_the_body(model: type[BaseModel], body: dict[str, Any]):
+def test_validation_stops_at_the_first_wrong_list_entry(model: type[BaseModel], body: dict[str, Any]):
     with pytest.raises(ValidationError) as refused:
         model.model_validate(body)
     assert refused.value.error_count() < 16
 
 
-def test_a_right_body_is_read_whole():
+def test_a_valid_request_body_is_read_completely():
     assert len(wire.StepSession(action=[[0.5]] * 1_000).action) == 1_000

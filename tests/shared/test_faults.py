@@ -23,14 +23,14 @@ from surrogym_shared.spec.environment import ModelChoice
         ({"action": {"kind": "box", "low": [1.0], "high": [0.0]}}, "action.box: action 0 crosses: expected low < high"),
     ],
 )
-def test_a_fault_has_its_place_and_no_words_of_python(fields: dict[str, Any], says: str):
+def test_a_validation_error_names_the_field_without_python_terms(fields: dict[str, Any], says: str):
     """``Tuple should have at least 1 item after validation`` and ``Value error,`` tell a person nothing."""
     with pytest.raises(ValidationError) as found:
         EnvironmentSpec.model_validate(SPEC.model_dump() | fields)
     assert first_fault(found.value).startswith(says)
 
 
-def test_the_value_that_came_is_cut():
+def test_a_validation_error_shortens_a_long_value():
     with pytest.raises(ValidationError) as found:
         EnvironmentSpec.model_validate(SPEC.model_dump() | {"time_limit": 1_000 * "x"})
     said = first_fault(found.value, got=True)
@@ -57,14 +57,14 @@ def test_the_value_that_came_is_cut():
         ),
     ],
 )
-def test_an_unknown_entry_is_named_with_the_allowed_ones(fields: dict[str, Any], says: str):
+def test_a_validation_error_for_an_unknown_field_lists_the_allowed_ones(fields: dict[str, Any], says: str):
     """``Extra inputs are not permitted`` left a person to guess the name."""
     with pytest.raises(ValidationError) as found:
         EnvironmentSpec.model_validate(SPEC.model_dump() | fields)
     assert first_fault(found.value, of=EnvironmentSpec).startswith(says)
 
 
-def test_the_entry_that_is_meant_is_named_before_those_that_miss():
+def test_a_validation_error_suggests_the_correct_name_of_a_misspelt_field():
     """A wrong name of a required entry gave ``Field required`` for the right one."""
     fields = SPEC.model_dump()
     fields["coordinate"] = fields.pop("coordinates")
@@ -76,7 +76,7 @@ def test_the_entry_that_is_meant_is_named_before_those_that_miss():
 
 
 @pytest.mark.parametrize("given", [float("nan"), float("-inf"), None, [1], {"a": 1}])
-def test_a_setting_of_another_type_is_refused_by_all_that_is_allowed(given: object):
+def test_a_validation_error_for_a_setting_lists_all_allowed_types(given: object):
     """The error named one of four types, by a word of the library."""
     with pytest.raises(ValidationError) as refused:
         ModelChoice(name="ensemble", settings={"beta": given})
@@ -84,7 +84,7 @@ def test_a_setting_of_another_type_is_refused_by_all_that_is_allowed(given: obje
     assert said == f"settings.beta: expected a finite number, true, false or a text, got {given}"
 
 
-def test_settings_keep_their_types():
+def test_settings_keep_their_types_when_validated():
     settings = {"a": True, "b": 1, "c": 0.5, "d": "text"}
     assert ModelChoice(name="own", settings=settings).settings == settings
     assert [type(value) for value in ModelChoice(name="own", settings=settings).settings.values()] == [

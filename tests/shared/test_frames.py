@@ -57,7 +57,7 @@ def assert_same(ours: ResetResult | StepResult, theirs: ResetResult | StepResult
 
 
 @given(data=st.data(), shape=SHAPES, seq=SEQ)
-def test_steps_come_back_bit_for_bit(data: st.DataObject, shape: Shape, seq: int):
+def test_steps_survive_binary_encoding_bit_for_bit(data: st.DataObject, shape: Shape, seq: int):
     results = data.draw(st.lists(step_results(shape), min_size=1, max_size=2))
     one = frames.read_reply(frames.encode(frames.step_reply(seq, results[0])))
     assert isinstance(one, frames.StepReply)
@@ -70,7 +70,7 @@ def test_steps_come_back_bit_for_bit(data: st.DataObject, shape: Shape, seq: int
 
 
 @given(data=st.data(), shape=SHAPES)
-def test_a_reset_comes_back_bit_for_bit(data: st.DataObject, shape: Shape):
+def test_a_reset_reply_survives_binary_encoding_bit_for_bit(data: st.DataObject, shape: Shape):
     observation = data.draw(floats((shape.lanes, shape.observation), np.float32))
     result = ResetResult(observation, data.draw(arrays.arrays(np.int64, shape.lanes)))
     reply = frames.read_reply(frames.encode(frames.reset_reply(3, result)))
@@ -79,7 +79,9 @@ def test_a_reset_comes_back_bit_for_bit(data: st.DataObject, shape: Shape):
 
 
 @given(data=st.data(), shape=SHAPES, seq=st.none() | SEQ, deviations=st.booleans())
-def test_requests_come_back_bit_for_bit(data: st.DataObject, shape: Shape, seq: int | None, deviations: bool):
+def test_requests_survive_binary_encoding_bit_for_bit(
+    data: st.DataObject, shape: Shape, seq: int | None, deviations: bool
+):
     lanes = shape.lanes
     mask = data.draw(st.none() | arrays.arrays(bool, lanes))
     actions = data.draw(floats((3, lanes, shape.action)))
@@ -103,7 +105,7 @@ POLICIES = [random_policy((3, 4, 1)), random_policy((3, 2), np.float64, continuo
 
 @pytest.mark.parametrize("policy", POLICIES, ids=["float32", "float64"])
 @pytest.mark.parametrize("noise", [None, NoiseKey(2**63 - 1, 2**63 - 1), NoiseKey(3, 64, hold=16)])
-def test_a_policy_comes_back_bit_for_bit(policy: ActingPolicy, noise: NoiseKey | None):
+def test_a_policy_survives_binary_encoding_bit_for_bit(policy: ActingPolicy, noise: NoiseKey | None):
     until = np.array([True, False])
     request = frames.read_request(frames.encode(frames.policy_request(5, policy, 9, noise, until)))
     assert isinstance(request, frames.PolicyRequest)
@@ -117,7 +119,7 @@ def test_a_policy_comes_back_bit_for_bit(policy: ActingPolicy, noise: NoiseKey |
 
 
 @given(data=st.data(), shape=SHAPES)
-def test_a_policys_actions_are_returned_bit_for_bit(data: st.DataObject, shape: Shape):
+def test_the_actions_of_a_policy_rollout_survive_binary_encoding_bit_for_bit(data: st.DataObject, shape: Shape):
     trusted = data.draw(st.booleans())
     drawn = data.draw(st.lists(step_results(shape), min_size=1, max_size=3))
     steps = [replace(one, deviation=None, untrusted=one.terminated if trusted else None) for one in drawn]
@@ -131,7 +133,7 @@ def test_a_policys_actions_are_returned_bit_for_bit(data: st.DataObject, shape: 
         assert_same(ours, theirs)
 
 
-def test_a_mean_of_minus_zero_is_no_reward_of_zero():
+def test_binary_encoding_keeps_a_mean_reward_of_minus_zero():
     step = replace(example(), deviation=None, reward=np.zeros(SMALL.lanes), reward_mean=np.full(SMALL.lanes, -0.0))
     result = PolicyRollout.of([step], np.zeros((1, SMALL.lanes, SMALL.action)), None)
     reply = frames.read_reply(frames.encode(frames.policy_reply(3, result)))
@@ -139,13 +141,13 @@ def test_a_mean_of_minus_zero_is_no_reward_of_zero():
     assert np.signbit(frames.policy_rollout(reply, SMALL).reward_mean).all()
 
 
-def test_any_layout_of_an_array_is_sent_in_row_order():
+def test_arrays_of_any_memory_layout_are_encoded_in_row_order():
     action = np.arange(6, dtype=np.float32).reshape(3, 2).T
     request = frames.step_request(1, action, None, False)
     np.testing.assert_array_equal(frames.action_of(request, Shape(2, 1, 3, 1)), action)
 
 
-def test_result_arrays_are_writable_and_aligned():
+def test_decoded_arrays_are_writable_and_aligned():
     reply = frames.read_reply(frames.encode(frames.step_reply(1, example())))
     assert isinstance(reply, frames.StepReply)
     result = frames.step_result(reply.step, SMALL)
@@ -155,7 +157,7 @@ def test_result_arrays_are_writable_and_aligned():
         assert array.flags.aligned, field.name
 
 
-def test_a_problem_comes_back():
+def test_an_error_reply_survives_binary_encoding():
     sent = frames.ProblemReply(409, Code.SEQ_CONFLICT, "seq conflict", "expected seq 3, got 4", 3, 4)
     assert frames.read_reply(frames.encode(sent)) == sent
 
@@ -238,7 +240,7 @@ CASES += [(read_whole_reply, frames.encode(r)) for r in REPLIES]
 
 
 @given(case=st.sampled_from(CASES), data=st.data())
-def test_changed_bytes_are_another_frame_or_a_frame_error(
+def test_a_binary_frame_with_changed_bytes_decodes_or_raises_frame_error(
     case: tuple[Callable[[bytes], None], bytes], data: st.DataObject
 ):
     read, content = case
@@ -250,14 +252,14 @@ def test_changed_bytes_are_another_frame_or_a_frame_error(
 
 
 @given(content=st.binary(max_size=64))
-def test_any_bytes_are_a_frame_or_a_frame_error(content: bytes):
+def test_random_bytes_decode_as_a_frame_or_raise_frame_error(content: bytes):
     for read in (read_whole_request, read_whole_reply):
         with suppress(FrameError):
             read(content)
 
 
 @pytest.mark.parametrize(("read", "content"), CASES)
-def test_every_cut_of_a_frame_is_an_error(read: Callable[[bytes], None], content: bytes):
+def test_every_truncated_binary_frame_raises_an_error(read: Callable[[bytes], None], content: bytes):
     read(content)
     for length in range(len(content)):
         with pytest.raises(FrameError):
@@ -289,26 +291,28 @@ def test_every_cut_of_a_frame_is_an_error(read: Callable[[bytes], None], content
         (of_policy(noise=frames.Noise(0, 0, 0)), "expected a frame"),
     ],
 )
-def test_the_refusal_of_a_misfitting_request_says_why(request_frame: frames.Request, message: str):
+def test_a_binary_request_that_does_not_fit_the_session_is_refused_with_the_reason(
+    request_frame: frames.Request, message: str
+):
     with pytest.raises(FrameError, match=message):
         read_whole_request(frames.encode(request_frame))
 
 
-def test_an_unknown_field_is_refused():
+def test_a_binary_frame_with_an_unknown_field_is_refused():
     content = frames.encode(frames.reset_request(1, None, None))
     assert content[0] == 0x82, "a map of two"
     with pytest.raises(FrameError, match="unknown field `more`"):
         frames.read_request(b"\x83" + content[1:] + b"\xa4more\x01")
 
 
-def test_final_steps_are_steps_of_the_rollout_in_order():
+def test_a_rollout_reply_with_invalid_final_step_numbers_is_refused():
     reply = frames.policy_reply(1, policy_example())
     for wrong in (np.array([0, 2]), np.array([-1, 0]), np.array([1, 0]), np.array([0])):
         with pytest.raises(FrameError, match="final_steps: expected"):
             read_whole_reply(frames.encode(msgspec.structs.replace(reply, final_steps=wrong.data)))
 
 
-def test_final_lanes_are_lanes_of_the_session():
+def test_a_step_reply_with_invalid_final_environment_numbers_is_refused():
     step = frames.step_reply(1, example()).step
     for wrong in (np.array([2]), np.array([-1]), np.array([], dtype=np.int64)):
         other = frames.Step(**{f: getattr(step, f) for f in step.__struct_fields__} | {"final_lanes": wrong.data})
@@ -317,6 +321,6 @@ def test_final_lanes_are_lanes_of_the_session():
 
 
 @pytest.mark.parametrize("seeds", [2**63, [2**63], [1.5, "a"], [None]])
-def test_seeds_that_are_no_integers_are_refused(seeds: Any):
+def test_a_binary_reset_with_non_integer_seeds_is_refused(seeds: Any):
     with pytest.raises(FrameError, match="seed: expected 0 to"):
         frames.reset_request(1, seeds, None)

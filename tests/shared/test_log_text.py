@@ -10,7 +10,7 @@ from surrogym_shared.logs.text import LONGEST_NAME, MOST_COLUMNS, table_of_text
 from surrogym_shared.logs.writing import spreadsheet_cell
 
 
-def test_one_long_cell_does_not_widen_its_column() -> None:
+def test_one_long_cell_of_a_text_log_does_not_enlarge_its_whole_column() -> None:
     table = table_of_text("x,note\n" + "1,short\n" * 1_000 + f"2,{'long' * 10_000}\n", "the log")
     assert sum(column.nbytes for column in table.columns.values()) == 2 * 8 * len(table)
     assert numbers("x", table.columns["x"])[0].sum() == 1_002
@@ -25,7 +25,7 @@ def test_one_long_cell_does_not_widen_its_column() -> None:
         (f"x\n{'1' * 200_000}\n", "expected CSV in the log, got other text in line 2"),
     ],
 )
-def test_a_log_beyond_its_bounds_is_refused(text: str, expected: str) -> None:
+def test_a_text_log_beyond_the_size_limits_is_refused(text: str, expected: str) -> None:
     with pytest.raises(UnusableLog, match=expected):
         table_of_text(text, "the log", most_rows=2)
 
@@ -43,5 +43,5 @@ def test_a_log_beyond_its_bounds_is_refused(text: str, expected: str) -> None:
         ("rig-7", "rig-7"),
     ],
 )
-def test_a_cell_of_an_exported_table_is_no_formula(cell: object, written: object) -> None:
+def test_cells_of_an_exported_table_cannot_be_spreadsheet_formulas(cell: object, written: object) -> None:
     assert spreadsheet_cell(cell) == written

@@ -22,7 +22,7 @@ def spec(**changes) -> EnvironmentSpec:
         ({"design": {"budget": 1}}, "expected a budget of 2 or more real steps, or 0 for none, got 1"),
     ],
 )
-def test_a_contradiction_is_refused(changes: dict, says: str):
+def test_a_contradicting_specification_of_a_log_is_refused(changes: dict, says: str):
     with pytest.raises(ValueError, match=says):
         spec(**changes)
 

@@ -14,7 +14,7 @@ SIZES = (0, 1, 125, 126, 65_535, 65_536)
 
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("mask", [False, True])
-def test_a_frame_of_the_library_is_read_and_written_alike(size: int, mask: bool):
+def test_websocket_frames_equal_those_of_the_websockets_library(size: int, mask: bool):
     payload = bytes(i % 251 for i in range(size))
     frame = Frame(Opcode.BINARY, payload).serialize(mask=mask, extensions=[])
     extent = extent_of(frame)
@@ -29,7 +29,7 @@ def test_a_frame_of_the_library_is_read_and_written_alike(size: int, mask: bool)
     st.lists(st.tuples(st.sampled_from([Opcode.BINARY, Opcode.PING]), st.binary(max_size=300)), max_size=5),
     st.lists(st.integers(1, 400), min_size=1, max_size=30),
 )
-def test_whole_frames_come_out_of_any_chunks(sent: list[tuple[Opcode, bytes]], cuts: list[int]):
+def test_whole_websocket_frames_are_extracted_from_arbitrary_chunks(sent: list[tuple[Opcode, bytes]], cuts: list[int]):
     written = [Frame(opcode, payload[:125]).serialize(mask=True, extensions=[]) for opcode, payload in sent]
     stream, splitter, found, i = b"".join(written), FrameSplitter(), [], 0
     while stream:
@@ -39,7 +39,7 @@ def test_whole_frames_come_out_of_any_chunks(sent: list[tuple[Opcode, bytes]], c
     assert [frame for frame, _ in found] == written
 
 
-def test_a_message_that_is_too_long_is_returned_unchanged():
+def test_a_too_long_websocket_message_is_passed_on_unchanged():
     splitter, announced = FrameSplitter(max_bytes=100), header(101, MASKED)
     assert splitter.split(announced[:1]) == []
     assert splitter.split(announced[1:]) == [(announced, None)]

@@ -25,7 +25,7 @@ def observations(spec: EnvironmentSpec, *shape: int) -> np.ndarray:
     return np.random.default_rng(1).normal(size=(*shape, len(spec.observation))).astype(np.float32)
 
 
-def test_a_continuous_action_is_a_scaled_tanh():
+def test_continuous_actions_of_a_network_are_scaled_by_tanh():
     made, seen = network(pendulum()), observations(pendulum(), 7)
     x = (seen - [0, 1, 2]) / 2
     hidden, output = made.layers
@@ -37,7 +37,7 @@ def test_a_continuous_action_is_a_scaled_tanh():
 
 
 @pytest.mark.parametrize(("counts", "shape"), [((3, 2), (50, 2)), ((4,), (50,))])
-def test_a_discrete_action_is_the_most_probable_of_each_entry(counts, shape):
+def test_discrete_actions_of_a_network_are_the_most_probable_ones(counts, shape):
     action = MultiDiscreteAction(nvec=counts)
     spec = cartpole().model_copy(update={"action": action})
     made, seen = network(spec), 10 * observations(spec, 50)
@@ -50,7 +50,7 @@ def test_a_discrete_action_is_the_most_probable_of_each_entry(counts, shape):
     assert len(np.unique(chosen)) > 1
 
 
-def test_many_networks_at_once_act_as_each_alone():
+def test_several_stacked_networks_give_the_actions_of_each_alone():
     many, seen = network(pendulum(), 3), observations(pendulum(), 3, 4)
     vector = np.random.default_rng(0).normal(size=(3, Network.size(pendulum(), UNITS)))
     for i in range(3):
@@ -60,7 +60,7 @@ def test_many_networks_at_once_act_as_each_alone():
 
 
 @pytest.mark.parametrize("activation", ["tanh", "relu"])
-def test_layers_follow_one_another(tmp_path: Path, activation):
+def test_the_layers_of_a_network_are_applied_in_order(tmp_path: Path, activation):
     spec, units = pendulum(), (4, 6)
     vector = np.random.default_rng(0).normal(size=Network.size(spec, units))
     made = replace(Network.of(spec, np.zeros(3), np.ones(3), units, vector), activation=activation)
@@ -76,7 +76,7 @@ def test_layers_follow_one_another(tmp_path: Path, activation):
     np.testing.assert_array_equal(Network.load(tmp_path / "policy.zip")(seen), made(seen))
 
 
-def test_a_file_of_version_1_is_still_read(tmp_path: Path):
+def test_a_network_file_of_version_1_is_still_read(tmp_path: Path):
     made, seen = network(pendulum()), observations(pendulum(), 9)
     names = dict(zip(("hidden", "output"), made.layers, strict=True))
     arrays = {name: layer.weights for name, layer in names.items()}
@@ -89,7 +89,7 @@ def test_a_file_of_version_1_is_still_read(tmp_path: Path):
     np.testing.assert_array_equal(Network.load(tmp_path / "old.zip")(seen), made(seen))
 
 
-def test_what_is_saved_is_read_again(tmp_path: Path):
+def test_a_saved_network_is_read_back_unchanged(tmp_path: Path):
     path = tmp_path / "policy.zip"
     for spec in (pendulum(), cartpole()):
         network(spec).save(path)
@@ -98,7 +98,7 @@ def test_what_is_saved_is_read_again(tmp_path: Path):
 
 
 @pytest.mark.parametrize("content", [b"", b"no zip", None])
-def test_another_file_is_refused(tmp_path: Path, content):
+def test_a_file_that_is_not_a_network_is_refused(tmp_path: Path, content):
     path = tmp_path / "policy.zip"
     if content is None:
         with path.open("wb") as file:
@@ -113,7 +113,7 @@ def test_another_file_is_refused(tmp_path: Path, content):
 @pytest.mark.parametrize(
     ("name", "value"), [("mean", np.nan), ("low", -np.inf), ("deviation", 0.0), ("deviation", -1.0)]
 )
-def test_numbers_that_no_training_gives_are_refused(tmp_path: Path, name, value):
+def test_a_network_file_with_invalid_numbers_is_refused(tmp_path: Path, name, value):
     """Such a policy was loaded, and its actions were NaN."""
     made = network(pendulum())
     replace(made, **{name: np.full_like(getattr(made, name), value)}).save(tmp_path / "policy.zip")
@@ -121,7 +121,7 @@ def test_numbers_that_no_training_gives_are_refused(tmp_path: Path, name, value)
         Network.load(tmp_path / "policy.zip")
 
 
-def test_a_weight_that_is_not_finite_is_refused(tmp_path: Path):
+def test_a_network_file_with_a_non_finite_weight_is_refused(tmp_path: Path):
     made = network(pendulum())
     made.layers[-1].weights[0] = np.inf
     made.save(tmp_path / "policy.zip")

@@ -59,7 +59,7 @@ def registry() -> Registry[Thing]:
         ("Member = int", f"expected a subclass of {__name__}.Thing, got <class 'int'>"),
     ],
 )
-def test_whatever_a_module_raises_is_one_sentence(sites: Sites, body: str, said: str):
+def test_any_exception_of_a_plugin_module_becomes_a_one_sentence_error(sites: Sites, body: str, said: str):
     sites.add("bad_package", "bad", body)
     sites.add("good_package", "good", GOOD)
     things = registry()
@@ -69,20 +69,20 @@ def test_whatever_a_module_raises_is_one_sentence(sites: Sites, body: str, said:
         things.get("BAD")
 
 
-def test_a_real_interrupt_ends_the_program(sites: Sites):
+def test_ctrl_c_while_loading_a_plugin_ends_the_program(sites: Sites):
     """One that a module raised by itself looks the same, and ends it too."""
     sites.add("interrupting", "interrupting", "raise KeyboardInterrupt")
     with pytest.raises(KeyboardInterrupt):
         _ = registry().names
 
 
-def test_a_built_in_name_loads_no_package(sites: Sites):
+def test_looking_up_a_built_in_name_loads_no_plugin(sites: Sites):
     sites.add("interrupting", "interrupting", "raise KeyboardInterrupt")
     assert registry().get("Plain") is Plain
 
 
 @pytest.mark.parametrize("order", [("first", "second"), ("second", "first")])
-def test_of_two_packages_with_one_name_none_is_used_and_both_are_named(sites: Sites, order: tuple[str, str]):
+def test_if_two_plugins_have_the_same_name_neither_is_used(sites: Sites, order: tuple[str, str]):
     for package in order:
         sites.add(package, "same" if package == "first" else "Same", GOOD)
     things = registry()
@@ -94,7 +94,7 @@ def test_of_two_packages_with_one_name_none_is_used_and_both_are_named(sites: Si
     }
 
 
-def test_no_package_takes_a_built_in_name(sites: Sites):
+def test_a_plugin_cannot_take_a_built_in_name(sites: Sites):
     sites.add("thief", "PLAIN", GOOD)
     things = registry()
     assert things.get("plain") is Plain

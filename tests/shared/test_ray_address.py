@@ -25,12 +25,14 @@ def mode() -> str | None:
     return os.environ.get(AUTH_MODE)
 
 
-def test_without_a_token_nothing_is_decided():
+def test_without_a_ray_token_the_authentication_mode_is_left_unset():
     assert mode() is None
 
 
 @pytest.mark.parametrize("place", ["home", "path", "variable"])
-def test_a_token_is_sent_wherever_it_is(monkeypatch: pytest.MonkeyPatch, home: Path, place: str):
+def test_a_ray_token_in_any_location_enables_token_authentication(
+    monkeypatch: pytest.MonkeyPatch, home: Path, place: str
+):
     file = home / (".ray/auth_token" if place == "home" else "token")
     file.parent.mkdir(exist_ok=True)
     if place == "variable":
@@ -42,7 +44,7 @@ def test_a_token_is_sent_wherever_it_is(monkeypatch: pytest.MonkeyPatch, home: P
     assert mode() == "token"
 
 
-def test_what_the_user_has_decided_stays(monkeypatch: pytest.MonkeyPatch):
+def test_a_ray_authentication_mode_set_by_the_user_is_kept(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv(TOKEN, "secret")
     monkeypatch.setenv(AUTH_MODE, "disabled")
     assert mode() == "disabled"

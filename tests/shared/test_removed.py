@@ -15,19 +15,19 @@ class Thing:
 
 
 @pytest.mark.parametrize(("kind", "name"), NAMES)
-def test_every_removed_name_says_what_takes_its_place(kind: str, name: str) -> None:
+def test_the_error_for_every_removed_name_states_its_replacement(kind: str, name: str) -> None:
     instead = instead_of(kind, name)
     assert instead
     assert "\n" not in instead
     assert remark(kind, name.upper()) == f"; {name.upper()!r} was removed: {instead}"
 
 
-def test_a_name_that_never_existed_has_no_successor() -> None:
+def test_the_error_for_an_unknown_name_states_no_replacement() -> None:
     assert remark("model", "nobody") == ""
     assert instead_of("nothing", "selected") is None
 
 
-def test_a_registry_that_refuses_a_removed_name_says_it() -> None:
+def test_a_registry_lookup_of_a_removed_name_states_its_replacement() -> None:
     registry = Registry("model", "surrogym.things_of_a_test", Thing, {"plain": Thing})
     with pytest.raises(UnknownMember) as refused:
         registry.get("selected")

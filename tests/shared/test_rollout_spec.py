@@ -13,7 +13,7 @@ def changed(**changes: object) -> EnvironmentSpec:
     return EnvironmentSpec.model_validate({**pendulum().model_dump(), **changes})
 
 
-def test_states_can_be_set_unless_the_specification_says_otherwise() -> None:
+def test_a_specification_declares_settable_states_by_default() -> None:
     assert pendulum().query == "step"
     assert changed(query="rollout", max_rollout=50).max_rollout == 50
 
@@ -22,7 +22,9 @@ def test_states_can_be_set_unless_the_specification_says_otherwise() -> None:
     ("changes", "access"),
     [({}, "any"), ({"query": "rollout", "snapshots": True}, "snapshot"), ({"query": "rollout"}, "reset")],
 )
-def test_access_follows_from_query_and_snapshots(changes: dict[str, object], access: str) -> None:
+def test_the_access_mode_of_a_specification_follows_from_query_and_snapshots(
+    changes: dict[str, object], access: str
+) -> None:
     assert changed(**changes).access == access
 
 
@@ -37,6 +39,6 @@ def test_access_follows_from_query_and_snapshots(changes: dict[str, object], acc
         ({"query": "teleport"}, "'step' or 'rollout'"),
     ],
 )
-def test_contradictions_are_refused(changes: dict[str, object], message: str) -> None:
+def test_contradicting_access_settings_of_a_specification_are_refused(changes: dict[str, object], message: str) -> None:
     with pytest.raises(ValidationError, match=message):
         changed(**changes)

@@ -39,7 +39,7 @@ def rewritten(change) -> bytes:
 
 
 @pytest.mark.parametrize("n", [0, 1, 7])
-def test_what_was_put_in_comes_out(n: int):
+def test_a_surrogate_file_is_read_back_unchanged(n: int):
     written = SurrogateFile("a.b", pendulum(), MODEL, samples(n))
     read = SurrogateFile.from_bytes(written.to_bytes())
     assert (read.name, read.spec) == ("a.b", pendulum())
@@ -52,7 +52,7 @@ def test_what_was_put_in_comes_out(n: int):
         np.testing.assert_array_equal(load(read.model)[name], array)
 
 
-def test_any_reader_of_safetensors_opens_it():
+def test_a_surrogate_file_can_be_opened_by_safetensors():
     arrays = load(DATA)
     np.testing.assert_array_equal(arrays["samples.reward"], WHOLE.samples.reward)
     np.testing.assert_array_equal(arrays["0.inputs"], load(MODEL)["0.inputs"])
@@ -99,7 +99,7 @@ HOSTILE = {
 
 
 @pytest.mark.parametrize("change", HOSTILE.values(), ids=HOSTILE)
-def test_a_file_that_lies_is_refused_in_words(change):
+def test_a_surrogate_file_with_contradicting_content_is_refused(change):
     with pytest.raises(NotASurrogateFile, match=r"expected|contradicts"):
         SurrogateFile.from_bytes(rewritten(change))
 
@@ -109,18 +109,18 @@ def test_a_file_that_lies_is_refused_in_words(change):
     [b"", b"PK\x03\x04", b"\x80\x04cposix\nsystem\n", DATA[:-1], (2**63).to_bytes(8, "little") + DATA[8:], MODEL],
     ids=["empty", "zip", "pickle", "cut", "endless header", "a model alone"],
 )
-def test_other_files_are_refused_in_words(data: bytes):
+def test_a_file_that_is_not_a_surrogate_file_is_refused(data: bytes):
     with pytest.raises(NotASurrogateFile, match="expected"):
         SurrogateFile.from_bytes(data)
 
 
-def test_deep_nesting_is_refused():
+def test_a_surrogate_file_with_deeply_nested_json_is_refused():
     text = b"[" * 100_000
     with pytest.raises(NotASurrogateFile, match="header in JSON"):
         SurrogateFile.from_bytes(len(text).to_bytes(8, "little") + text)
 
 
-def test_sizes_are_bounded(monkeypatch, tmp_path):
+def test_a_surrogate_file_beyond_the_size_limits_is_refused(monkeypatch, tmp_path):
     monkeypatch.setattr(surrogate_file, "MAX_FILE_BYTES", len(DATA) - 1)
     (tmp_path / "large.surrogate").write_bytes(DATA)
     with pytest.raises(NotASurrogateFile, match=r"large\.surrogate: expected a file of at most"):
@@ -129,7 +129,7 @@ def test_sizes_are_bounded(monkeypatch, tmp_path):
 
 @settings(max_examples=200)
 @given(st.lists(st.tuples(st.integers(0, len(DATA) - 1), st.integers(0, 255)), min_size=1, max_size=4))
-def test_random_changes_are_read_or_refused_and_nothing_else(changes):
+def test_a_randomly_changed_surrogate_file_is_read_or_refused_without_a_crash(changes):
     mutated = bytearray(DATA)
     for place, byte in changes:
         mutated[place] = byte

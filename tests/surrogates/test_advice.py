@@ -103,7 +103,7 @@ def models(indices: list[float], error: float = 0.01) -> list[ModelView]:
         ),
     ],
 )
-def test_the_verdict_names_what_is_in_doubt(outputs: tuple[OutputFidelity, ...], phase: str, words: str) -> None:
+def test_the_verdict_names_the_uncertain_outputs(outputs: tuple[OutputFidelity, ...], phase: str, words: str) -> None:
     assert verdict(view(*outputs, phase=phase)) == words
 
 
@@ -116,17 +116,17 @@ def test_the_verdict_names_what_is_in_doubt(outputs: tuple[OutputFidelity, ...],
         (-6.0, 6.0, True, "below -6 or above 6"),
     ],
 )
-def test_the_verdict_says_where_an_output_is_in_doubt(low, high, outside, words) -> None:
+def test_the_verdict_states_the_range_where_an_output_is_uncertain(low, high, outside, words) -> None:
     region = DoubtfulRegion(input="theta", low=low, high=high, outside=outside, share=0.9)
     said = verdict(view(output("x", 1.0), output("r", 0.98, region=region)))
     assert said == f"ready but for r where theta is {words} (confidence 0.98 of 0.999)"
 
 
-def test_established_noise_allows_for_a_larger_error() -> None:
+def test_established_noise_allows_a_larger_error_in_the_verdict() -> None:
     assert verdict(view(output("x", 1.0, error=0.06, noise=0.05), output("r", 0.9))).startswith("ready but for r")
 
 
-def test_noise_is_given_as_a_share_of_the_squared_error() -> None:
+def test_the_estimated_noise_is_shown_as_share_of_the_squared_error() -> None:
     said = noise_in_words(view(output("x", 1.0, error=0.05, noise=0.04), output("v", 1.0, error=0.1, noise=0.2)))
     assert said == "x 0.04 (64 % of its squared error), v 0.2 (100 % of its squared error)"
     said = noise_in_words(view(output("x", 1.0, error=0.05, noise=0.04, sensor_noise=0.03)))
@@ -134,12 +134,12 @@ def test_noise_is_given_as_a_share_of_the_squared_error() -> None:
     assert noise_in_words(view(output("x", 1.0))) == noise_in_words(view()) == ""
 
 
-def test_without_a_model_there_is_nothing_to_say() -> None:
+def test_a_surrogate_without_model_has_no_verdict_and_no_advice() -> None:
     assert verdict(view()) == ""
     assert advice(view(), []) == ""
 
 
-def test_steps_to_go_follow_the_rate_of_the_last_fits() -> None:
+def test_the_advised_number_of_steps_follows_the_progress_of_the_last_fits() -> None:
     """What it lacks falls by e in twenty samples: from e^-4 to 1e-3 that takes 58.2."""
     rate = [1 - 2.718281828 ** -(i / 2) for i in range(1, 9)]
     assert advice(view(output("x", rate[-1])), models(rate)) == (
@@ -148,13 +148,13 @@ def test_steps_to_go_follow_the_rate_of_the_last_fits() -> None:
 
 
 @pytest.mark.parametrize("indices", [[0.7] * 8, [0.9, 0.9, 0.9, 0.9, 0.85, 0.8, 0.75, 0.7]])
-def test_without_progress_a_tolerance_within_reach_is_named(indices: list[float]) -> None:
+def test_without_progress_a_reachable_tolerance_is_advised(indices: list[float]) -> None:
     said = advice(view(output("x", 0.7, error=0.2)), models(indices))
     assert "more real steps hardly help x" in said
     assert said.endswith("surrogym change rig --tolerance x=0.29")
 
 
-def test_an_error_that_falls_too_slowly_is_not_called_hopeless() -> None:
+def test_for_a_slowly_falling_error_the_advice_states_its_progress() -> None:
     falling = [models([0.7] * 8, error=error)[i] for i, error in enumerate([9, 9, 9, 9, 1.74, 1.5, 1.2, 1.05])]
     said = advice(view(output("x", 0.7, error=1.05)), falling)
     assert said.startswith(
@@ -163,12 +163,12 @@ def test_an_error_that_falls_too_slowly_is_not_called_hopeless() -> None:
     assert "hardly" not in said
 
 
-def test_few_rounds_show_no_rate_and_more_steps_are_the_advice() -> None:
+def test_after_few_rounds_the_advice_is_to_double_the_real_steps() -> None:
     said = advice(view(output("x", 0.7, error=0.2)), models([0.7, 0.7]))
     assert said.endswith("as many real steps again: surrogym improve rig --queries 40")
 
 
-def test_an_output_that_never_varied_is_to_be_declared() -> None:
+def test_the_advice_reports_an_output_that_never_varied() -> None:
     said = advice(view(output("reward", 0.5, error=0.08, tolerance=1e-90)), [])
     assert said.startswith("all initial samples had the same reward")
 
@@ -178,14 +178,14 @@ def noisy_output(index: float, error: float) -> OutputFidelity:
     return output("x", index, error=error, noise=0.04, tolerance=0.05)
 
 
-def test_an_error_that_is_nearly_all_noise_is_not_answered_by_real_steps() -> None:
+def test_no_further_real_steps_are_advised_if_the_error_is_mostly_noise() -> None:
     rising = [0.9, 0.92, 0.94, 0.96, 0.97, 0.98, 0.985, 0.99]
     said = advice(view(noisy_output(0.99, error=0.042)), models(rising))
     assert said.startswith("the error of x is nearly all noise (91 % of its square), which more real steps don't lower")
     assert "--queries" not in said
 
 
-def test_an_error_that_the_step_before_explains_leads_to_the_history_and_not_to_a_tolerance() -> None:
+def test_an_error_explained_by_the_previous_step_gives_the_advice_to_declare_history() -> None:
     said = advice(view(output("x", 0.6, error=0.2, past=0.8)), models([0.6] * 12))
     assert "surrogym doctor --env ENVIRONMENT --history 60" in said
     assert "80 % of the squared error of x" in said
@@ -193,12 +193,12 @@ def test_an_error_that_the_step_before_explains_leads_to_the_history_and_not_to_
 
 
 @pytest.mark.parametrize(("index", "error"), [(0.99, 0.08), (0.6, 0.042)])
-def test_an_error_beside_the_noise_or_doubt_elsewhere_is_not_called_noise(index: float, error: float) -> None:
+def test_the_advice_does_not_call_an_error_noise_if_noise_explains_only_part(index: float, error: float) -> None:
     assert "nearly all noise" not in advice(view(noisy_output(index, error)), models([0.6, 0.6]))
 
 
 @pytest.mark.parametrize(("index", "error"), [(0.99, 0.042), (0.9988, 0.042)])
-def test_the_tolerance_for_a_noisy_output_is_just_enough(index: float, error: float) -> None:
+def test_the_tolerance_advised_for_a_noisy_output_is_just_sufficient(index: float, error: float) -> None:
     """The server's index allows sqrt(tolerance^2 + (1.5 noise)^2), and the leave-one-out error 1.25 times
     sqrt(tolerance^2 + noise^2). It leaves noise out that is smaller than the tolerance."""
     said = advice(view(noisy_output(index, error)), [])
@@ -209,7 +209,7 @@ def test_the_tolerance_for_a_noisy_output_is_just_enough(index: float, error: fl
     assert error <= (1.25 if noise else 1.0) * math.hypot(tolerance, noise)
 
 
-def test_samples_that_end_at_a_limit_are_named_where_real_steps_do_not_help() -> None:
+def test_without_progress_the_advice_reports_samples_ending_at_a_limit() -> None:
     limit = ReachedLimit(coordinate="level", side="upper", value=3.0, share=0.31)
     stuck = view(output("x", 0.7, error=0.2))
     assert stuck.fidelity is not None
@@ -225,7 +225,7 @@ def test_a_running_or_ready_design_gets_no_advice(phase: str) -> None:
     assert advice(view(output("x", 0.7), phase=phase), []) == ""
 
 
-def test_waiting_asks_for_a_sampler_only_if_none_runs() -> None:
+def test_the_waiting_message_asks_to_start_a_sampler_only_if_none_runs() -> None:
     idle = view(output("x", 0.7))
     start = "surrogym sample rig --env rig:Rig"
     assert words_of_waiting(idle, start).startswith(f"waiting for a sampler ({start}): 0 of 40 real steps")
@@ -233,7 +233,7 @@ def test_waiting_asks_for_a_sampler_only_if_none_runs() -> None:
     assert words_of_waiting(running, start).startswith("waiting for the sampler's answers: 0 of 40 real steps")
 
 
-def test_a_fit_is_told_because_that_of_a_log_takes_minutes() -> None:
+def test_waiting_messages_mention_a_running_fit() -> None:
     """An audit of a policy of 11,000 logged steps was silent for two minutes after its last real step."""
     fitting = view(output("x", 0.7), phase="fitting")
     fit = "; a model is being fitted to 40 steps"
@@ -245,7 +245,7 @@ def test_a_fit_is_told_because_that_of_a_log_takes_minutes() -> None:
     assert words_of_audit(view(output("x", 0.7), phase="ready")) == "0 real steps of audits"
 
 
-def test_an_uncertain_end_names_index_and_target() -> None:
+def test_the_message_of_a_design_that_ended_unsure_names_index_and_target() -> None:
     assert words_of_uncertainty(view(output("x", 0.7))) == (
         "the design has spent its budget without being certain of its model: confidence index 0.7000, target 0.999"
     )

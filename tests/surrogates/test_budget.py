@@ -35,13 +35,13 @@ def owned(guarded: ServerProcess) -> str:
     return name
 
 
-def test_rounds_within_the_budget_are_announced(guarded: ServerProcess, owned: str) -> None:
+def test_the_real_steps_of_training_rounds_within_the_budget_are_announced(guarded: ServerProcess, owned: str) -> None:
     with Api(guarded.url, TOKENS["train"]) as api:
         words = words_of_rounds(api, owned, queries=4, rounds=2)
     assert words == f"up to 8 more real steps (2 rounds of 4); the budget of {owned!r} has 8 of 12 real steps left"
 
 
-def test_rounds_of_a_ready_design_wait_for_a_failed_audit(
+def test_training_rounds_of_a_ready_design_take_real_steps_only_after_a_failed_audit(
     guarded: ServerProcess, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with Api(guarded.url, TOKENS["admin"]) as api:
@@ -52,14 +52,14 @@ def test_rounds_of_a_ready_design_wait_for_a_failed_audit(
         assert words_of_rounds(api, name, queries=3, rounds=3).endswith("no real steps, unless an audit fails")
 
 
-def test_rounds_beyond_the_budget_need_the_right_to_raise_it(guarded: ServerProcess, owned: str) -> None:
+def test_training_rounds_beyond_the_budget_require_an_admin_token(guarded: ServerProcess, owned: str) -> None:
     with Api(guarded.url, TOKENS["train"]) as api, pytest.raises(BudgetTooSmall, match=rf"{owned} --budget 13\b"):
         words_of_rounds(api, owned, queries=3, rounds=3)
     with Api(guarded.url, TOKENS["admin"]) as api:
         assert words_of_rounds(api, owned, queries=3, rounds=3).endswith("left, and will be raised to at most 13")
 
 
-def test_the_server_refuses_too_and_changes_nothing(guarded: ServerProcess, owned: str) -> None:
+def test_the_server_refuses_improve_beyond_the_budget_and_changes_nothing(guarded: ServerProcess, owned: str) -> None:
     with Api(guarded.url, TOKENS["train"]) as api:
         with pytest.raises(BeyondBudget, match="at most 8 more queries"):
             api.improve(owned, 10_000)
@@ -74,7 +74,7 @@ def test_the_server_refuses_too_and_changes_nothing(guarded: ServerProcess, owne
     [("improve", "--queries", "10000"), ("train", "--improve", "5", "--rounds", "3")],
     ids=["improve", "train"],
 )
-def test_commands_say_it_in_one_sentence(
+def test_commands_refuse_steps_beyond_the_budget_in_one_sentence(
     guarded: ServerProcess,
     owned: str,
     command: tuple[str, ...],

@@ -53,12 +53,14 @@ def assert_same(ours: list[StepResult], theirs: list[StepResult]) -> None:
 
 
 @pytest.mark.parametrize("variant", ["deterministic", "probabilistic", "pathwise"])
-def test_a_file_steps_as_the_server_does_bit_for_bit(pendulum_server: ServerProcess, file: Path, variant: str) -> None:
+def test_an_exported_surrogate_file_steps_bit_equal_to_the_server(
+    pendulum_server: ServerProcess, file: Path, variant: str
+) -> None:
     with HttpSurrogate(pendulum_server.url, "pendulum") as served:
         assert_same(steps_of(open_file(file), variant), steps_of(served, variant))
 
 
-def test_an_imported_surrogate_steps_the_same_and_remembers_its_real_steps(
+def test_an_imported_surrogate_steps_the_same_and_keeps_its_ledger(
     pendulum_server: ServerProcess, file: Path, name: str
 ) -> None:
     read = SurrogateFile.load(file)
@@ -76,7 +78,7 @@ def test_an_imported_surrogate_steps_the_same_and_remembers_its_real_steps(
             import_surrogate(api, read, name)
 
 
-def test_a_model_of_another_environment_is_refused_and_leaves_nothing(
+def test_importing_a_surrogate_with_a_foreign_model_is_refused_and_stores_nothing(
     pendulum_server: ServerProcess, file: Path, name: str
 ) -> None:
     read = SurrogateFile.load(file)
@@ -101,7 +103,7 @@ class Overtaken(Api):
         return super().create_surrogate(name, spec)
 
 
-def test_of_two_imports_at_once_the_later_leaves_the_others_surrogate_alone(
+def test_of_two_simultaneous_imports_the_later_does_not_delete_the_first(
     pendulum_server: ServerProcess, file: Path, name: str
 ) -> None:
     read = SurrogateFile.load(file)
@@ -113,7 +115,9 @@ def test_of_two_imports_at_once_the_later_leaves_the_others_surrogate_alone(
         assert api.surrogate(name).samples == len(read.samples)
 
 
-def test_an_interrupted_import_leaves_nothing(pendulum_server: ServerProcess, file: Path, name: str) -> None:
+def test_an_interrupted_surrogate_import_leaves_no_surrogate(
+    pendulum_server: ServerProcess, file: Path, name: str
+) -> None:
     with Api(pendulum_server.url) as api:
         with pytest.raises(KeyboardInterrupt):
             import_surrogate(api, SurrogateFile.load(file), name, interrupted)
@@ -121,7 +125,7 @@ def test_an_interrupted_import_leaves_nothing(pendulum_server: ServerProcess, fi
             api.surrogate(name)
 
 
-def test_gymnasium_and_stable_baselines_take_the_file(file: Path) -> None:
+def test_a_surrogate_file_can_be_used_with_gymnasium_and_stable_baselines3(file: Path) -> None:
     env = gymnasium.make("surrogym/File-v0", file=file)
     first, _ = env.reset(seed=1)
     assert env.observation_space.contains(first)

@@ -16,7 +16,7 @@ def view(phase: str, samples: int = 2_000) -> Any:
     return Mock(phase=phase, samples=samples, budget=0, ledger=Ledger(logged=samples), fidelity=None)
 
 
-def test_a_fit_is_counted_in_seconds_while_it_runs():
+def test_waiting_for_a_model_shows_the_seconds_of_the_running_fit():
     said = words_of_long_fit(view("fitting"), 12.3)
     assert "a model is being fitted to 2000 steps for 12 s" in said
     assert "with noise" in said
@@ -25,7 +25,7 @@ def test_a_fit_is_counted_in_seconds_while_it_runs():
 
 
 @pytest.mark.parametrize(("phase", "said"), [("fitting", "continues on the server"), ("sampling", "phase is sampling")])
-def test_a_wait_that_ends_before_the_fit_says_what_goes_on(monkeypatch: pytest.MonkeyPatch, phase: str, said: str):
+def test_waiting_that_times_out_reports_that_the_fit_continues(monkeypatch: pytest.MonkeyPatch, phase: str, said: str):
     monkeypatch.setattr(waiting, "LOOK_SECONDS", 0.0)
     api: Any = Mock(surrogate=lambda _: view(phase))
     with pytest.raises(DesignUnfinished, match=said):

@@ -66,48 +66,52 @@ def run(
     return trainings, *training.train()
 
 
-def test_a_promise_that_an_audit_halves_is_trained_on_without_the_budget(monkeypatch, tmp_path: Path) -> None:
+def test_a_training_continues_if_the_audit_lowers_the_promise_clearly(monkeypatch, tmp_path: Path) -> None:
     trainings, result, handover = run(monkeypatch, tmp_path, found(95.6, -21.6), found(97.4, 97.5))
     assert (trainings.made, result.virtual_steps) == (2, 200)
     assert trainings.trained_from == [None, tmp_path / "p.zip"]
     assert handover.promise.median == 97.5
 
 
-def test_a_promise_far_below_the_imagined_return_is_trained_on(monkeypatch, tmp_path: Path) -> None:
+def test_a_training_continues_if_the_promise_is_far_below_the_imagined_return(monkeypatch, tmp_path: Path) -> None:
     trainings, _, _ = run(monkeypatch, tmp_path, found(52.6, 69.7), found(97.4, 97.5), imagined=99.4)
     assert trainings.made == 2
 
 
-def test_a_limited_number_of_virtual_steps_is_not_exceeded_after_an_audit(monkeypatch, tmp_path: Path) -> None:
+def test_a_training_with_a_step_limit_does_not_continue_after_an_audit(monkeypatch, tmp_path: Path) -> None:
     trainings, _, _ = run(monkeypatch, tmp_path, found(95.6, -21.6), steps=100)
     assert trainings.made == 1
 
 
-def test_an_imagined_return_below_the_promise_changes_nothing(monkeypatch, tmp_path: Path) -> None:
+def test_an_imagined_return_below_the_promise_causes_no_further_training(monkeypatch, tmp_path: Path) -> None:
     trainings, _, _ = run(monkeypatch, tmp_path, found(95.6, 94.0), imagined=60.0)
     assert trainings.made == 1
 
 
 @pytest.mark.parametrize("after", [94.0, 120.0])
-def test_a_promise_that_stands_or_grows_is_handed_over(monkeypatch, tmp_path: Path, after: float) -> None:
+def test_a_policy_whose_promise_stays_or_grows_after_the_audit_is_handed_over(
+    monkeypatch, tmp_path: Path, after: float
+) -> None:
     trainings, _, handover = run(monkeypatch, tmp_path, found(95.6, after))
     assert trainings.made == 1
     assert handover.trusted
 
 
-def test_a_failed_audit_without_budget_is_trained_on_where_the_promise_falls(monkeypatch, tmp_path: Path) -> None:
+def test_after_a_failed_audit_training_continues_if_the_promise_fell(monkeypatch, tmp_path: Path) -> None:
     trainings, _, handover = run(monkeypatch, tmp_path, found(95.6, -21.6, passed=False), found(97.4, 97.5))
     assert trainings.made == 2
     assert handover.trusted
 
 
-def test_a_failed_audit_without_budget_is_handed_over_where_the_promise_stands(monkeypatch, tmp_path: Path) -> None:
+def test_after_a_failed_audit_with_unchanged_promise_the_policy_is_handed_over_untrusted(
+    monkeypatch, tmp_path: Path
+) -> None:
     trainings, _, handover = run(monkeypatch, tmp_path, found(95.6, 94.0, passed=False))
     assert trainings.made == 1
     assert not handover.trusted
 
 
-def test_promises_that_fall_again_and_again_end(monkeypatch, tmp_path: Path) -> None:
+def test_training_stops_after_a_limited_number_of_audits(monkeypatch, tmp_path: Path) -> None:
     trainings, _, handover = run(monkeypatch, tmp_path, *[found(95.6, -21.6)] * MOST_AUDITS)
     assert trainings.made == MOST_AUDITS
     assert handover.promise.median == -21.6
@@ -149,7 +153,7 @@ def rounds_taken(
 @pytest.mark.parametrize(
     ("role", "unspent", "improved"), [("admin", 0, []), ("admin", 1, [12]), ("admin", 2, [12, 12]), ("trainer", 2, [])]
 )
-def test_a_failed_audit_takes_the_steps_of_rounds_that_took_none(
+def test_a_failed_audit_uses_the_unspent_steps_of_earlier_rounds(
     monkeypatch, tmp_path: Path, role: str, unspent: int, improved: list[int]
 ) -> None:
     """The budget has none left: the loop raises it by a round's steps, and it took none where the model seemed sure."""
@@ -168,14 +172,14 @@ def test_a_failed_audit_takes_the_steps_of_rounds_that_took_none(
         (3, "ready", 0.9, []),
     ],
 )
-def test_a_passed_audit_takes_them_if_the_model_is_no_longer_certain_where_the_policy_goes(
+def test_a_passed_audit_uses_unspent_steps_if_visited_states_became_uncertain(
     monkeypatch, tmp_path: Path, unspent: int, phase: str, certain: float | None, improved: list[int]
 ) -> None:
     taken, made = rounds_taken(monkeypatch, tmp_path, passed=True, unspent=unspent, phase=phase, certain=certain)
     assert (taken, made) == (improved, 1 + len(improved))
 
 
-def test_a_ready_design_whose_index_fell_takes_them_where_the_policy_goes(monkeypatch, tmp_path: Path) -> None:
+def test_unspent_steps_are_used_if_the_confidence_of_a_ready_design_fell(monkeypatch, tmp_path: Path) -> None:
     taken, _ = rounds_taken(monkeypatch, tmp_path, passed=True, unspent=3, phase="ready", certain=0.9, index=0.9986)
     assert taken == [12, 12]
 
@@ -189,7 +193,7 @@ def test_a_ready_design_whose_index_fell_takes_them_where_the_policy_goes(monkey
         (76.0, 3, "over_budget", []),
     ],
 )
-def test_a_passed_audit_takes_them_if_the_promise_is_wide(
+def test_a_passed_audit_uses_unspent_steps_if_the_promise_interval_is_wide(
     monkeypatch, tmp_path: Path, low: float, unspent: int, phase: str, improved: list[int]
 ) -> None:
     """94 is promised, beyond an untrained policy's 0. A fifth of that is 18.8."""

@@ -44,7 +44,7 @@ def trained(path: Path, policy: bytes, steps: int) -> TrainResult:
 
 
 @pytest.mark.parametrize("later", [b"slowly to the middle", b"away"])
-def test_a_later_policy_that_is_worse_gives_way_to_an_earlier_one(port, tmp_path: Path, later: bytes) -> None:
+def test_an_earlier_policy_replaces_a_clearly_worse_later_one(port, tmp_path: Path, later: bytes) -> None:
     candidates, path = Candidates(load), tmp_path / "policy.zip"
     candidates.keep(trained(path, b"away", 100))
     candidates.keep(trained(path, b"to the middle", 200))
@@ -54,7 +54,7 @@ def test_a_later_policy_that_is_worse_gives_way_to_an_earlier_one(port, tmp_path
     assert (best.virtual_steps, best.lost_episodes) == (300, 2), "all that was spent"
 
 
-def test_a_later_policy_that_is_better_stays(port, tmp_path: Path) -> None:
+def test_a_better_later_policy_is_kept(port, tmp_path: Path) -> None:
     candidates, path = Candidates(load), tmp_path / "policy.zip"
     candidates.keep(trained(path, b"away", 100))
     latest = trained(path, b"to the middle", 200)
@@ -62,7 +62,7 @@ def test_a_later_policy_that_is_better_stays(port, tmp_path: Path) -> None:
     assert path.read_bytes() == b"to the middle"
 
 
-def test_the_same_policy_is_not_compared_with_itself(port, tmp_path: Path) -> None:
+def test_identical_candidate_policies_are_not_compared(port, tmp_path: Path) -> None:
     candidates, path = Candidates(load), tmp_path / "policy.zip"
     latest = trained(path, b"away", 100)
     candidates.keep(latest)
@@ -70,7 +70,7 @@ def test_the_same_policy_is_not_compared_with_itself(port, tmp_path: Path) -> No
     assert port.steps == 0
 
 
-def test_a_policy_that_can_not_be_read_leaves_the_latest_in_place(port, tmp_path: Path) -> None:
+def test_an_unreadable_candidate_policy_leaves_the_latest_one_in_place(port, tmp_path: Path) -> None:
     candidates, path = Candidates(load), tmp_path / "policy.zip"
     candidates.keep(trained(path, b"broken", 100))
     latest = trained(path, b"to the middle", 200)
@@ -85,7 +85,7 @@ class Audited(AuditedTraining):
     _chosen = TrainSettings()  # type: ignore[assignment]
 
 
-def test_policy_of_every_training_after_an_audit_is_a_candidate(port, tmp_path: Path, monkeypatch) -> None:
+def test_the_policy_of_every_training_after_an_audit_is_a_candidate(port, tmp_path: Path, monkeypatch) -> None:
     path, later = tmp_path / "policy.zip", iter([b"to the middle", b"slowly to the middle"])
     monkeypatch.setattr(audited, "train", lambda *_: trained(path, next(later), 100))
     training = Audited(None, "line", port, path, TrainSettings())  # type: ignore[arg-type]

@@ -31,26 +31,26 @@ def after(untrained: Returns, *checks: Returns, earned: float = BEST, saved: Ret
 @pytest.mark.parametrize(
     ("successes", "learned"), [(6, False), (22, True), (64, True)], ids=["a few more", "a third", "all"]
 )
-def test_a_quarter_of_the_episodes_has_to_earn_more(successes: int, learned: bool):
+def test_a_network_counts_as_learned_if_a_quarter_of_its_episodes_earn_more(successes: int, learned: bool):
     assert after(UNTRAINED, episodes(successes)).learned is learned
 
 
-def test_many_episodes_do_not_count_if_the_mean_is_no_higher():
+def test_a_network_whose_mean_return_did_not_rise_has_not_learned():
     assert not after(UNTRAINED, episodes(22, 10.0)).learned
 
 
 @pytest.mark.parametrize(("successes", "learned"), [(58, True), (20, False)], ids=["most starts", "no other start"])
-def test_the_mean_decides_where_a_quarter_of_the_starts_succeeds_untrained(successes: int, learned: bool):
+def test_if_the_untrained_policy_often_succeeds_the_mean_decides_about_learning(successes: int, learned: bool):
     assert after(episodes(20, 1.0), episodes(successes, 1.0), earned=1.0).learned is learned
 
 
-def test_a_new_network_has_to_reach_half_of_the_gain_of_a_saved_policy():
+def test_a_new_network_must_reach_half_the_gain_of_the_saved_policy():
     flat = np.ones(64)
     assert not after(-100 * flat, -60 * flat, earned=-10.0, saved=-10 * flat).learned
     assert after(-100 * flat, -50 * flat, earned=-10.0, saved=-10 * flat).learned
 
 
-def test_training_is_over_once_three_checks_earn_the_most_there_is():
+def test_training_stops_after_three_checks_with_the_maximum_return():
     full = np.full(64, 500.0)
     assert after(full / 25, full, full, full, earned=500.0).saturated
     assert not after(full / 25, full, full, earned=500.0).saturated
@@ -67,18 +67,18 @@ def test_training_is_over_once_three_checks_earn_the_most_there_is():
         pytest.param(0.0, 10.0, [50.0, 60.0, 70.0, 80.0, 80.0], id="each check earns more"),
     ],
 )
-def test_training_continues_while_more_may_be_earned(untrained: float, earned: float, checks: Sequence[float]):
+def test_training_continues_while_a_higher_return_is_possible(untrained: float, earned: float, checks: Sequence[float]):
     flat = np.ones(64)
     assert not after(untrained * flat, *(each * flat for each in checks), earned=earned).saturated
 
 
-def test_training_continues_while_episodes_of_a_check_differ():
+def test_training_continues_while_the_returns_of_a_check_differ():
     """Long episodes end rarely: a policy soon earns more in checks than any finished episode of the training."""
     differ = np.linspace(0, 820, 64)
     assert not after(np.zeros(64), differ, differ, differ, earned=10.0).saturated
 
 
-def test_a_gain_is_paired_clear_and_not_too_small():
+def test_a_policy_gain_must_be_significant_and_not_too_small():
     rng = np.random.default_rng(0)
     starts = rng.normal(0, 100, 64)  # good and bad starts, the same for every policy
     untrained, before = starts - 1_000, starts - 100

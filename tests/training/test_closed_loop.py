@@ -70,7 +70,7 @@ def sampling(url: str, name: str, spec: EnvironmentSpec) -> Iterator[None]:
     [(1e-9, 4, 4 + 2 * 3, 2), (1e3, 4, 4, 1), (1e3, 8, 6, 0)],
     ids=["unsure", "known where it goes", "ready"],
 )
-def test_rounds_end_when_the_visited_region_is_known_or_design_ready(
+def test_closed_loop_rounds_end_once_visited_states_are_known_or_the_design_is_ready(
     own_server: ServerProcess,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -119,7 +119,7 @@ def test_rounds_end_when_the_visited_region_is_known_or_design_ready(
     assert all(isinstance(now, TrainProgress) and now.steps <= now.total_steps for now in seen)
 
 
-def test_who_names_a_variant_and_preset_paper_keep_it(pendulum_server: ServerProcess) -> None:
+def test_a_chosen_session_variant_and_preset_paper_are_kept_in_training(pendulum_server: ServerProcess) -> None:
     with Api(pendulum_server.url) as api:
         view = api.surrogate("pendulum")
     unsure = view.model_copy(update={"phase": "over_budget"})
@@ -139,7 +139,7 @@ def test_who_names_a_variant_and_preset_paper_keep_it(pendulum_server: ServerPro
     assert SETTINGS.judging == SETTINGS.session, "who learns by the mean is compared by it"
 
 
-def test_a_policy_that_explores_by_state_visits_each_lanes_own_way_and_the_same_each_time(tmp_path: Path) -> None:
+def test_state_dependent_exploration_is_reproducible_and_differs_between_environments(tmp_path: Path) -> None:
     out, spec = tmp_path / "policy.zip", pendulum()
     port = LocalSurrogate(spec, learn(definition_from_spec(spec), random_steps(spec, 8, seed=0)).model)
     hyperparameters = {"n_steps": 16, "use_sde": True}
@@ -152,7 +152,7 @@ def test_a_policy_that_explores_by_state_visits_each_lanes_own_way_and_the_same_
     assert np.array_equal(actions, again(same))
 
 
-def test_rounds_share_the_requested_steps() -> None:
+def test_closed_loop_rounds_share_the_requested_virtual_steps() -> None:
     assert shares(TrainSettings(total_steps=1_750), rounds=3) == (1_750, 250), "the last has four rounds' steps"
     assert shares(TrainSettings(total_steps=1_900), rounds=9) == (1_900, 100), "many rounds leave it half and more"
     assert shares(TrainSettings("PPO"), rounds=3) == (1_000_000, 150_000)

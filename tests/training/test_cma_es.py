@@ -36,7 +36,7 @@ def surrogate() -> LocalSurrogate:
     return local(short(pendulum()))
 
 
-def test_generations_are_as_many_as_the_steps_allow(surrogate, tmp_path: Path):
+def test_the_number_of_cma_es_generations_follows_from_the_virtual_steps(surrogate, tmp_path: Path):
     seen = []
     result = train(surrogate, tmp_path / "policy.zip", small(total_steps=8 * 2 * 20 * 3 + 10), seen.append)
     assert result.virtual_steps == 8 * 2 * 20 * 3
@@ -45,7 +45,7 @@ def test_generations_are_as_many_as_the_steps_allow(surrogate, tmp_path: Path):
     assert not surrogate._sessions
 
 
-def test_no_units_make_a_linear_policy(surrogate, tmp_path: Path):
+def test_cma_es_with_zero_hidden_units_searches_a_linear_policy(surrogate, tmp_path: Path):
     """Such a policy is saved, read and acts as any other."""
     linear = {**SMALL, "units": 0}
     result = train(surrogate, tmp_path / "policy.zip", small(total_steps=640, hyperparameters=linear))
@@ -57,7 +57,7 @@ def test_no_units_make_a_linear_policy(surrogate, tmp_path: Path):
     np.testing.assert_allclose(load_policy(result.path)(observations), expected, atol=1e-6)
 
 
-def test_a_penalty_is_reported(surrogate, tmp_path: Path):
+def test_cma_es_reports_the_uncertainty_penalty(surrogate, tmp_path: Path):
     reports, results = [], []
     for penalty in (0.0, 100.0):
         settings = small(session={"penalty": penalty}, total_steps=320)
@@ -68,7 +68,7 @@ def test_a_penalty_is_reported(surrogate, tmp_path: Path):
     assert results[1].episode_penalty == penalised.episode_penalty > 0
 
 
-def test_the_same_seed_finds_the_same_policy(surrogate, tmp_path: Path):
+def test_cma_es_finds_the_same_policy_with_the_same_seed(surrogate, tmp_path: Path):
     def found(seed: int) -> np.ndarray:
         return Network.load(train(surrogate, tmp_path / "p.zip", small(seed=seed, total_steps=1_000)).path).vector
 
@@ -76,7 +76,7 @@ def test_the_same_seed_finds_the_same_policy(surrogate, tmp_path: Path):
     assert not np.array_equal(found(0), found(1))
 
 
-def test_it_learns_to_balance_and_evaluation_reads_the_file(tmp_path: Path):
+def test_cma_es_learns_to_balance_and_evaluate_reads_its_policy(tmp_path: Path):
     surrogate = local(cartpole().model_copy(update={"time_limit": 60}))
     result = train(surrogate, tmp_path / "policy.zip", small(total_steps=12 * 8 * 2 * 60))
     assert result.imagined_return > 55
@@ -84,7 +84,7 @@ def test_it_learns_to_balance_and_evaluation_reads_the_file(tmp_path: Path):
     assert returns.mean() > 50
 
 
-def test_it_continues_from_a_network(surrogate, tmp_path: Path):
+def test_cma_es_continues_from_a_saved_network(surrogate, tmp_path: Path):
     first = train(surrogate, tmp_path / "first.zip", small(total_steps=3_000))
     second = train(surrogate, tmp_path / "second.zip", small(start_from=first.path, seed=1, total_steps=320))
     assert second.path.exists()
@@ -93,19 +93,19 @@ def test_it_continues_from_a_network(surrogate, tmp_path: Path):
         train(surrogate, tmp_path / "third.zip", wider)
 
 
-def test_unknown_hyperparameters_are_refused(surrogate, tmp_path: Path):
+def test_unknown_cma_es_hyperparameters_are_refused(surrogate, tmp_path: Path):
     with pytest.raises(ValueError, match="population, starts, units, sigma, got gamma"):
         train(surrogate, tmp_path / "policy.zip", small(hyperparameters={"gamma": 0.9}))
 
 
-def test_it_is_not_prolonged(surrogate, tmp_path: Path):
+def test_a_cma_es_training_is_not_prolonged(surrogate, tmp_path: Path):
     with pytest.raises(ValueError, match="can't be prolonged"):
         train(surrogate, tmp_path / "policy.zip", small(prolong=True))
     assert not list(tmp_path.iterdir())
     assert not is_prolonged(small(total_steps=None), pendulum())
 
 
-def test_a_goal_far_from_the_start_is_found(tmp_path: Path):
+def test_cma_es_finds_a_policy_to_a_goal_far_from_the_start(tmp_path: Path):
     """Whole policies explore: noise on each action leads nowhere here."""
     surrogate = local(mountain_car_continuous())
     settings = TrainSettings(
@@ -114,7 +114,7 @@ def test_a_goal_far_from_the_start_is_found(tmp_path: Path):
     assert train(surrogate, tmp_path / "policy.zip", settings).imagined_return > 80
 
 
-def test_an_interruption_keeps_what_was_found(surrogate, tmp_path: Path):
+def test_an_interrupted_cma_es_training_keeps_its_best_policy(surrogate, tmp_path: Path):
     def interrupt(now):
         raise KeyboardInterrupt
 

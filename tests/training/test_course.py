@@ -14,7 +14,7 @@ REPORTED = [  # of a demo, whose bar went back twice
 ]
 
 
-def test_the_share_never_falls_when_a_training_is_extended():
+def test_the_training_progress_never_falls_when_the_training_is_extended():
     course = Course()
     shares = [course.share(*reported) for reported in REPORTED]
     assert shares == sorted(shares)
@@ -22,18 +22,18 @@ def test_the_share_never_falls_when_a_training_is_extended():
     assert shares[-1] == pytest.approx(1.0)
 
 
-def test_the_share_of_a_training_that_is_not_extended_is_that_of_its_steps():
+def test_the_progress_of_a_training_without_extension_is_its_share_of_steps():
     course = Course()
     assert [course.share(steps, 400) for steps in (100, 200, 400)] == [0.25, 0.5, 1.0]
 
 
-def test_a_training_after_another_continues_its_steps():
+def test_the_step_count_of_a_following_training_continues_the_first():
     now = after(TrainProgress(50, 200, None, 0.0), done=1_000)
     assert (now.steps, now.total_steps) == (1_050, 1_200)
     assert after(TrainProgress(50, 200, None, 0.0), done=1_000, total=5_000).total_steps == 5_000
 
 
-def test_the_time_left_follows_from_the_pace_of_the_steps():
+def test_the_estimated_remaining_time_follows_the_steps_per_second():
     """The first estimate was far too long: it took the time of compiling for that of the first steps."""
     course, compiling = Course(), 60.0
     assert course.words_of_time_left(100, 1_000, compiling + 1.0) == "", "no pace is known yet"
@@ -42,7 +42,7 @@ def test_the_time_left_follows_from_the_pace_of_the_steps():
     assert course.words_of_time_left(1_000, 1_000, compiling + 10.0) == ""
 
 
-def test_nothing_is_said_of_the_time_left_before_the_first_step():
+def test_no_remaining_time_is_estimated_before_the_first_step():
     course = Course()
     assert course.words_of_time_left(0, 400, 10.0) == course.words_of_time_left(0, 400, 20.0) == ""
     assert course.words_of_time_left(100, 400, 30.0) == ", about 60 s left"

@@ -54,7 +54,7 @@ def several() -> EnvironmentSpec:
 
 @pytest.mark.parametrize("make", [pendulum, cartpole, several], ids=["continuous", "discrete", "several choices"])
 @pytest.mark.parametrize("compiled", [pytest.param(True, marks=needs_numba), False], ids=["compiled", "numpy"])
-def test_an_update_is_that_of_stable_baselines3(make: Callable[[], EnvironmentSpec], compiled: bool):
+def test_a_numpy_ppo_update_equals_that_of_stable_baselines3(make: Callable[[], EnvironmentSpec], compiled: bool):
     """The same parameters after three updates of the same rollout, where some ratios are clipped."""
     spec, rng = make(), np.random.default_rng(0)
     size = len(spec.observation)
@@ -72,7 +72,7 @@ def test_an_update_is_that_of_stable_baselines3(make: Callable[[], EnvironmentSp
         np.testing.assert_allclose(learner.further, made.policy.log_std.detach().numpy(), atol=2e-5)
 
 
-def test_rewards_are_scaled_as_by_vec_normalize():
+def test_numpy_ppo_scales_rewards_like_vec_normalize():
     rng, gamma = np.random.default_rng(1), 0.97
     scale, statistics, returns = RewardScale(5, gamma), RunningMeanStd(shape=()), np.zeros(5)
     for _ in range(50):
@@ -84,7 +84,7 @@ def test_rewards_are_scaled_as_by_vec_normalize():
         np.testing.assert_allclose(scale(reward, ended), expected, rtol=1e-12)
 
 
-def test_advantages_are_those_of_a_rollout_buffer():
+def test_numpy_ppo_advantages_equal_those_of_stable_baselines3():
     rng, steps, lanes = np.random.default_rng(2), 30, 4
     rewards, values = (rng.normal(size=(steps, lanes)).astype(np.float32) for _ in range(2))
     ended, last = rng.random((steps, lanes)) < 0.2, rng.normal(size=lanes).astype(np.float32)
@@ -103,7 +103,7 @@ def test_advantages_are_those_of_a_rollout_buffer():
     )
 
 
-def test_a_lost_session_cuts_its_episodes_and_collecting_continues(surrogate):
+def test_a_lost_session_truncates_its_episodes_and_collection_continues(surrogate):
     """One step of the rollout ends them where they stood; the others are taken in a new session."""
     spec, lanes = surrogate.spec(), 6
     learner = Learner(spec, np.zeros(3), np.ones(3), (8,), np.random.default_rng(0))
@@ -123,13 +123,13 @@ def test_a_lost_session_cuts_its_episodes_and_collecting_continues(surrogate):
     assert len(following.earned) == lanes
 
 
-def test_imagined_episodes_begin_anew_where_the_session_is_lost(surrogate):
+def test_imagined_episodes_restart_if_the_session_is_lost(surrogate):
     network = Learner(surrogate.spec(), np.zeros(3), np.ones(3), (8,), np.random.default_rng(0)).policy()
     returns = [imagined_returns(port, network, 4, 0) for port in (surrogate, Forgetful(surrogate, at=1))]
     np.testing.assert_array_equal(*returns)
 
 
-def test_choices_are_drawn_by_their_probabilities():
+def test_discrete_actions_are_drawn_with_their_probabilities():
     scores = np.array([[1.0, 0.0, -1.0, 0.5, 0.0]], dtype=np.float32)
     choices, rng = Choices((3, 2)), np.random.default_rng(0)
     actions, logs = choices.sample(np.repeat(scores, 40_000, 0), choices.further(), rng)
@@ -141,7 +141,7 @@ def test_choices_are_drawn_by_their_probabilities():
     assert choices.sent(actions).shape == (40_000, 2)
 
 
-def test_a_bounded_action_is_noise_around_its_mean_and_sent_within_its_bounds():
+def test_continuous_actions_are_normal_around_the_mean_and_clipped_to_bounds():
     bounded, rng = Bounded(np.float32([1.0]), np.float32([2.0])), np.random.default_rng(0)
     outputs = np.full((40_000, 1), 0.5, dtype=np.float32)
     actions, logs = bounded.sample(outputs, bounded.further(), rng)
@@ -152,7 +152,7 @@ def test_a_bounded_action_is_noise_around_its_mean_and_sent_within_its_bounds():
     assert bounded.sent(actions).max() == 3
 
 
-def test_it_learns(tmp_path: Path):
+def test_numpy_ppo_learns_to_improve_its_return(tmp_path: Path):
     """An untrained CartPole falls after some twenty steps."""
     spec = cartpole().model_copy(update={"time_limit": 100})
     port = LocalSurrogate(spec, learn(definition_from_spec(spec), random_steps(spec, 40, seed=0)).model)
@@ -160,7 +160,7 @@ def test_it_learns(tmp_path: Path):
     assert train(port, tmp_path / "policy.zip", settings).imagined_return > 80
 
 
-def test_its_saved_policy_acts_with_and_without_noise(surrogate, tmp_path: Path):
+def test_a_policy_saved_by_numpy_ppo_acts_with_and_without_noise(surrogate, tmp_path: Path):
     settings = TrainSettings(algorithm="fastppo", total_steps=512, num_envs=16, hyperparameters=SMALL)
     path = train(surrogate, tmp_path / "policy.zip", settings).path
     observations = np.random.default_rng(0).normal(size=(2_000, 3)).astype(np.float32)
@@ -171,7 +171,7 @@ def test_its_saved_policy_acts_with_and_without_noise(surrogate, tmp_path: Path)
 
 
 @pytest.mark.parametrize("make", [pendulum, cartpole], ids=["continuous", "discrete"])
-def test_inputs_standardised_anew_leave_the_policy_as_it_was(make: Callable[[], EnvironmentSpec]):
+def test_restandardising_the_inputs_does_not_change_the_policy(make: Callable[[], EnvironmentSpec]):
     """An input that hardly varies keeps a tenth of its deviation, so that it does not explode where it varies later."""
     spec, rng = make(), np.random.default_rng(0)
     size = len(spec.observation)
@@ -202,7 +202,7 @@ def watched(monkeypatch: pytest.MonkeyPatch) -> list[dict]:
     return opened
 
 
-def test_a_training_refines_its_policy_from_the_declared_starts(surrogate, tmp_path: Path, monkeypatch):
+def test_numpy_ppo_refines_its_policy_from_the_declared_starts(surrogate, tmp_path: Path, monkeypatch):
     """The policy is never worse in the surrogate than before. Chosen steps are not followed by it."""
     opened = watched(monkeypatch)
     settings = TrainSettings(algorithm="fastppo", total_steps=4_096, num_envs=16, hyperparameters=SMALL, prolong=False)
@@ -222,7 +222,7 @@ def test_a_training_refines_its_policy_from_the_declared_starts(surrogate, tmp_p
     assert train(surrogate, tmp_path / "further.zip", further).imagined_return >= refined.imagined_return
 
 
-def test_it_continues_from_a_saved_policy(surrogate, tmp_path: Path):
+def test_numpy_ppo_continues_from_a_saved_policy(surrogate, tmp_path: Path):
     """Parameters and the moments of Adam; a policy alone is refused."""
     settings = TrainSettings(algorithm="fastppo", total_steps=512, num_envs=16, hyperparameters=SMALL, prolong=False)
     first = train(surrogate, tmp_path / "first.zip", settings).path
@@ -247,7 +247,7 @@ def learned(monkeypatch: pytest.MonkeyPatch, value: bool) -> None:
     [(mountain_car_continuous(), [1, searches.HELD]), (cartpole(), [1])],
     ids=["continuous", "discrete"],
 )
-def test_a_network_that_learned_nothing_is_followed_by_another(spec, noise, tmp_path: Path, monkeypatch):
+def test_a_network_that_does_not_learn_is_replaced_by_a_new_one(spec, noise, tmp_path: Path, monkeypatch):
     """Every second one explores by held noise, where actions are continuous. All of them together stay within the
     chosen steps."""
     holds: list[int] = []
@@ -271,7 +271,7 @@ def test_a_network_that_learned_nothing_is_followed_by_another(spec, noise, tmp_
 
 
 @pytest.mark.parametrize(("gained", "cycles"), [(True, 6), (False, 1)], ids=["while it gains", "it gains no more"])
-def test_cycles_follow_while_the_second_half_of_the_last_one_gained(
+def test_training_cycles_continue_while_the_last_one_improved(
     surrogate, gained: bool, cycles: int, tmp_path: Path, monkeypatch
 ):
     learned(monkeypatch, True)
@@ -282,7 +282,7 @@ def test_cycles_follow_while_the_second_half_of_the_last_one_gained(
     assert result.gaining is gained
 
 
-def test_a_saved_policy_stays_until_a_new_network_comes_near(surrogate, tmp_path: Path, monkeypatch):
+def test_with_anew_the_saved_policy_is_kept_until_a_new_network_is_comparable(surrogate, tmp_path: Path, monkeypatch):
     """With ``anew`` a new network learns beside it. The saved one is trained further only if that one falls short."""
     monkeypatch.setattr(searches, "PATIENT_ROLLOUTS", 2)
     small = {"total_steps": 2_048, "num_envs": 16, "hyperparameters": SMALL, "prolong": False}
@@ -295,7 +295,7 @@ def test_a_saved_policy_stays_until_a_new_network_comes_near(surrogate, tmp_path
     assert result.imagined_return == pytest.approx(start.imagined_return)
 
 
-def test_only_stable_baselines3_trains_its_policies_further(surrogate, tmp_path: Path):
+def test_numpy_ppo_refuses_to_continue_a_stable_baselines3_policy(surrogate, tmp_path: Path):
     small = {"total_steps": 512, "num_envs": 16, "hyperparameters": SMALL, "prolong": False}
     start = train(surrogate, tmp_path / "first.zip", TrainSettings("ppo", **small)).path
     for anew in (False, True):
@@ -303,7 +303,7 @@ def test_only_stable_baselines3_trains_its_policies_further(surrogate, tmp_path:
         assert train(surrogate, tmp_path / "further.zip", further).algorithm == "PPO"
 
 
-def test_training_ends_early_where_nothing_can_be_gained(surrogate, tmp_path: Path, monkeypatch):
+def test_numpy_ppo_ends_early_if_nothing_can_be_gained(surrogate, tmp_path: Path, monkeypatch):
     monkeypatch.setattr(Checks, "saturated", property(lambda self: self.best is not None))
     settings = TrainSettings(algorithm="fastppo", total_steps=8_192, num_envs=16, hyperparameters=SMALL, prolong=True)
     result = train(surrogate, tmp_path / "policy.zip", settings)
@@ -312,7 +312,7 @@ def test_training_ends_early_where_nothing_can_be_gained(surrogate, tmp_path: Pa
     load_policy(result.path, result.algorithm)
 
 
-def test_ctrl_c_keeps_the_best_policy_so_far(surrogate, tmp_path: Path):
+def test_ctrl_c_during_numpy_ppo_keeps_the_best_policy_so_far(surrogate, tmp_path: Path):
     def interrupt(now) -> None:
         if now.imagined_return is not None:
             raise KeyboardInterrupt
@@ -328,6 +328,6 @@ def test_ctrl_c_keeps_the_best_policy_so_far(surrogate, tmp_path: Path):
     ("name", "value"),
     [("n_steps", 0), ("n_steps", 2.5), ("n_steps", True), ("clip_range", -1.0), ("gamma", 2.0), ("n_epochs", "x")],
 )
-def test_impossible_settings_are_refused(name: str, value: object):
+def test_invalid_numpy_ppo_settings_are_refused(name: str, value: object):
     with pytest.raises(ValueError, match=f"{name}: expected .* got {value!r}"):
         search_for(TrainSettings(algorithm="fastppo", hyperparameters={name: value}))

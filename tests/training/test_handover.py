@@ -91,7 +91,7 @@ def _until_deleted(sampler: Sampler) -> None:
         sampler.run()
 
 
-def test_a_right_model_passes_and_its_steps_stand_apart(line: Place) -> None:
+def test_a_correct_model_passes_the_audit_and_audit_steps_cost_no_budget(line: Place) -> None:
     before = line.api.surrogate(line.name)
     handover = hand_over(line.subject(), AUDIT)
     after = line.api.surrogate(line.name)
@@ -105,7 +105,7 @@ def test_a_right_model_passes_and_its_steps_stand_apart(line: Place) -> None:
     assert after.samples == before.samples + 8, "the model learns from the audit"
 
 
-def test_a_policy_that_promises_no_more_than_an_untrained_one_is_not_trusted(line: Place) -> None:
+def test_a_policy_promising_no_more_than_an_untrained_one_is_not_trusted(line: Place) -> None:
     """A promise without width passed for a sure one, where no policy could change the return."""
     best = hand_over(line.subject(), None).promise
     assert best is not None
@@ -114,7 +114,7 @@ def test_a_policy_that_promises_no_more_than_an_untrained_one_is_not_trusted(lin
     assert handover.reason.startswith("the promise is no more than the return of an untrained policy")
 
 
-def test_a_machine_that_has_changed_fails_the_audit(line: Place) -> None:
+def test_a_changed_environment_fails_the_audit(line: Place) -> None:
     line.environment.changed = True
     handover = hand_over(line.subject(), AUDIT)
     assert not handover.trusted
@@ -132,7 +132,7 @@ class Bowl(Changed):
 
 
 @pytest.mark.parametrize("wrong", [True, False])
-def test_members_of_an_ensemble_that_agree_and_are_wrong_fail_the_audit(
+def test_an_ensemble_whose_members_agree_but_are_wrong_fails_the_audit(
     server_process: ServerProcess, wrong: bool
 ) -> None:
     """Their disagreement can't show it: all have learned from the same samples."""
@@ -157,7 +157,7 @@ class Slope(Line):
         return replace(step, reward=0.0 if self.changed and x > 0.6 else 1 - x)
 
 
-def test_a_ready_design_is_audited_in_the_gaps_of_its_samples_too(server_process: ServerProcess) -> None:
+def test_the_audit_of_a_ready_design_includes_gaps_between_its_samples(server_process: ServerProcess) -> None:
     with placed(server_process.url, SPEC, Slope()) as place:
         assert place.api.surrogate(place.name).phase == "ready"
         handover = hand_over(place.subject(), AUDIT)
@@ -168,7 +168,7 @@ def test_a_ready_design_is_audited_in_the_gaps_of_its_samples_too(server_process
         )
 
 
-def test_what_is_wrong_in_a_gap_fails_the_audit_of_a_ready_design(server_process: ServerProcess) -> None:
+def test_a_model_error_in_a_sample_gap_fails_the_audit_of_a_ready_design(server_process: ServerProcess) -> None:
     """The promise is right: the policy does not go there, perhaps because of what the model has wrong."""
     with placed(server_process.url, SPEC, Slope()) as place:
         place.environment.changed = True
@@ -179,7 +179,7 @@ def test_what_is_wrong_in_a_gap_fails_the_audit_of_a_ready_design(server_process
         assert not handover.trusted
 
 
-def test_without_a_sampler_an_audit_is_given_up(
+def test_an_audit_without_a_sampler_is_given_up(
     pendulum_server: ServerProcess, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(waiting, "FIRST_LEASE_SECONDS", 1.0)
@@ -192,7 +192,7 @@ def test_without_a_sampler_an_audit_is_given_up(
     assert handover.reason.endswith(NO_SAMPLER)
 
 
-def test_where_no_state_can_be_set_an_audit_is_a_whole_episode(server_process: ServerProcess) -> None:
+def test_the_audit_of_a_reset_only_environment_is_a_whole_episode(server_process: ServerProcess) -> None:
     with placed(server_process.url, rail.SPEC, rail.Rail()) as place:
         handover = hand_over(place.subject(), AUDIT)
         assert handover.audit is not None
@@ -219,7 +219,7 @@ class Paying(rail.Rail):
 
 
 @pytest.mark.parametrize("changed", [False, True])
-def test_whole_episodes_judge_the_way_and_the_return(server_process: ServerProcess, changed: bool) -> None:
+def test_an_audit_by_whole_episodes_checks_dynamics_and_return(server_process: ServerProcess, changed: bool) -> None:
     with placed(server_process.url, rail.SPEC, Paying()) as place:
         real = Paying()
         real.changed = changed
@@ -243,7 +243,7 @@ class Broken(Changed):
         return super().step_from(coordinates, action)
 
 
-def test_a_step_that_fails_on_the_way_is_not_left_out(server_process: ServerProcess) -> None:
+def test_a_failed_audit_step_counts_against_the_model(server_process: ServerProcess) -> None:
     with placed(server_process.url, SPEC, Broken()) as place:
         place.environment.changed = True
         handover = hand_over(place.subject(), AUDIT)
@@ -274,7 +274,9 @@ class Interlocked(rail.Rail):
 
 
 @pytest.mark.parametrize("fails", [False, True], ids=["ends", "fails"])
-def test_a_rollout_that_does_not_get_far_is_not_trusted(server_process: ServerProcess, fails: bool) -> None:
+def test_a_policy_whose_audit_rollout_fails_or_ends_early_is_not_trusted(
+    server_process: ServerProcess, fails: bool
+) -> None:
     with placed(server_process.url, rail.SPEC, Interlocked()) as place:
         place.environment.fails, place.environment.changed = fails, True
         handover = hand_over(place.subject(), AUDIT)
@@ -293,7 +295,7 @@ class Growing(Line):
         return RealStep(coordinates, action, [2 * x + 0.1 * float(action[0])], reward=x**2)
 
 
-def test_a_way_that_leaves_what_can_be_set_is_not_trusted(server_process: ServerProcess) -> None:
+def test_a_policy_that_leaves_the_sampling_range_is_not_trusted(server_process: ServerProcess) -> None:
     with placed(server_process.url, SPEC, Growing()) as place:
         handover = hand_over(place.subject(), AUDIT)
         assert handover.audit is not None
@@ -302,7 +304,7 @@ def test_a_way_that_leaves_what_can_be_set_is_not_trusted(server_process: Server
         assert "beyond what the original environment can be set to" in handover.reason
 
 
-def test_the_way_of_a_policy_is_what_it_visits(line: Place) -> None:
+def test_the_audited_states_are_those_the_policy_visits_in_the_surrogate(line: Place) -> None:
     q, u = way_of(line.subject(), 4, 20)
     assert q.shape == (80, 1)
     assert np.abs(u).max() <= 1
@@ -310,7 +312,7 @@ def test_the_way_of_a_policy_is_what_it_visits(line: Place) -> None:
     assert moved == pytest.approx(0.1 * u[:-4, 0], abs=0.05)
 
 
-def test_a_failed_audit_is_on_the_result_of_a_training(line: Place, tmp_path: Path) -> None:
+def test_the_result_of_a_training_contains_a_failed_audit(line: Place, tmp_path: Path) -> None:
     line.environment.changed = True
     line.api.patch_surrogate(line.name, budget=line.api.surrogate(line.name).ledger.total)
     settings = TrainSettings(algorithm="CMAES", total_steps=2_000)
@@ -322,7 +324,7 @@ def test_a_failed_audit_is_on_the_result_of_a_training(line: Place, tmp_path: Pa
 
 
 @pytest.mark.parametrize("own", [True, False], ids=["its own surrogate", "another surrogate"])
-def test_the_command_audits_a_policy_and_notes_it_on_the_card(
+def test_the_audit_command_stores_its_result_in_the_policy_description(
     line: Place, tmp_path: Path, capsys: pytest.CaptureFixture[str], server_process: ServerProcess, own: bool
 ) -> None:
     """In another surrogate the card's gain over an untrained policy is worth nothing: this policy does nothing."""

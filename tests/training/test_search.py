@@ -24,29 +24,29 @@ PAPER = pendulum().model_copy(update={"design": Design(preset="paper", budget=40
     ],
     ids=["nothing", "its hyperparameter", "another's hyperparameter", "tracker", "paper", "named"],
 )
-def test_the_fast_search_is_chosen_unless_only_its_reference_serves(chosen: dict, spec, name: str):
+def test_fastppo_is_the_default_policy_search_unless_settings_need_stable_baselines3(chosen: dict, spec, name: str):
     assert with_algorithm(TrainSettings(**chosen), spec).algorithm == name
 
 
-def test_a_policy_of_stable_baselines3_is_continued_by_its_own_library(tmp_path: Path):
+def test_continuing_a_stable_baselines3_policy_selects_stable_baselines3_ppo(tmp_path: Path):
     start = tmp_path / "policy.zip"
     start.write_bytes(b"no network of arrays")
     assert with_algorithm(TrainSettings(start_from=start), pendulum()).algorithm == "PPO"
 
 
-def test_a_tracker_is_refused_where_nothing_is_logged():
+def test_a_tracker_is_refused_by_a_policy_search_that_does_not_log():
     with pytest.raises(ValueError, match="FASTPPO reports to no tracker: leave mlflow out"):
         search_for(TrainSettings("fastppo", tracker="mlflow"))
 
 
 @pytest.mark.parametrize("chosen", [{"start_visited": 0.5}, {"horizon": 20}], ids=["visited starts", "horizon"])
-def test_a_search_over_whole_episodes_refuses_parts_of_them(chosen: dict):
+def test_a_policy_search_over_whole_episodes_refuses_shortened_episodes(chosen: dict):
     with pytest.raises(ValueError, match="runs whole episodes"):
         search_for(TrainSettings(algorithm="cmaes", **chosen))
     search_for(TrainSettings(algorithm="fastppo", **chosen))
 
 
-def test_visited_starts_replace_those_anywhere_unless_both_are_chosen():
+def test_start_visited_replaces_the_default_start_box_unless_both_are_given():
     assert TrainSettings(start_visited=0.5, horizon=20).learning == {
         "seed": 0,
         "start_box": 0.0,

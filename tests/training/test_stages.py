@@ -32,7 +32,7 @@ def task(settings: TrainSettings | None = None, limit: int | None = 500) -> Sear
 @pytest.mark.parametrize(
     ("limit", "length"), [(500, 500 // SHORTER), (60, SHORTEST), (20, 20)], ids=["long", "a few steps", "fewer"]
 )
-def test_training_episodes_are_short_and_half_of_them_begin_anywhere(limit: int, length: int):
+def test_first_stage_training_episodes_are_short_and_half_start_anywhere(limit: int, length: int):
     stage = learn(task(limit=limit))
     assert stage.settings.learning == {"seed": 0, "start_box": 0.5, "time_limit": length}
     assert stage.settings.judging == {}, "checks are whole episodes from the declared starts"
@@ -44,14 +44,14 @@ def test_training_episodes_are_short_and_half_of_them_begin_anywhere(limit: int,
     [{"start_box": 0.2}, {"session": {"time_limit": 150}}, {"horizon": 20}, {"start_visited": 0.5}],
     ids=["starts", "limit", "horizon", "visited states"],
 )
-def test_chosen_starts_and_lengths_are_kept(chosen: dict[str, Any]):
+def test_chosen_training_starts_and_episode_lengths_are_kept(chosen: dict[str, Any]):
     given = task(TrainSettings(**chosen))
     stage = learn(given)
     assert stage.settings == given.settings
     assert stage.gamma == suggested_gamma(given.port.spec())
 
 
-def test_refining_takes_whole_episodes_from_declared_starts():
+def test_second_stage_training_uses_whole_episodes_from_declared_starts():
     stage = refine(task(TrainSettings(session={"variant": "pathwise"}, horizon=20)))
     assert stage.settings.learning == {"seed": 0, "start_box": 0.0, "start_visited": 0.0, "variant": "pathwise"}
     assert stage.gamma == suggested_gamma(plane().model_copy(update={"time_limit": 500}))

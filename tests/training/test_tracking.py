@@ -33,14 +33,16 @@ def small(**settings: Any) -> TrainSettings:
     return TrainSettings(total_steps=256, num_envs=8, hyperparameters=HYPERPARAMETERS, **settings)
 
 
-def test_tensorboard_has_the_curves_beside_the_policy(surrogate: LocalSurrogate, tmp_path: Path) -> None:
+def test_training_curves_are_written_for_tensorboard_beside_the_policy(
+    surrogate: LocalSurrogate, tmp_path: Path
+) -> None:
     train(surrogate, tmp_path / "policy.zip", small(tracker="tensorboard"))
     (run,) = (tmp_path / "tensorboard").iterdir()
     curves = EventAccumulator(str(run)).Reload().Tags()["scalars"]
     assert {"surrogym/imagined_return", "surrogym/penalty_share", "train/loss"} <= set(curves)
 
 
-def test_no_tracker_writes_nothing_but_the_policy_and_its_settings(
+def test_without_a_tracker_training_writes_only_policy_and_settings(
     surrogate: LocalSurrogate, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
@@ -48,7 +50,7 @@ def test_no_tracker_writes_nothing_but_the_policy_and_its_settings(
     assert {path.name for path in tmp_path.iterdir()} == {"policy.zip", "policy.json"}
 
 
-def test_mlflow_is_given_settings_and_numbers(
+def test_a_training_logs_settings_and_metrics_to_mlflow(
     surrogate: LocalSurrogate, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     told = Recorder()
@@ -61,7 +63,7 @@ def test_mlflow_is_given_settings_and_numbers(
     assert all(isinstance(value, float) for value in told.metrics.values())
 
 
-def test_a_tracker_that_is_not_installed_stops_the_training_before_it_begins(
+def test_a_training_with_a_missing_tracker_is_refused_before_it_starts(
     surrogate: LocalSurrogate, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "wandb", None)
@@ -70,7 +72,7 @@ def test_a_tracker_that_is_not_installed_stops_the_training_before_it_begins(
     assert not (tmp_path / "policy.zip").exists()
 
 
-def test_cmaes_refuses_a_tracker(surrogate: LocalSurrogate, tmp_path: Path) -> None:
+def test_training_with_cma_es_refuses_a_tracker(surrogate: LocalSurrogate, tmp_path: Path) -> None:
     settings = TrainSettings(algorithm="cmaes", tracker="mlflow")
     with pytest.raises(ValueError, match="leave mlflow out"):
         train(surrogate, tmp_path / "policy.zip", settings)

@@ -46,7 +46,7 @@ def small(**settings) -> TrainSettings:
     return TrainSettings(**{"algorithm": "PPO", "total_steps": 256, "num_envs": 8, "hyperparameters": SMALL} | settings)
 
 
-def test_no_promise_of_an_earlier_policy_stays_if_the_policy_is_not_saved(surrogate, tmp_path: Path):
+def test_the_promise_of_an_earlier_policy_is_deleted_before_the_new_one_is_saved(surrogate, tmp_path: Path):
     """Else a kill between the two files leaves a new policy with an old verdict."""
     out = tmp_path / "policy.zip"
     out.mkdir()
@@ -56,7 +56,7 @@ def test_no_promise_of_an_earlier_policy_stays_if_the_policy_is_not_saved(surrog
     assert not out.with_suffix(".json").exists()
 
 
-def test_a_policy_and_what_it_was_trained_with_are_written(surrogate, tmp_path: Path):
+def test_training_writes_the_policy_and_its_settings(surrogate, tmp_path: Path):
     out, seen = tmp_path / "new" / "policy.zip", []
     result = train(surrogate, out, small(), seen.append)
     loaded = PPO.load(out, device="cpu")
@@ -73,12 +73,12 @@ def test_a_policy_and_what_it_was_trained_with_are_written(surrogate, tmp_path: 
 
 
 @pytest.mark.parametrize(("total", "taken"), [(128, 128), (255, 128), (300, 256), (1, 128)])
-def test_whole_rollouts_are_taken_and_no_more_than_the_total_allows(surrogate, tmp_path: Path, total, taken):
+def test_training_takes_whole_rollouts_within_the_total_number_of_steps(surrogate, tmp_path: Path, total, taken):
     result = train(surrogate, tmp_path / "policy.zip", small(total_steps=total))
     assert result.virtual_steps == result.settings["total_steps"] == taken
 
 
-def test_the_same_seed_gives_the_same_policy(surrogate, tmp_path: Path):
+def test_training_with_the_same_seed_gives_the_same_policy(surrogate, tmp_path: Path):
     def weights(seed: int, name: str) -> np.ndarray:
         train(surrogate, tmp_path / name, small(seed=seed, total_steps=128))
         policy = PPO.load(tmp_path / name, device="cpu").policy
@@ -101,7 +101,7 @@ def test_training_continues_from_a_saved_policy(surrogate, tmp_path: Path):
     assert distance(one, two) < 0.3 * distance(one, fresh)
 
 
-def test_given_settings_override_those_saved_with_the_policy(surrogate, tmp_path: Path):
+def test_given_training_settings_override_those_saved_with_the_policy(surrogate, tmp_path: Path):
     first, second = tmp_path / "first.zip", tmp_path / "second.zip"
     train(surrogate, first, small(total_steps=128))
     asked = SMALL | {"learning_rate": 1e-5, "n_steps": 32, "ent_coef": 0.01}
@@ -111,7 +111,7 @@ def test_given_settings_override_those_saved_with_the_policy(surrogate, tmp_path
     assert {name: result.settings[name] for name in asked} == asked
 
 
-def test_the_misfit_of_a_policy_is_named(surrogate, tmp_path: Path):
+def test_the_error_for_a_start_policy_that_does_not_fit_names_the_difference(surrogate, tmp_path: Path):
     first = tmp_path / "first.zip"
     train(surrogate, first, small(total_steps=128))
     for changes in ({"n_steps": "many"}, {"device": "moon"}):
@@ -121,7 +121,7 @@ def test_the_misfit_of_a_policy_is_named(surrogate, tmp_path: Path):
         train(local(cartpole()), tmp_path / "policy.zip", small(start_from=first))
 
 
-def test_a_file_of_another_algorithm_is_not_gone_on_from(surrogate, tmp_path: Path):
+def test_training_refuses_to_continue_a_policy_of_another_algorithm(surrogate, tmp_path: Path):
     a_search = tmp_path / "search.zip"
     few = {"population": 4, "starts": 2, "units": 2}
     train(surrogate, a_search, TrainSettings(algorithm="cmaes", total_steps=1, hyperparameters=few))
@@ -137,7 +137,7 @@ def distance(a: PaperPolicy, b: PaperPolicy) -> float:
     return sum(float((p - q).detach().square().sum()) for p, q in pairs) ** 0.5
 
 
-def test_an_episodes_penalty_comes_with_its_end(surrogate):
+def test_the_info_of_an_ended_episode_contains_its_total_penalty(surrogate):
     env, taken = SurrogateVecEnv.from_port(surrogate, 2, seed=0, penalty=100.0, time_limit=4), np.zeros(2)
     env.reset()
     for _ in range(4):
@@ -147,7 +147,7 @@ def test_an_episodes_penalty_comes_with_its_end(surrogate):
     np.testing.assert_allclose([info["penalty"] for info in infos], taken, rtol=1e-5)
 
 
-def test_a_penalty_is_reported(surrogate, tmp_path: Path):
+def test_training_reports_the_uncertainty_penalty(surrogate, tmp_path: Path):
     reports = []
     for penalty in (0.0, 100.0):
         session = {"penalty": penalty, "time_limit": 4}
@@ -160,13 +160,13 @@ def test_a_penalty_is_reported(surrogate, tmp_path: Path):
 
 
 @pytest.mark.parametrize("session", [{"variant": "pathwise"}, {"trust": 0.1}, {"process_noise": True}])
-def test_every_kind_of_session_trains(surrogate, tmp_path: Path, session):
+def test_training_works_with_every_session_variant(surrogate, tmp_path: Path, session):
     result = train(surrogate, tmp_path / "policy.zip", small(session=session, total_steps=128))
     assert result.settings["session"] == session
     assert result.virtual_steps == 128
 
 
-def test_the_policy_with_the_best_imagined_return_is_kept(surrogate, tmp_path: Path):
+def test_training_keeps_the_policy_with_the_best_imagined_return(surrogate, tmp_path: Path):
     seen: list[float] = []
     ruinous = {"learning_rate": 0.3}  # every update throws away what was learned
     settings = small(total_steps=512, hyperparameters=SMALL | ruinous)
@@ -189,14 +189,14 @@ def test_imagined_returns_are_whole_episodes_from_the_declared_starts(surrogate)
 
 
 @pytest.mark.parametrize(("preset", "hidden"), [("default", [64, 64]), ("paper", [32])])
-def test_the_papers_network_belongs_to_its_preset(tmp_path: Path, preset, hidden):
+def test_the_papers_policy_network_is_used_only_with_preset_paper(tmp_path: Path, preset, hidden):
     spec = make("Pendulum-v1", preset=preset).spec()
     result = train(local(spec), tmp_path / "policy.zip", small(total_steps=128))
     network = PPO.load(result.path, device="cpu").policy.mlp_extractor.policy_net
     assert [layer.out_features for layer in network if hasattr(layer, "out_features")] == hidden
 
 
-def test_a_discrete_task_trains(tmp_path: Path):
+def test_training_works_with_discrete_actions(tmp_path: Path):
     result = train(local(cartpole()), tmp_path / "policy.zip", small())
     assert result.virtual_steps == 256
     assert result.imagined_return is not None
@@ -205,7 +205,7 @@ def test_a_discrete_task_trains(tmp_path: Path):
 
 
 @pytest.mark.parametrize("algorithm", ["A2C", "sac", "TD3"])
-def test_other_algorithms_by_name(surrogate, tmp_path: Path, algorithm):
+def test_other_stable_baselines3_algorithms_can_be_trained_by_name(surrogate, tmp_path: Path, algorithm):
     hyperparameters = {"n_steps": 8} if algorithm == "A2C" else {"learning_starts": 32, "batch_size": 16}
     settings = small(algorithm=algorithm, num_envs=4, total_steps=64, hyperparameters=hyperparameters)
     result = train(surrogate, tmp_path / "policy.zip", settings)
@@ -213,7 +213,7 @@ def test_other_algorithms_by_name(surrogate, tmp_path: Path, algorithm):
     assert SEARCHES.get(algorithm).algorithm.load(tmp_path / "policy.zip", device="cpu") is not None
 
 
-def test_dqn_takes_one_discrete_action_and_sac_none(tmp_path: Path):
+def test_dqn_trains_on_one_discrete_action_and_sac_refuses_it(tmp_path: Path):
     surrogate, quick = local(cartpole()), {"learning_starts": 32, "batch_size": 16}
     settings = small(algorithm="dqn", num_envs=4, total_steps=64, hyperparameters=quick)
     result = train(surrogate, tmp_path / "policy.zip", settings)
@@ -233,14 +233,14 @@ def test_dqn_takes_one_discrete_action_and_sac_none(tmp_path: Path):
         ({"total_steps": MAX_STEPS + 1}, f"expected 1 to {MAX_STEPS}, got {MAX_STEPS + 1}"),
     ],
 )
-def test_an_impossible_training_is_refused(surrogate, tmp_path: Path, settings, complaint):
+def test_invalid_training_settings_are_refused(surrogate, tmp_path: Path, settings, complaint):
     with pytest.raises(ValueError, match=complaint):
         train(surrogate, tmp_path / "policy.zip", small(**settings))
     assert not list(tmp_path.iterdir())
     assert not surrogate._sessions, "every session was closed"
 
 
-def test_settings_follow_from_the_specification(surrogate):
+def test_default_training_settings_follow_from_the_specification(surrogate):
     assert suggested_gamma(pendulum()) == pytest.approx(0.985)
     assert suggested_gamma(cartpole()) == pytest.approx(0.994)
     assert suggested_gamma(pendulum().model_copy(update={"time_limit": 20})) == 0.9
@@ -249,11 +249,11 @@ def test_settings_follow_from_the_specification(surrogate):
 
 
 @pytest.mark.parametrize(("rollout", "batch"), [(8_192, 1_024), (128, 128), (1_536, 1_536), (3_072, 1_024), (1, 1)])
-def test_a_rollout_is_a_whole_number_of_batches(rollout, batch):
+def test_the_default_batch_size_divides_the_rollout_length(rollout, batch):
     assert even_batch(rollout) == batch
 
 
-def test_statistics_are_of_the_sampling_range(surrogate):
+def test_observation_statistics_are_computed_over_the_sampling_range(surrogate):
     mean, deviation = observation_statistics(surrogate, seed=0)
     np.testing.assert_allclose(mean, [0, 0, 0], atol=0.5)
     np.testing.assert_allclose(deviation, [0.5**0.5, 0.5**0.5, 16 / 12**0.5], rtol=0.1)
@@ -274,7 +274,7 @@ def test_ctrl_c_before_the_first_rollout_leaves_an_untrained_policy(surrogate, t
     assert load_policy(tmp_path / "policy.zip")(np.zeros((1, 3), np.float32)).shape == (1, 1)
 
 
-def test_nobody_asked_for_a_number_of_steps_so_a_training_may_take_more_cycles_but_not_the_papers():
+def test_a_training_without_given_steps_is_prolonged_except_with_preset_paper():
     default, paper = pendulum(), make("Pendulum-v1", preset="paper").spec()
     assert prolongs(TrainSettings(), default)
     assert not prolongs(TrainSettings(total_steps=1_000), default)
@@ -283,7 +283,9 @@ def test_nobody_asked_for_a_number_of_steps_so_a_training_may_take_more_cycles_b
 
 
 @pytest.mark.parametrize("earned", [40.0, 160.0], ids=["less", "more"])
-def test_anew_the_saved_policy_stays_if_a_new_network_earns_less(surrogate, tmp_path: Path, monkeypatch, earned: float):
+def test_with_anew_the_saved_policy_is_kept_if_a_new_network_earns_less(
+    surrogate, tmp_path: Path, monkeypatch, earned: float
+):
     """An untrained network earns nothing, the saved policy 100."""
     saved = tmp_path / "saved.zip"
     train(surrogate, saved, small(total_steps=128))
@@ -295,12 +297,12 @@ def test_anew_the_saved_policy_stays_if_a_new_network_earns_less(surrogate, tmp_
     assert (distance(one, two) == 0) is (earned < 100)
 
 
-def test_it_takes_the_steps_that_it_was_given_and_no_more(surrogate):
+def test_stable_baselines3_ppo_refuses_to_be_prolonged(surrogate):
     with pytest.raises(ValueError, match="PPO trains for a fixed number of steps"):
         search_for(small(prolong=True))
 
 
-def test_policies_are_compared_by_what_was_asked_for_and_not_by_what_they_learn_in(surrogate, tmp_path: Path):
+def test_policies_are_compared_in_the_judging_session_and_not_the_training_one(surrogate, tmp_path: Path):
     session = {"time_limit": 4}
     asked = small(session=session, judge={"variant": "pathwise", "time_limit": 3})
     result = train(surrogate, tmp_path / "policy.zip", asked)
@@ -312,7 +314,7 @@ def test_policies_are_compared_by_what_was_asked_for_and_not_by_what_they_learn_
 
 
 @pytest.mark.parametrize("threads", [0, 10**9, 1.5, True])
-def test_as_many_threads_as_no_machine_has_are_refused(threads: Any):
+def test_a_training_with_an_absurd_number_of_threads_is_refused(threads: Any):
     """Torch would start them, and the process end."""
     with pytest.raises(ValueError, match="threads: expected a whole number from 1 to 1024, got"):
         TrainSettings(threads=threads)

@@ -48,7 +48,7 @@ def sample(number: int) -> wire.SampleView:
     )
 
 
-def test_samples_are_resent_with_their_key_after_a_lost_reply():
+def test_samples_are_resent_with_their_idempotency_key_after_a_lost_reply():
     added = said(wire.AddedSamples(sample_ids=[1], duplicates=1, ledger=wire.Ledger(manual=1, total=1)))
     with api_of(lost_reply, added, added) as (api, server):
         api.add_samples("pendulum", "me", [SAMPLE])
@@ -57,7 +57,7 @@ def test_samples_are_resent_with_their_key_after_a_lost_reply():
     assert keys[0] == keys[1] != keys[2]
 
 
-def test_it_is_known_which_samples_a_server_stored_before_it_refused_others():
+def test_the_client_reports_which_samples_were_stored_before_a_refusal():
     """A caller that can tell the stored samples from the others loses none and sends none in vain."""
     many, stored = [SAMPLE] * 1500, list[wire.AddedSamples]()
     first = wire.AddedSamples(sample_ids=[1], duplicates=0, ledger=wire.Ledger(manual=1, total=1))
@@ -104,7 +104,7 @@ def test_an_invalid_name_is_refused_without_a_request(name: str):
 
 
 @pytest.mark.parametrize("identity", ["", ".", "..", "a/b", "../surrogates", "a\\b"])
-def test_an_id_that_no_session_can_have_reaches_no_server(identity: str):
+def test_an_invalid_session_id_is_refused_without_a_request(identity: str):
     with api_of(reply("{}")) as (api, server):
         remote = HttpSurrogate(api.url, "pendulum")
         for call in (remote.reset, remote.close):
@@ -116,7 +116,7 @@ def test_an_id_that_no_session_can_have_reaches_no_server(identity: str):
 
 
 @pytest.mark.parametrize(("identity", "sent"), [("-2aay_C", "-2aay_C"), ("a b%2Fc", "a%20b%252Fc"), ("a..", "a..")])
-def test_the_id_of_a_session_is_quoted(identity: str, sent: str):
+def test_session_ids_are_url_quoted_in_requests(identity: str, sent: str):
     with api_of(reply("")) as (api, server):
         HttpSurrogate(api.url, "pendulum").close(identity)
         assert [request.path for request in server.received] == [f"/v1/sessions/{sent}"]
@@ -155,7 +155,7 @@ def test_all_pages_of_surrogates_are_read():
     assert [request.path for request in server.received] == ["/v1/surrogates?after=0", "/v1/surrogates?after=7"]
 
 
-def test_a_broken_stream_of_events_continues_after_the_last_event():
+def test_a_broken_event_stream_continues_after_the_last_event():
     first = reply(": connected\n\n" + event(1) + event(2), content_type="text/event-stream")
     second = reply(": connected\n\n" + event(3), content_type="text/event-stream")
     gone = problem(Code.UNKNOWN_SURROGATE)
@@ -167,7 +167,7 @@ def test_a_broken_stream_of_events_continues_after_the_last_event():
     assert [r.headers["Last-Event-ID"] for r in server.received] == ["0", "2", "2", "3"]
 
 
-def test_a_patch_says_only_what_it_is_given():
+def test_a_patch_request_contains_only_the_given_fields():
     with api_of(problem(Code.FORBIDDEN)) as (api, server):
         with pytest.raises(errors.Forbidden):
             api.patch_surrogate("pendulum", paused=True)
@@ -176,7 +176,7 @@ def test_a_patch_says_only_what_it_is_given():
         assert body == {"paused": True, "budget": None, "target": None, "tolerances": None}
 
 
-def test_another_protocol_is_refused():
+def test_a_server_with_another_protocol_version_is_refused():
     newer = said(wire.Health(version="9", protocol=wire.PROTOCOL + 1))
     with (
         api_of(newer) as (api, _),
@@ -185,7 +185,7 @@ def test_another_protocol_is_refused():
         api.health()
 
 
-def test_an_answer_of_another_shape_is_refused():
+def test_a_reply_that_does_not_match_its_schema_is_refused():
     other = reply('{"models": [{"version": "first"}]}')
     with (
         api_of(other) as (api, _),
@@ -194,13 +194,13 @@ def test_an_answer_of_another_shape_is_refused():
         api.models("pendulum")
 
 
-def test_a_server_on_its_way_up_is_waited_for():
+def test_the_client_waits_for_a_server_that_is_starting():
     ready = said(wire.Ready(status="ready", storage="ok"))
     with api_of(problem(Code.UNAVAILABLE), ready, said(wire.Health(version="1"))) as (api, _):
         assert api.wait_until_ready(5.0).version == "1"
 
 
-def test_every_method_is_typed_and_explains_itself():
+def test_every_api_method_has_a_docstring_and_a_return_type():
     methods = {name: member for name, member in vars(Api).items() if callable(member) and not name.startswith("_")}
     assert len(methods) > 20
     for name, method in methods.items():

@@ -54,7 +54,7 @@ def test_a_late_reply_never_answers_a_later_request():
         assert connection.send("POST", "/x", b"2") == b"third"
 
 
-def test_a_time_out_differs_from_a_dead_server():
+def test_a_timeout_and_an_unreachable_server_raise_different_errors():
     with (
         scripted_server(reply("late", delay=0.3)) as server,
         Connection(server.url, retries=NEVER) as connection,
@@ -63,13 +63,13 @@ def test_a_time_out_differs_from_a_dead_server():
         connection.send("GET", "/x", timeout=0.05)
 
 
-def test_a_dead_server_is_named():
+def test_the_error_for_an_unreachable_server_contains_its_address():
     url = f"http://127.0.0.1:{unused_port()}"
     with Connection(url, retries=NEVER) as connection, pytest.raises(errors.ServerUnreachable, match=url):
         connection.send("GET", "/x")
 
 
-def test_a_server_that_comes_up_late_is_waited_for():
+def test_a_connection_waits_for_a_server_that_starts_late():
     port = unused_port()
     listening = socket.socket()
 
@@ -90,7 +90,7 @@ def test_a_server_that_comes_up_late_is_waited_for():
         thread.join()
 
 
-def test_a_refusal_is_raised_at_once_as_its_own_error():
+def test_an_error_reply_is_raised_at_once_as_its_own_exception():
     refusal = problem(Code.SPEC_CONFLICT, "another spec")
     with scripted_server(refusal) as server, Connection(server.url, retries=QUICK) as connection:
         with pytest.raises(errors.SpecConflict, match="another spec"):
@@ -99,7 +99,7 @@ def test_a_refusal_is_raised_at_once_as_its_own_error():
 
 
 @pytest.mark.parametrize("status", [200, 302, 307, 404])
-def test_a_server_of_another_kind_is_no_surrogym_server(status: int):
+def test_a_reply_from_a_foreign_http_server_is_refused(status: int):
     """A login page or a redirect must not be exported as samples."""
     with (
         scripted_server(reply("<html>", status, "text/html")) as server,
@@ -109,7 +109,7 @@ def test_a_server_of_another_kind_is_no_surrogym_server(status: int):
         connection.send("GET", "/x")
 
 
-def test_a_gateway_without_a_server_behind_it_is_waited_for():
+def test_a_connection_retries_after_a_bad_gateway_reply():
     script = [reply("<html>", 502, "text/html"), reply("done")]
     with scripted_server(*script) as server, Connection(server.url, retries=QUICK) as connection:
         assert connection.send("GET", "/x") == b"done"
@@ -121,7 +121,7 @@ def test_an_invalid_server_address_is_refused(url: str):
         Connection(url)
 
 
-def test_the_token_is_sent_and_the_environment_gives_defaults(monkeypatch: pytest.MonkeyPatch):
+def test_address_and_token_default_to_environment_variables(monkeypatch: pytest.MonkeyPatch):
     with scripted_server(reply("done")) as server:
         monkeypatch.setenv("SURROGYM_URL", server.url + "/")
         monkeypatch.setenv("SURROGYM_TOKEN", "from-environment")
@@ -132,7 +132,7 @@ def test_the_token_is_sent_and_the_environment_gives_defaults(monkeypatch: pytes
         assert server.received[-1].path == "/x"
 
 
-def test_a_token_comes_from_a_file_too(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+def test_the_token_can_be_read_from_a_file(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     (tmp_path / "token").write_text("train:from-a-file\n")
     monkeypatch.setenv("SURROGYM_TOKEN_FILE", str(tmp_path / "token"))
     for token, expected in (("", "from-a-file"), ("from-environment", "from-environment")):
@@ -151,7 +151,7 @@ def test_a_token_comes_from_a_file_too(monkeypatch: pytest.MonkeyPatch, tmp_path
         ("king:a-secret", "a token's role: expected one of read, train, sample, admin before the colon, got another"),
     ],
 )
-def test_a_token_file_that_holds_no_token_is_refused(monkeypatch, tmp_path: Path, content: str | None, message: str):
+def test_a_token_file_without_a_token_is_refused(monkeypatch, tmp_path: Path, content: str | None, message: str):
     file = tmp_path / "token"
     if content is not None:
         file.write_text(content)
@@ -163,12 +163,12 @@ def test_a_token_file_that_holds_no_token_is_refused(monkeypatch, tmp_path: Path
     assert "secret" not in str(refusal.value)
 
 
-def test_without_anything_it_is_the_loopback_server(monkeypatch: pytest.MonkeyPatch):
+def test_the_default_server_address_is_loopback(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.delenv("SURROGYM_URL", raising=False)
     assert Connection().url == "http://127.0.0.1:8000"
 
 
-def test_no_proxy_comes_between_programs_of_one_machine(monkeypatch: pytest.MonkeyPatch):
+def test_requests_to_loopback_ignore_proxy_settings(monkeypatch: pytest.MonkeyPatch):
     for name in ("HTTP_PROXY", "http_proxy", "ALL_PROXY", "all_proxy"):
         monkeypatch.setenv(name, f"http://127.0.0.1:{unused_port()}")
     for name in ("NO_PROXY", "no_proxy"):
@@ -177,7 +177,7 @@ def test_no_proxy_comes_between_programs_of_one_machine(monkeypatch: pytest.Monk
         assert connection.send("GET", "/x") == b"done"
 
 
-def test_a_pickled_connection_connects_anew():
+def test_a_pickled_connection_reconnects():
     with (
         scripted_server(reply("done")) as server,
         Connection(server.url, "secret", Timeouts(step=3)) as original,
@@ -188,7 +188,7 @@ def test_a_pickled_connection_connects_anew():
         assert server.received[-1].headers["Authorization"] == "Bearer secret"
 
 
-def test_pauses_grow_to_their_limit_and_end_with_the_budget():
+def test_retry_delays_grow_to_their_limit_and_end_after_the_time_budget():
     pauses = Retries(seconds=0.4, first_delay=0.01, longest_delay=0.04).delays()
     taken = [next(pauses) for _ in range(6)]
     limits = [0.01, 0.02, 0.04, 0.04, 0.04, 0.04]
@@ -198,7 +198,7 @@ def test_pauses_grow_to_their_limit_and_end_with_the_budget():
     assert list(NEVER.delays()) == []
 
 
-def test_an_address_with_a_password_is_refused_without_showing_it():
+def test_a_server_address_with_a_password_is_refused_without_showing_it():
     """It would be written into cards and reports, and sent in the place of the token."""
     with pytest.raises(errors.ServerUnreachable, match="without user and password") as refused:
         Connection("http://bob:hunter2@127.0.0.1:1", None)

@@ -16,17 +16,17 @@ def leaves(cls: type) -> list[type]:
     return [cls] + [leaf for child in cls.__subclasses__() for leaf in leaves(child)]
 
 
-def test_every_code_has_an_error_of_its_own_kind():
+def test_every_error_code_has_its_own_client_exception():
     assert set(errors.BY_CODE) == set(Code)
 
 
-def test_every_refusal_stands_for_some_code():
+def test_every_client_refusal_exception_stands_for_an_error_code():
     without_code = {errors.ProblemError, errors.NotThere, errors.SessionLost, errors.Conflict, errors.Refused}
     assert set(leaves(errors.ProblemError)) - without_code == set(errors.BY_CODE.values())
 
 
 @pytest.mark.parametrize("code", list(Code))
-def test_a_refusal_says_its_detail_and_pickles(code: Code):
+def test_a_refusal_exception_contains_its_detail_and_can_be_pickled(code: Code):
     error = errors.error_from_problem(problem(code))
     again = pickle.loads(pickle.dumps(error))
     assert type(again) is errors.BY_CODE[code]
@@ -35,19 +35,19 @@ def test_a_refusal_says_its_detail_and_pickles(code: Code):
 
 
 @pytest.mark.parametrize("cls", [errors.ServerUnreachable, errors.RequestTimeout, errors.ProtocolMismatch])
-def test_the_other_errors_pickle(cls: type[Exception]):
+def test_the_other_client_exceptions_can_be_pickled(cls: type[Exception]):
     again = pickle.loads(pickle.dumps(cls("why")))
     assert type(again) is cls
     assert str(again) == "why"
 
 
-def test_a_seq_conflict_says_what_the_session_waits_for():
+def test_a_sequence_conflict_error_states_the_expected_number():
     error = errors.error_from_problem(problem(Code.SEQ_CONFLICT))
     assert isinstance(error, errors.SeqConflict)
     assert error.expected_seq == 7
 
 
-def test_the_drawn_tree_is_the_real_one():
+def test_the_documented_tree_of_client_exceptions_is_the_real_one():
     drawn = [word for line in errors.__doc__.splitlines() if (word := line.strip("│├└─ ").split(" ")[0])]
     real = [cls.__name__ for cls in leaves(errors.SurrogymClientError) if cls.__module__ == errors.__name__]
     assert [word for word in drawn if word in real] == real

@@ -54,7 +54,7 @@ def echo(connection: ServerConnection) -> None:
 
 
 @pytest.mark.parametrize("size", [0, 1, 125, 126, 65_535, 65_536, 3_000_000])
-def test_messages_of_any_size_come_back(size: int):
+def test_stream_messages_of_any_size_are_received(size: int):
     message = bytes(range(256)) * (size // 256) + b"x" * (size % 256)
     with serving(echo, max_size=None) as (url, seen), stream(url) as opened:
         assert opened.exchange(message, 30) == message
@@ -62,7 +62,7 @@ def test_messages_of_any_size_come_back(size: int):
     assert len(seen) == 1, "one connection carries many messages"
 
 
-def test_the_token_is_in_the_handshake_and_survives_pickling():
+def test_the_stream_handshake_contains_the_token_even_after_pickling():
     with serving(echo) as (url, seen), stream(url, "secret") as opened:
         opened.exchange(b"1", 30)
         copy = pickle.loads(pickle.dumps(opened))
@@ -71,7 +71,7 @@ def test_the_token_is_in_the_handshake_and_survives_pickling():
     assert [request.headers["Authorization"] for request in seen] == ["Bearer secret"] * 2
 
 
-def test_a_reply_in_parts_between_pings_is_one_reply():
+def test_a_fragmented_stream_reply_with_pings_is_received_as_one():
     def in_parts(connection: ServerConnection) -> None:
         for _ in connection:
             connection.ping()
@@ -82,7 +82,7 @@ def test_a_reply_in_parts_between_pings_is_one_reply():
         assert opened.exchange(b"", 30) == b"one two three"
 
 
-def test_a_late_reply_finds_nobody():
+def test_a_late_stream_reply_is_dropped():
     late = threading.Event()
 
     def dawdling(connection: ServerConnection) -> None:
@@ -99,7 +99,7 @@ def test_a_late_reply_finds_nobody():
         assert len(seen) == 2
 
 
-def test_a_cut_stream_raises_and_the_next_message_reconnects():
+def test_a_broken_stream_raises_and_the_next_message_reconnects():
     def once(connection: ServerConnection) -> None:
         connection.send(connection.recv())
 
@@ -111,7 +111,7 @@ def test_a_cut_stream_raises_and_the_next_message_reconnects():
         assert len(seen) == 2
 
 
-def test_a_message_that_is_too_large_is_no_lost_connection():
+def test_a_too_large_stream_message_is_not_reported_as_lost_connection():
     with (
         serving(echo, max_size=1000) as (url, _),
         stream(url) as opened,
@@ -120,7 +120,7 @@ def test_a_message_that_is_too_large_is_no_lost_connection():
         opened.exchange(b"x" * 2000, 30)
 
 
-def test_a_server_that_closes_within_a_message_gives_the_reason():
+def test_a_stream_closed_within_a_message_raises_with_the_servers_reason():
     def refuse(handler: BaseHTTPRequestHandler) -> None:
         upgrade(handler)
         handler.rfile.read(2)
@@ -146,7 +146,7 @@ def test_a_server_that_closes_within_a_message_gives_the_reason():
         lost_reply,
     ],
 )
-def test_a_missing_stream_differs_from_a_refused_one(answer):
+def test_a_server_without_streams_and_a_refused_stream_raise_different_errors(answer):
     with scripted_server(answer) as server, stream(server.url) as opened, pytest.raises(StreamUnavailable):
         opened.exchange(b"", 30)
 
@@ -159,12 +159,12 @@ def test_a_missing_stream_differs_from_a_refused_one(answer):
         (Code.UNAVAILABLE, errors.Unavailable),
     ],
 )
-def test_a_refusal_is_raised_as_its_own_error(code: Code, error: type[Exception]):
+def test_an_error_reply_on_a_stream_is_raised_as_its_own_exception(code: Code, error: type[Exception]):
     with scripted_server(problem(code)) as server, stream(server.url) as opened, pytest.raises(error):
         opened.exchange(b"", 30)
 
 
-def test_nobody_listens():
+def test_opening_a_stream_to_an_unreachable_server_raises():
     with serving(echo) as (url, _):
         pass
     with stream(url) as opened, pytest.raises(StreamUnavailable):

@@ -45,11 +45,11 @@ def bodies(server: ScriptedServer) -> list[dict[str, object]]:
 ACTION = np.array([[0.5], [-0.5]], dtype=np.float32)
 
 
-def test_it_is_a_surrogate_port():
+def test_the_http_surrogate_implements_the_surrogate_interface():
     assert isinstance(HttpSurrogate(None, "pendulum"), SurrogatePort)
 
 
-def test_a_lost_reply_is_requested_again_with_the_same_seq():
+def test_a_lost_reply_is_requested_again_with_the_same_sequence_number():
     with scripted_server(session_view(), lost_reply, step(1), step(2)) as server, surrogate(server) as port:
         session = port.open(wire.OpenSession(num_envs=2)).id
         port.step(session, ACTION)
@@ -58,7 +58,7 @@ def test_a_lost_reply_is_requested_again_with_the_same_seq():
         assert bodies(server)[1] == bodies(server)[2]
 
 
-def test_a_refused_step_leaves_the_seq_as_it_was():
+def test_a_refused_step_leaves_the_sequence_number_unchanged():
     with scripted_server(session_view(), problem(Code.NOT_RESET), step(1)) as server, surrogate(server) as port:
         session = port.open(wire.OpenSession(num_envs=2)).id
         with pytest.raises(errors.NotReset):
@@ -67,7 +67,7 @@ def test_a_refused_step_leaves_the_seq_as_it_was():
         assert [body["seq"] for body in bodies(server)[1:]] == [1, 1]
 
 
-def test_the_wire_accepts_what_it_sends():
+def test_requests_of_the_client_match_the_server_schemas():
     reset = reply(wire.ResetReply(seq=1, observation=[[0, 0]] * 2, model_version=[1, 1]).model_dump_json())
     rollout = reply(wire.RolloutReply(seq=3, steps=[step_reply(3)] * 2).model_dump_json())
     with scripted_server(session_view(), reset, step(2), rollout) as server, surrogate(server) as port:
@@ -86,7 +86,7 @@ def test_the_wire_accepts_what_it_sends():
     assert len(results) == 2
 
 
-def test_a_reply_becomes_arrays():
+def test_a_json_step_reply_is_converted_to_arrays():
     with scripted_server(session_view(), step(1)) as server, surrogate(server) as port:
         port.open(wire.OpenSession(num_envs=2))
         result = port.step("abc", ACTION)
@@ -108,7 +108,7 @@ def test_a_reply_becomes_arrays():
         (np.array([["left"], ["right"]]), r"expected an array of numbers, got dtype <U5"),
     ],
 )
-def test_values_without_a_json_form_are_refused_before_sending(action: np.ndarray, message: str):
+def test_values_that_json_cannot_express_are_refused_before_sending(action: np.ndarray, message: str):
     with scripted_server(session_view()) as server, surrogate(server) as port:
         port.open(wire.OpenSession(num_envs=2))
         with pytest.raises(errors.InvalidInput, match=message):
@@ -135,7 +135,7 @@ def test_a_pickled_client_continues_its_session():
         assert bodies(server)[-1]["seq"] == 2
 
 
-def test_an_older_or_newer_server_is_refused():
+def test_a_server_of_an_older_or_newer_protocol_is_refused():
     with (
         scripted_server(session_view(protocol=wire.PROTOCOL + 1)) as server,
         surrogate(server) as port,
@@ -145,14 +145,14 @@ def test_an_older_or_newer_server_is_refused():
 
 
 @pytest.mark.parametrize("body", ['{"seq": 1}', "not json", step_reply(1).model_dump_json()[:-1] + ',"more":1}'])
-def test_an_answer_that_is_no_step_is_refused(body: str):
+def test_a_json_reply_that_is_not_a_step_is_refused(body: str):
     with scripted_server(session_view(), reply(body)) as server, surrogate(server) as port:
         port.open(wire.OpenSession(num_envs=2))
         with pytest.raises(errors.ProtocolMismatch, match="/v1/sessions/abc/step"):
             port.step("abc", ACTION)
 
 
-def test_the_last_session_takes_its_sockets_with_it():
+def test_closing_the_last_session_closes_its_sockets():
     with scripted_server(session_view(), step(1), reply(""), session_view(seq=4), step(5)) as server:
         port = surrogate(server)
         port.open(wire.OpenSession(num_envs=2))
@@ -163,7 +163,7 @@ def test_the_last_session_takes_its_sockets_with_it():
         port.disconnect()
 
 
-def test_a_lost_session_keeps_no_socket_open():
+def test_a_lost_session_leaves_no_socket_open():
     with scripted_server(session_view(), problem(Code.SESSION_EXPIRED), reply("")) as server:
         port = surrogate(server)
         port.open(wire.OpenSession(num_envs=2))
@@ -173,7 +173,7 @@ def test_a_lost_session_keeps_no_socket_open():
         assert port.connection._client.is_closed
 
 
-def test_closing_a_session_that_is_gone_is_harmless():
+def test_closing_an_unknown_session_is_harmless():
     with scripted_server(problem(Code.UNKNOWN_SESSION)) as server, surrogate(server) as port:
         port.close("abc")
         assert server.received[0].method == "DELETE"

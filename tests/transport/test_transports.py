@@ -92,7 +92,7 @@ REFUSALS = [reply("<html>", 426, "text/html"), problem(Code.NOT_FOUND), reply("<
 
 
 @pytest.mark.parametrize("refusal", REFUSALS)
-def test_where_the_upgrade_is_refused_frames_go_by_http(refusal: Answer):
+def test_if_the_stream_upgrade_is_refused_binary_http_is_used(refusal: Answer):
     with (
         scripted_server(session_view(), refusal, step(1), step(2)) as server,
         HttpSurrogate(server.url, "pendulum", retries=QUICK) as port,
@@ -104,7 +104,7 @@ def test_where_the_upgrade_is_refused_frames_go_by_http(refusal: Answer):
         assert seqs(server) == [1, 2]
 
 
-def test_a_step_lost_with_its_stream_is_repeated_by_http_under_its_seq():
+def test_a_step_lost_with_its_stream_is_repeated_by_http_with_its_sequence_number():
     script = [session_view(), upgrade_answer_and_cut(step_frame(1)), step(2), upgrade_and_cut, step(3)]
     with scripted_server(*script) as server, HttpSurrogate(server.url, "pendulum", retries=QUICK) as port:
         port.open(wire.OpenSession(num_envs=2))
@@ -113,7 +113,7 @@ def test_a_step_lost_with_its_stream_is_repeated_by_http_under_its_seq():
         assert seqs(server) == [2, 3]
 
 
-def test_a_session_may_take_longer_to_open_than_other_requests():
+def test_opening_a_session_has_a_longer_timeout_than_other_requests():
     with scripted_server(session_view(delay=0.6)) as server:
         hasty = Timeouts(request=0.2)
         with HttpSurrogate(server.url, "pendulum", retries=Retries(seconds=0), timeouts=hasty) as port:
@@ -121,7 +121,7 @@ def test_a_session_may_take_longer_to_open_than_other_requests():
 
 
 @pytest.mark.parametrize("useless", [upgrade_and_cut, upgrade_and_swallow])
-def test_a_stream_that_opens_and_never_answers_is_left_at_once(useless: Answer):
+def test_a_stream_that_never_answers_is_replaced_by_http(useless: Answer):
     script = [session_view(), useless, step(1), step(2)]
     hasty = Timeouts(step=0.3)
     with (
@@ -134,7 +134,7 @@ def test_a_stream_that_opens_and_never_answers_is_left_at_once(useless: Answer):
         assert seqs(server) == [1, 2]
 
 
-def test_the_stream_alone_is_tried_again_and_given_up():
+def test_with_transport_stream_only_the_stream_is_retried_and_then_fails():
     with (
         scripted_server(session_view(), reply("<html>", 426, "text/html")) as server,
         HttpSurrogate(server.url, "pendulum", retries=Retries(seconds=0.2), transport="stream") as port,
@@ -156,7 +156,7 @@ def test_the_stream_alone_is_tried_again_and_given_up():
         ),
     ],
 )
-def test_an_answer_that_is_no_step_is_refused(content: bytes, message: str):
+def test_a_binary_reply_that_is_not_a_step_is_refused(content: bytes, message: str):
     with (
         scripted_server(session_view(), binary(content)) as server,
         HttpSurrogate(server.url, "pendulum", transport="binary") as port,
@@ -166,7 +166,7 @@ def test_an_answer_that_is_no_step_is_refused(content: bytes, message: str):
             port.step("abc", ACTION)
 
 
-def test_an_answer_to_another_request_is_refused():
+def test_a_reply_to_another_request_is_refused():
     with (
         scripted_server(session_view(), step(7)) as server,
         HttpSurrogate(server.url, "pendulum", transport="binary") as port,
@@ -185,7 +185,7 @@ def test_an_answer_to_another_request_is_refused():
         (ACTION, np.ones(3, dtype=bool), r"mask: expected 2 entries, got shape \(3,\)"),
     ],
 )
-def test_values_that_a_frame_would_hide_are_refused_before_sending(action, mask, message: str):
+def test_invalid_values_are_refused_before_binary_encoding(action, mask, message: str):
     with scripted_server(session_view()) as server, HttpSurrogate(server.url, "pendulum", transport="binary") as port:
         port.open(wire.OpenSession(num_envs=2))
         with pytest.raises(errors.InvalidInput, match=message):
@@ -193,12 +193,12 @@ def test_values_that_a_frame_would_hide_are_refused_before_sending(action, mask,
         assert len(server.received) == 1
 
 
-def test_there_are_four_transports():
+def test_the_valid_transport_names_are_exactly_four():
     with pytest.raises(ValueError, match="expected one of auto, stream, binary, json, got 'grpc'"):
         HttpSurrogate(None, "pendulum", transport="grpc")  # type: ignore[arg-type]
 
 
-def test_by_itself_it_takes_the_stream(pendulum_server):
+def test_the_default_transport_uses_the_stream(pendulum_server):
     """No step goes by HTTP: the client's pool has seen none since the session was opened."""
     with HttpSurrogate(pendulum_server.url, "pendulum") as port:
         session = port.open(wire.OpenSession(num_envs=2)).id
@@ -215,7 +215,7 @@ def test_by_itself_it_takes_the_stream(pendulum_server):
         port.close(session)
 
 
-def test_no_stream_is_opened_through_a_proxy(monkeypatch: pytest.MonkeyPatch):
+def test_no_stream_is_opened_if_a_proxy_is_configured(monkeypatch: pytest.MonkeyPatch):
     for name in ("http_proxy", "HTTP_PROXY", "no_proxy", "NO_PROXY"):
         monkeypatch.delenv(name, raising=False)
     assert not Connection("http://far.example").proxied

@@ -52,7 +52,7 @@ def sent(server: ScriptedServer) -> list[tuple[int, float]]:
     return [(body["seq"], body["action"][0][0]) for body in posts]
 
 
-def test_a_session_that_went_back_gets_its_requests_again():
+def test_a_session_reset_to_an_earlier_step_gets_the_later_requests_again():
     script = (step(1), step(2), step(3), back_to(2), step(2), step(3), step(4), step(5))
     with scripted_server(session_view(replay=10), *script) as server, opened(server) as port:
         for number in range(1, 6):
@@ -61,7 +61,7 @@ def test_a_session_that_went_back_gets_its_requests_again():
     assert sent(server) == [(number, pytest.approx(number / 10)) for number in order]
 
 
-def test_a_pickled_client_sends_what_the_first_one_sent():
+def test_a_pickled_client_can_repeat_the_requests_of_the_original():
     script = (step(1), step(2), back_to(1), step(1), step(2), step(3))
     with scripted_server(session_view(replay=10), *script) as server, opened(server) as port:
         take(port, 1)
@@ -71,7 +71,7 @@ def test_a_pickled_client_sends_what_the_first_one_sent():
         assert [seq for seq, _ in sent(server)] == [1, 2, 3, 1, 2, 3]
 
 
-def test_a_session_may_go_back_while_it_catches_up():
+def test_a_session_may_fall_back_again_while_requests_are_repeated():
     script = (step(1), step(2), back_to(2), back_to(1), back_to(1), step(1), step(2), step(3))
     with scripted_server(session_view(replay=10), *script) as server, opened(server) as port:
         for number in range(1, 4):
@@ -83,7 +83,7 @@ def test_a_session_may_go_back_while_it_catches_up():
     ("kept", "replay", "said"),
     [(2, (), "request 1, which this client no longer keeps"), (10, (step(1, 9.0),), "in another way")],
 )
-def test_a_session_that_can_not_go_on_as_it_was_is_lost(kept: int, replay: tuple[Answer, ...], said: str):
+def test_a_session_that_cannot_be_restored_exactly_is_reported_lost(kept: int, replay: tuple[Answer, ...], said: str):
     script = (step(1), step(2), step(3), back_to(1), *replay, reply(""))
     with scripted_server(session_view(replay=kept), *script) as server, opened(server) as port:
         for number in range(1, 4):
@@ -93,7 +93,7 @@ def test_a_session_that_can_not_go_on_as_it_was_is_lost(kept: int, replay: tuple
         assert server.received[-1].method == "DELETE"
 
 
-def test_a_seq_that_is_ahead_is_a_conflict_as_ever():
+def test_a_server_sequence_number_ahead_of_the_client_raises_a_conflict():
     for view in (session_view(replay=10), session_view()):
         with (
             scripted_server(view, step(1), back_to(9)) as server,
@@ -104,14 +104,14 @@ def test_a_seq_that_is_ahead_is_a_conflict_as_ever():
                 take(port, 2)
 
 
-def test_a_server_that_always_goes_back_is_a_conflict_in_the_end():
+def test_a_server_that_always_falls_back_raises_a_conflict():
     with scripted_server(session_view(replay=10), step(1), back_to(1)) as server, opened(server) as port:
         take(port, 1)
         with pytest.raises(errors.SeqConflict):
             take(port, 2)
 
 
-def test_a_window_is_bounded_in_number_and_bytes():
+def test_the_kept_requests_are_limited_in_number_and_bytes():
     window, size = Window(3), MAX_BYTES // 2
     for seq, content in ((1, b"1"), (2, b"2"), (3, b"3"), (4, b"4")):
         window.keep(Sent(seq, "step", content, lambda *_: (0, None), 1.0))

@@ -61,7 +61,7 @@ def policy(folder: Path, spec: EnvironmentSpec) -> str:
     return "mine.zip"
 
 
-def test_what_a_server_that_is_away_did_not_get_is_sent_later(
+def test_results_are_sent_later_if_the_server_was_unreachable(
     api: Api, away: Api, outbox: Outbox, tmp_path: Path, told: list[str]
 ):
     job = claimed(api)
@@ -86,7 +86,7 @@ def test_what_a_server_that_is_away_did_not_get_is_sent_later(
     assert not path.exists()
 
 
-def test_a_policy_that_the_server_refuses_ends_its_job_and_stays(api: Api, outbox: Outbox, tmp_path: Path):
+def test_a_policy_refused_by_the_server_ends_its_job_and_is_kept(api: Api, outbox: Outbox, tmp_path: Path):
     job = claimed(api)
     name = policy(tmp_path, cartpole())
     outbox.put(Waiting(surrogate=NAME, job=job.id, lease_token=job.lease_token, status="done", policy=name))
@@ -97,7 +97,7 @@ def test_a_policy_that_the_server_refuses_ends_its_job_and_stays(api: Api, outbo
     assert (tmp_path / name).exists()
 
 
-def test_a_policy_whose_file_was_deleted_ends_its_job(api: Api, outbox: Outbox):
+def test_an_unsent_policy_whose_file_was_deleted_ends_its_job(api: Api, outbox: Outbox):
     job = claimed(api)
     outbox.put(Waiting(surrogate=NAME, job=job.id, lease_token=job.lease_token, status="cancelled", policy="gone.zip"))
     outbox.send(api)
@@ -106,7 +106,9 @@ def test_a_policy_whose_file_was_deleted_ends_its_job(api: Api, outbox: Outbox):
     assert "no such policy file" in (ended.error or "")
 
 
-def test_a_job_that_another_worker_has_keeps_nothing_waiting(api: Api, outbox: Outbox, tmp_path: Path, told: list[str]):
+def test_the_unsent_result_of_a_job_taken_by_another_worker_is_dropped(
+    api: Api, outbox: Outbox, tmp_path: Path, told: list[str]
+):
     job = claimed(api)
     outbox.put(Waiting(surrogate=NAME, job=job.id, lease_token="the token of another", status="done"))
     outbox.send(api)
@@ -118,7 +120,7 @@ def test_a_job_that_another_worker_has_keeps_nothing_waiting(api: Api, outbox: O
 @pytest.mark.parametrize(
     "changes", [{"policy": "../secret.zip"}, {"policy": "/etc/passwd"}, {"status": "queued"}, {"a": 1}]
 )
-def test_a_file_that_no_worker_wrote_is_set_aside(
+def test_an_invalid_outbox_file_is_set_aside(
     api: Api, outbox: Outbox, tmp_path: Path, told: list[str], changes: dict[str, object]
 ):
     good = Waiting(surrogate=NAME, job=1, lease_token="a", status="done").model_dump(mode="json")

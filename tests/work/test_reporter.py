@@ -40,7 +40,7 @@ def progress(steps: int, imagined: float | None = -1.0) -> TrainProgress:
     return TrainProgress(steps, 10, imagined, 0.0)
 
 
-def test_a_training_that_is_extended_continues_its_curve_and_never_goes_back():
+def test_the_reported_curve_of_an_extended_training_continues():
     stand, shares = Stand(), [0.0]
     for steps, total in ((4, 10), (8, 10), (11, 18), (14, 18)):
         stand = stand.trained(TrainProgress(steps, total, -1.0, 0.0), 1.0)
@@ -52,7 +52,7 @@ def test_a_training_that_is_extended_continues_its_curve_and_never_goes_back():
     assert sent.share == pytest.approx(0.8 + 0.2 * 6 / 10)
 
 
-def test_a_long_curve_is_thinned_and_a_return_that_is_no_number_left_out():
+def test_a_reported_learning_curve_is_thinned_and_leaves_out_nan_returns():
     stand = Stand()
     for steps in range(1, 1_000):
         stand = stand.trained(TrainProgress(steps, 1_000, float("inf"), 0.0), 1.0)
@@ -62,7 +62,7 @@ def test_a_long_curve_is_thinned_and_a_return_that_is_no_number_left_out():
 
 
 @pytest.mark.parametrize(("answer", "taken"), [(True, False), (ENDED, True)])
-def test_a_job_that_is_cancelled_or_lost_stops_at_its_next_progress(answer: bool | Exception, taken: bool):
+def test_a_cancelled_or_lost_job_stops_at_its_next_progress_report(answer: bool | Exception, taken: bool):
     with Reporter(Jobs([answer]), "pendulum", JOB) as reporter:
         with pytest.raises(JobStopped):
             work_on(reporter.trained)
@@ -77,7 +77,7 @@ def test_the_end_of_a_short_training_is_reported_before_its_result():
     assert [point.steps for point in jobs.states[-1].curve] == [10]
 
 
-def test_a_server_that_is_away_stops_nothing_and_hears_of_it_later():
+def test_an_unreachable_server_does_not_stop_a_job_and_gets_reports_later():
     jobs = Jobs([ServerUnreachable("away"), ServerUnreachable("away"), False])
     with Reporter(jobs, "pendulum", JOB) as reporter:
         reporter.trained(progress(1))

@@ -12,18 +12,18 @@ from surrogym_trainer.training.search import SEARCHES
 from surrogym_trainer.work.tasks import QUICK, settings_of
 
 
-def test_a_task_without_choices_trains_as_the_command_does():
+def test_a_training_job_without_options_trains_like_the_train_command():
     settings = settings_of(wire.TrainTask(kind="train", seed=7), pendulum())
     assert (settings.algorithm, settings.total_steps, settings.prolong) == ("FASTPPO", None, None)
     assert (settings.seed, settings.tracker, settings.hyperparameters) == (7, None, {})
 
 
-def test_a_quick_training_takes_a_part_of_the_steps_and_is_never_prolonged():
+def test_a_quick_training_job_takes_fewer_steps_and_is_never_prolonged():
     settings = settings_of(wire.TrainTask(kind="train", algorithm="cmaes", preset="quick"), pendulum())
     assert settings.total_steps == SEARCHES.get("CMAES").suggested_steps // QUICK
     assert settings.prolong is False
 
 
 @pytest.mark.parametrize("name", get_args(wire.JobAlgorithm))
-def test_every_algorithm_of_a_task_is_a_policy_search(name: str):
+def test_every_algorithm_of_a_training_job_is_a_known_policy_search(name: str):
     assert SEARCHES.name_of(name) == name.upper()

@@ -62,7 +62,7 @@ def evaluating(most_episodes: int = 10) -> Environment:
     return Environment(pendulum(), lambda: GymnasiumEpisode(pendulum()), most_episodes)
 
 
-def test_a_training_is_stored_with_its_curve_and_promise(api: Api, run_one, tmp_path: Path):
+def test_a_worker_stores_a_trained_policy_with_learning_curve_and_promise(api: Api, run_one, tmp_path: Path):
     job = run_one(SHORT)
     assert (job.status, job.error, job.worker) == ("done", None, "tester")
     assert job.version is not None
@@ -76,7 +76,7 @@ def test_a_training_is_stored_with_its_curve_and_promise(api: Api, run_one, tmp_
     assert list(tmp_path.glob("*.waiting.json")) == []
 
 
-def test_a_running_training_shows_its_curve_and_stops_when_cancelled(api: Api, tmp_path: Path):
+def test_a_running_training_job_reports_its_curve_and_stops_when_cancelled(api: Api, tmp_path: Path):
     id = api.jobs.add(NAME, LONG).id
     reports: list[WorkerReport] = []
     settings = WorkerSettings("tester", tmp_path, lease_seconds=6, once=True)
@@ -95,7 +95,7 @@ def test_a_running_training_shows_its_curve_and_stops_when_cancelled(api: Api, t
     assert reports == [WorkerReport(cancelled=1)]
 
 
-def test_an_evaluation_counts_its_real_steps_and_stores_its_episodes(api: Api, run_one):
+def test_an_evaluation_job_counts_its_real_steps_and_stores_its_episodes(api: Api, run_one):
     version = api.policies.push(NAME, wire.PushedCard(algorithm="CMAES"), [], "zip", network_file(seed=3)).version
     before = api.surrogate(NAME).ledger.evaluation
     job = run_one(wire.EvaluateTask(kind="evaluate", policy=str(version), episodes=2, compare="zero"), evaluating())
@@ -106,7 +106,7 @@ def test_an_evaluation_counts_its_real_steps_and_stores_its_episodes(api: Api, r
     assert job.evaluation == stored[0].id
 
 
-def test_an_evaluation_takes_a_reference_controller_and_draws_a_video(api: Api, run_one, tmp_path: Path):
+def test_an_evaluation_job_can_use_a_reference_controller_and_draw_a_video(api: Api, run_one, tmp_path: Path):
     version = api.policies.push(NAME, wire.PushedCard(algorithm="CMAES"), [], "zip", network_file(seed=11)).version
     asked = wire.EvaluateTask(kind="evaluate", policy=str(version), episodes=1, reference=True, video=True)
     made: list[Reference] = []
@@ -127,7 +127,7 @@ def test_an_evaluation_takes_a_reference_controller_and_draws_a_video(api: Api, 
     assert (job.error or "").startswith("no video: ")
 
 
-def test_a_job_that_fails_says_why_and_the_worker_goes_on(api: Api, run_one):
+def test_a_failed_job_reports_the_reason_and_the_worker_continues(api: Api, run_one):
     job = run_one(SHORT.model_copy(update={"algorithm": "dqn"}))
     assert job.status == "failed"
     assert "can't be trained in this surrogate" in (job.error or "")
@@ -141,7 +141,7 @@ def test_a_job_that_fails_says_why_and_the_worker_goes_on(api: Api, run_one):
     assert (job.status, job.error) == ("failed", "RuntimeError: no power at all")
 
 
-def test_an_environment_of_another_surrogate_is_not_even_reset(api: Api, run_one):
+def test_a_worker_refuses_an_environment_of_another_surrogate_before_resetting_it(api: Api, run_one):
     version = api.policies.push(NAME, wire.PushedCard(algorithm="CMAES"), [], "zip", network_file(seed=6)).version
     task = wire.EvaluateTask(kind="evaluate", policy=str(version), episodes=1)
     other = Environment(SPEC, partial(open_episode, "a line", None, NeverMoved), 10)
@@ -157,7 +157,7 @@ class NeverMoved(Line):
         raise AssertionError("it was moved")
 
 
-def test_a_cancelled_evaluation_counts_the_real_steps_that_it_took(api: Api, tmp_path: Path):
+def test_a_cancelled_evaluation_job_counts_its_real_steps(api: Api, tmp_path: Path):
     version = api.policies.push(NAME, wire.PushedCard(algorithm="CMAES"), [], "zip", network_file(seed=5)).version
     task = wire.EvaluateTask(kind="evaluate", policy=str(version), episodes=2)
     gathered = Gathered()
@@ -185,7 +185,7 @@ class OneAtATime(GymnasiumEpisode):
     parallel = False
 
 
-def test_a_worker_that_is_stopped_keeps_the_best_policy(api: Api, tmp_path: Path):
+def test_a_stopped_worker_keeps_the_best_policy_of_its_training(api: Api, tmp_path: Path):
     id = api.jobs.add(NAME, LONG).id
 
     def interrupt(stand: Stand) -> None:
@@ -200,7 +200,7 @@ def test_a_worker_that_is_stopped_keeps_the_best_policy(api: Api, tmp_path: Path
 
 
 @pytest.mark.e2e
-def test_ctrl_c_keeps_the_best_policy_and_says_so(api: Api, tmp_path: Path):
+def test_ctrl_c_of_a_worker_keeps_the_best_policy_and_reports_it(api: Api, tmp_path: Path):
     id = api.jobs.add(NAME, LONG).id
     command = [sys.executable, "-m", "surrogym", "work", NAME, "--folder", str(tmp_path), "--server", api.url]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"})

@@ -29,20 +29,20 @@ def calibrated(
     return calibrate(hinge_spec(), RealTransitions(q, u, q_next), parameters, own, step)
 
 
-def test_four_steps_without_noise_determine_three_parameters():
+def test_four_noise_free_real_steps_determine_three_simulator_parameters():
     found = calibrated(4)
     assert found.values == pytest.approx(TRUE, rel=1e-5)
     assert found.error < 1e-6 < 0.01 < found.error_before
     assert all(one.determined and one.low <= TRUE[one.name] <= one.high for one in found.parameters)
 
 
-def test_nine_of_ten_intervals_hold_under_noise():
+def test_calibration_intervals_cover_the_true_parameters_in_90_percent_under_noise():
     runs = [calibrated(12, noise=0.02, seed=seed) for seed in range(30)]
     inside = [one.low <= TRUE[one.name] <= one.high for run in runs for one in run.parameters]
     assert 0.8 <= np.mean(inside) <= 0.99
 
 
-def test_a_parameter_that_the_steps_say_nothing_of_keeps_its_value_and_is_not_determined():
+def test_a_simulator_parameter_without_effect_on_the_steps_keeps_its_value():
     class WithName(Textbook):
         spare = 3.0
 
@@ -54,22 +54,22 @@ def test_a_parameter_that_the_steps_say_nothing_of_keeps_its_value_and_is_not_de
     assert {name: value for name, value in found.values.items() if name != "spare"} == pytest.approx(TRUE, rel=1e-4)
 
 
-def test_without_parameters_the_error_alone_is_measured():
+def test_calibration_without_parameters_only_measures_the_simulator_error():
     found = calibrated(5, parameters=())
     assert found.parameters == ()
     assert found.error == found.error_before > 0.01
 
 
-def test_a_simulator_of_another_plant_keeps_a_large_error():
+def test_the_calibrated_simulator_of_another_plant_keeps_a_large_error():
     assert calibrated(12, plant=Backwards).error > 0.3
 
 
 @pytest.mark.parametrize("count", [0, 1])
-def test_too_few_steps_are_refused_with_the_number_that_is_needed(count):
+def test_calibration_with_too_few_real_steps_is_refused_with_the_needed_number(count):
     with pytest.raises(NotCalibrated, match="at least 2 real steps"):
         calibrated(count)
 
 
-def test_a_simulator_that_fails_everywhere_is_refused_with_its_error():
+def test_calibrating_a_simulator_that_always_fails_is_refused_with_its_error():
     with pytest.raises(NotCalibrated, match="the solver diverged"):
         calibrated(6, plant=Broken)

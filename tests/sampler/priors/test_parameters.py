@@ -10,7 +10,7 @@ from surrogym_sampler.original.errors import UnknownEnvironment
 from surrogym_sampler.priors.parameters import Parameter, adjustable, read_parameters
 
 
-def test_the_numbers_of_an_object_are_its_parameters():
+def test_numeric_attributes_of_a_simulator_are_its_parameters():
     plant, other = Textbook(), Textbook()
     found = adjustable(plant)
     assert found.parameters() == {"mass": 1.0, "length": 1.0, "friction": 0.2}
@@ -18,7 +18,7 @@ def test_the_numbers_of_an_object_are_its_parameters():
     assert (plant.mass, other.mass) == (2.5, 1.0)
 
 
-def test_methods_of_an_object_come_before_its_attributes():
+def test_parameter_methods_of_a_simulator_take_precedence_over_attributes():
     class Computing(Textbook):
         def parameters(self):
             return {"weight": self.mass * 9.81}
@@ -31,7 +31,7 @@ def test_methods_of_an_object_come_before_its_attributes():
     assert plant.mass == pytest.approx(2.0)
 
 
-def test_parameters_are_reached_through_a_specification_that_replaced_the_own_one():
+def test_simulator_parameters_can_be_set_under_a_replaced_specification():
     own = original.make("support.hinge:Textbook").spec()
     changed = own.model_copy(update={"time_limit": 7})
     environment = original.make("support.hinge:Textbook", spec=changed)
@@ -40,14 +40,14 @@ def test_parameters_are_reached_through_a_specification_that_replaced_the_own_on
     assert environment.step_from((1.0, 0.0), (0.0,)).next_coordinates[1] == pytest.approx(2 * before)
 
 
-def test_a_task_of_gymnasium_has_its_physics_and_computes_what_depends_on_it():
+def test_setting_a_gymnasium_parameter_updates_its_derived_constants():
     environment = original.make("CartPole-v1")
     before = environment.step_from((0.0, 0.0, 0.1, 0.0), (1,)).next_coordinates
     adjustable(environment).set_parameters({"masscart": 3.0})
     assert environment.step_from((0.0, 0.0, 0.1, 0.0), (1,)).next_coordinates[1] < before[1] / 2
 
 
-def test_a_model_of_mujoco_has_masses_and_damping_of_named_parts():
+def test_masses_and_damping_of_mujoco_parts_are_simulator_parameters():
     environment = original.make("InvertedPendulum-v5")
     found = adjustable(environment)
     assert {"mass.pole", "mass.cart", "damping.slider"} <= set(found.parameters())
@@ -63,7 +63,7 @@ def test_a_model_of_mujoco_has_masses_and_damping_of_named_parts():
 @pytest.mark.parametrize(
     ("text", "low", "high"), [("mass", 0.5, 2.0), ("mass=0.2..3", 0.2, 3.0), ("friction=-1..1e0", -1.0, 1.0)]
 )
-def test_a_range_is_read_or_lies_around_the_own_value(text, low, high):
+def test_a_parameter_range_is_parsed_or_chosen_around_the_current_value(text, low, high):
     found = Parameter.parse(text, {"mass": 1.0, "friction": 0.2})
     assert (found.low, found.high) == (low, high)
 
@@ -80,16 +80,16 @@ def test_a_range_is_read_or_lies_around_the_own_value(text, low, high):
         ("friction", "own value is 0"),
     ],
 )
-def test_a_range_that_makes_no_sense_is_refused(text, words):
+def test_an_invalid_parameter_range_is_refused(text, words):
     with pytest.raises(ValueError, match=words):
         Parameter.parse(text, {"mass": 1.0, "friction": 0.0})
 
 
-def test_a_parameter_named_twice_is_refused():
+def test_a_simulator_parameter_named_twice_is_refused():
     with pytest.raises(ValueError, match="mass several times"):
         read_parameters(["mass", "mass=0.5..2"], adjustable(Textbook()))
 
 
-def test_a_simulator_without_single_steps_is_refused():
+def test_a_simulator_that_cannot_step_from_given_states_is_refused():
     with pytest.raises(UnknownEnvironment):
         adjustable(object())

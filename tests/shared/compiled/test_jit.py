@@ -31,12 +31,12 @@ def run(tmp_path: Path, kept: Path) -> str:
     return subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout.strip()
 
 
-def test_second_process_loads_what_the_first_compiled(tmp_path: Path):
+def test_a_second_process_loads_the_compiled_functions_of_the_first(tmp_path: Path):
     assert run(tmp_path, tmp_path / "kept") == "4.0 0"
     assert run(tmp_path, tmp_path / "kept") == "4.0 1"
 
 
-def test_folder_that_others_may_write_is_not_used(tmp_path: Path):
+def test_a_compile_cache_folder_writable_by_others_is_not_used(tmp_path: Path):
     run(tmp_path, tmp_path / "kept")
     (folder,) = (tmp_path / "kept" / "surrogym").iterdir()
     assert folder.stat().st_mode & 0o077 == 0
@@ -44,7 +44,7 @@ def test_folder_that_others_may_write_is_not_used(tmp_path: Path):
     assert run(tmp_path, tmp_path / "kept") == "4.0 0"
 
 
-def test_process_without_a_place_to_write_compiles_for_itself(tmp_path: Path):
+def test_a_process_without_a_writable_compile_cache_compiles_in_memory(tmp_path: Path):
     taken = tmp_path / "taken"
     taken.write_text("a file where a folder should be")
     assert run(tmp_path, taken) == "4.0 0"
