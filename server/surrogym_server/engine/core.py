@@ -38,9 +38,8 @@ Bools = NDArray[np.bool_]
 
 SESSION_ID_BYTES = 16
 MAX_PARTICLES = 4_000_000  # largest number of particles in all lanes of a session together
-MAX_PATHWISE_LANES = (
-    4_096  # largest number of lanes in variant ``pathwise``, in which a lane needs memory for a sampled function
-)
+# Largest number of lanes in variant ``pathwise``, in which a lane needs memory for a sampled function.
+MAX_PATHWISE_LANES = 4_096
 
 
 class Models(Protocol):
@@ -244,9 +243,8 @@ def _step(
         return step_session(session, u, mask, stds, lambda version: models.get(surrogate, version, device), latest)
     except SurrogymError:
         raise
-    except (
-        BaseException
-    ) as error:  # an error of a model family, perhaps of a plug-in; a context manager would slow each step
+    except BaseException as error:
+        # The error comes from a model family, perhaps of a plug-in. A context manager would slow each step.
         if isinstance(error, KeyboardInterrupt) and not interrupts:
             raise
         raise failure_of(session.definition, error) from error

@@ -125,9 +125,8 @@ class SessionInfo:
     model: WantedVersion
     versions: Versions  # (N,) model version of each lane's episode
     seq: int  # sequence number of the last answered request
-    behind: bool = (
-        False  # True if the session went back to a checkpoint, so that its client has to repeat its last requests
-    )
+    # Whether the session went back to a checkpoint, so that its client has to repeat its last requests.
+    behind: bool = False
 
 
 @dataclass(frozen=True, eq=False)

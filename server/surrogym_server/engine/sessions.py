@@ -298,9 +298,8 @@ class LiveSessions:
         self._check_deadline(deadline, threads.wait + expected)
 
         def in_time(session: Session) -> tuple[Session, Outcome]:
-            self._check_deadline(
-                deadline, expected
-            )  # a second check, because the wait may have been longer than predicted
+            # The deadline is checked again, because the wait for a thread may have been longer than predicted.
+            self._check_deadline(deadline, expected)
             return work(session)
 
         threads.queued.append(expected)

@@ -312,9 +312,8 @@ class Designer:
             open_steps=sum(query.steps for query in pending if query.status != "set_aside"),
             refused=tuple(refused),
             snapshots=self._storage.snapshots.all(name) if definition.snapshots else {},
-            extra_queries=min(
-                lease.extra_queries, max(0, record.budget - spoken)
-            ),  # the budget may have been lowered after the request
+            # The budget may have been lowered after these queries were requested.
+            extra_queries=min(lease.extra_queries, max(0, record.budget - spoken)),
             occupancy=None if visits is None else visits.states,
             threads=self._settings.threads,
             prior=self._storage.priors.blob(name),

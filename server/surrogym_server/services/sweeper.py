@@ -31,7 +31,7 @@ class Sweeper:
         notices: Notices,
         others: Sequence[Callable[[], Awaitable[None]]] = (),
     ) -> None:
-        """Keep the objects to sweep.
+        """Keep the storage and the engine on which the periodic work is done.
 
         ``seconds`` is the time between sweeps, and ``others`` are functions of optional features for each sweep.
         """

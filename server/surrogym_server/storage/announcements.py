@@ -5,9 +5,8 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 
-Hear = Callable[
-    [str | None], None
-]  # callback that gets the name of a changed surrogate, or None if announcements may have been lost
+# Callback that gets the name of a changed surrogate, or None if announcements may have been lost.
+Hear = Callable[[str | None], None]
 
 
 class Announcements(ABC):

@@ -139,9 +139,8 @@ class QueryRecord(Query):
     attempts: int  # number of leases so far
     sampler: str | None  # name of the sampler that claimed the query last
     error: str | None  # error of the last failed attempt
-    lease_seconds_left: float | None = (
-        None  # time left of the open lease, by the database's clock; negative after it has expired; None without lease
-    )
+    # Time left of the open lease, by the database's clock; negative after it has expired; None without an open lease.
+    lease_seconds_left: float | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

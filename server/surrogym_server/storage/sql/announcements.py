@@ -63,9 +63,8 @@ class NotifiedAnnouncements(Announcements):
                 names, self._waiting = list(self._waiting), {}
             try:
                 self._database.notify(CHANNEL, [f"{self._origin} {name}" for name in names])
-            except (
-                Unavailable
-            ) as error:  # a lost announcement does no harm, because other servers also compare events periodically
+            except Unavailable as error:
+                # A lost announcement does no harm, because other servers also compare events periodically.
                 logger.debug("other servers were not told of %s: %s", names, error)
             self._ended.wait(GAP_SECONDS)
 

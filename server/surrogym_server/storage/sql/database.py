@@ -30,9 +30,8 @@ from surrogym_server.storage.sql.filelock import FileLock, marks
 
 SQLITE_CODES = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 SQLSTATES = ("XX001", "XX002", "42P01", "42703")  # data corrupted, index corrupted, undefined table, undefined column
-OTHER_SCHEMA = re.compile(
-    r"no such (table|column)|has no column|already exists"
-)  # SQLite's messages about a wrong schema, which have no code
+# Pattern of SQLite's messages about missing or different tables; such errors have no code.
+OTHER_SCHEMA = re.compile(r"no such (table|column)|has no column|already exists")
 UNDECODABLE = "Could not decode to UTF-8"  # part of the message of SQLite's driver about damaged text
 
 

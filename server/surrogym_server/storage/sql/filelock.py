@@ -25,13 +25,10 @@ from typing import BinaryIO
 from surrogym_server.errors import Unavailable
 
 LOCKED_BYTE = 2**62  # position of the locked byte, beyond any database and far from the bytes that SQLite locks
-WHOLE_DESCRIPTION = getattr(
-    fcntl, "F_OFD_SETLK", None
-)  # fcntl command for an open file description lock; None on systems without it
-SQLITE_SHARED = (
-    2**30 + 2,
-    510,
-)  # first byte and number of bytes that SQLite's readers lock as shared, and a program that merges the log as exclusive
+# Command of fcntl for an open file description lock; None on systems without such locks.
+WHOLE_DESCRIPTION = getattr(fcntl, "F_OFD_SETLK", None)
+# First byte and number of bytes that SQLite's readers lock as shared, and a program that merges the log as exclusive.
+SQLITE_SHARED = (2**30 + 2, 510)
 BUSY = (BlockingIOError, PermissionError)  # errors of fcntl if another process holds the lock
 
 BESIDE = ("-wal", "-shm")  # suffixes of the names of SQLite's write-ahead log and of its index
@@ -86,9 +83,8 @@ class FileLock:
         """Whether the whole write-ahead log is merged into the file, so that the next transaction may begin a new log.
         The caller must hold the write lock."""
         if self._index_descriptor is None:
-            self._index_descriptor = os.open(
-                self._index, os.O_RDONLY | os.O_CLOEXEC
-            )  # SQLite has created this file before
+            # SQLite has created the index, because the database is open.
+            self._index_descriptor = os.open(self._index, os.O_RDONLY | os.O_CLOEXEC)
         return is_merged(os.pread(self._index_descriptor, INDEX_BYTES, 0))
 
     def watch(self) -> None:

@@ -64,9 +64,8 @@ class SqlSamples(port.Samples):
         key: str | None = None,
         log: LogPart | None = None,
     ) -> AddedSamples:
-        body = fingerprint(
-            sampler, [asdict(sample) for sample in samples] if key else []
-        )  # to be compared with an earlier request with the same idempotency key
+        # Content hash, to be compared with that of an earlier request with the same idempotency key.
+        body = fingerprint(sampler, [asdict(sample) for sample in samples] if key else [])
         with self._database.write() as connection:
             surrogate = hold(connection, name)
             if log is not None:  # logged samples are identified by their position in the log, not by a key

@@ -152,9 +152,8 @@ def _upgrade(connection: Connection) -> None:
 def _take_turn(connection: Connection) -> None:
     if connection.dialect.name == "postgresql":
         connection.execute(sa.text("SET LOCAL lock_timeout = 0"))  # wait for another migration without limit
-        connection.execute(
-            sa.text("SET LOCAL idle_in_transaction_session_timeout = 0")
-        )  # a migration may compute for a while between two statements
+        # A migration may compute for a while between two statements.
+        connection.execute(sa.text("SET LOCAL idle_in_transaction_session_timeout = 0"))
         connection.execute(sa.select(sa.func.pg_advisory_xact_lock(MIGRATION_LOCK)))
 
 

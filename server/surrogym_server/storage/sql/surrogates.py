@@ -247,17 +247,8 @@ def _apply(connection: Connection, surrogate: Row[Any], changes: dict[str, Any])
         connection.execute(sa.update(surrogates).where(surrogates.c.id == surrogate.id).values(**changes))
 
 
-SUMMARY_FIELDS = (
-    "id",
-    "name",
-    "budget",
-    "target",
-    "phase",
-    "paused",
-    "round",
-    "error",
-    "created_at",
-)  # fields of a summary that are columns of the table
+# Fields of a summary that are columns of the table of surrogates.
+SUMMARY_FIELDS = ("id", "name", "budget", "target", "phase", "paused", "round", "error", "created_at")
 SUMMARY_COLUMNS = [getattr(surrogates.c, name) for name in SUMMARY_FIELDS]
 
 

@@ -163,9 +163,8 @@ surrogates = sa.Table(
     sa.Column("checkpoint", sa.Text),
     sa.Column("revision", sa.BigInteger, nullable=False),  # increases with each change that makes a fit due
     sa.Column("fitted_revision", sa.BigInteger, nullable=False),  # revision at the last fit
-    sa.Column(
-        "logged_revision", sa.BigInteger, nullable=False, server_default="0"
-    ),  # revision with which the last log was complete
+    # Revision with which the last log was complete.
+    sa.Column("logged_revision", sa.BigInteger, nullable=False, server_default="0"),
     sa.Column("fit_token", sa.Text),
     sa.Column("fit_owner", sa.Text),
     sa.Column("fit_expires", sa.Double),
