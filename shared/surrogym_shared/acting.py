@@ -74,7 +74,7 @@ class ActingPolicy:
         ValueError: arrays that don't fit together, that are too large, or that contain NaN or infinity.
     """
 
-    mean: Array  # (D,) subtracted from an observation
+    mean: Array  # (D,) mean that is subtracted from an observation
     deviation: Array  # (D,) standard deviation by which the difference is divided
     layers: tuple[Layer, ...]
     activation: Activation = "tanh"  # activation function of the hidden layers

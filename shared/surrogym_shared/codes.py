@@ -20,7 +20,7 @@ class Code(StrEnum):
     NOT_FOUND = "not_found"  # no such route
     UNKNOWN_SURROGATE = "unknown_surrogate"
     UNKNOWN_SESSION = "unknown_session"
-    SESSION_EXPIRED = "session_expired"  # idle for too long, or lost with a crash; open a new one
+    SESSION_EXPIRED = "session_expired"  # the session was idle for too long, or was lost in a crash
     UNKNOWN_QUERY = "unknown_query"
     UNKNOWN_MODEL = "unknown_model"
     UNKNOWN_POLICY = "unknown_policy"  # no such version or alias, or the policy has no such file or evaluation
@@ -32,10 +32,10 @@ class Code(StrEnum):
     FOREIGN_LEASE = "foreign_lease"  # the lease token was never given out for this query
     LEASE_EXPIRED = "lease_expired"  # a query was renewed or reported as failed after its lease had ended
     NOT_RESET = "not_reset"  # a step before the first reset, or of a lane whose episode ended, with autoreset disabled
-    NO_MODEL = "no_model"  # nothing has been fitted yet
+    NO_MODEL = "no_model"  # no model has been fitted yet
     TOO_LARGE = "too_large"
     UNSUPPORTED_MEDIA_TYPE = "unsupported_media_type"
-    REQUEST_TIMEOUT = "request_timeout"  # the request itself did not arrive in time
+    REQUEST_TIMEOUT = "request_timeout"  # the body of the request did not arrive in time
     TOO_MANY_REQUESTS = "too_many_requests"  # a queue or a cap is full
     DEADLINE_EXCEEDED = "deadline_exceeded"  # the reply would have been late, so it was not computed
     UNAVAILABLE = "unavailable"

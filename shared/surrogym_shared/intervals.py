@@ -26,7 +26,7 @@ def of_mean(values: Sequence[float]) -> Interval | None:
     if len(values) < 2:
         return None
     array = np.asarray(values, dtype=np.float64)
-    rows = max(1, 2**20 // len(array))  # resamples at once: 8 MB
+    rows = max(1, 2**20 // len(array))  # number of resamples that are computed at once, in 8 MB
     rng = np.random.default_rng(0)
     means = np.concatenate(
         [

@@ -18,18 +18,19 @@ from surrogym_shared.terms import evaluate
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
-CORNERS = 10  # most coordinates of which every corner of the start is checked
-STARTS = 1_000  # random states of the start that are checked
+CORNERS = 10  # most coordinates with which every corner of the start ranges is checked
+STARTS = 1_000  # number of random start states that are checked
 
 
 def limits_of(spec: EnvironmentSpec) -> Limits:
-    """Return the limits of a specification that has some."""
+    """Return the limits of a specification, which must have some."""
     assert spec.limits is not None
     return spec.limits
 
 
 def room(spec: EnvironmentSpec, coordinates: Array) -> Array:
-    """Distance (n, L) from coordinates (n, C) to the nearer end of each limit, in the limit's unit; negative beyond."""
+    """Return the distances (n, L) from coordinates (n, C) to the nearer end of each limit, in the limit's unit; they
+    are negative beyond the end."""
     columns = []
     for limit in limits_of(spec).keep:
         value = evaluate(spec, limit.term, coordinates)
@@ -40,38 +41,41 @@ def room(spec: EnvironmentSpec, coordinates: Array) -> Array:
 
 
 def past(spec: EnvironmentSpec, coordinates: Array) -> Bools:
-    """Whether (n,) coordinates (n, C) lie beyond a limit."""
+    """Return whether coordinates (n, C) lie beyond any limit, as booleans (n,)."""
     return np.asarray((room(spec, coordinates) < 0).any(axis=1))
 
 
 def falls_back(spec: EnvironmentSpec, before: Array, coordinates: Array) -> Bools:
-    """Whether (n,) the fallback acts at coordinates (n, C), which followed ``before`` (n, C) by one step.
+    """Return whether the fallback acts at coordinates (n, C), one step after ``before`` (n, C), as booleans (n,).
 
-    It acts if the room of a limit is below its margin, now or after one more step with the same change.
+    It acts if the distance to a limit is below its margin, now or after one more step with the same change.
     """
     now = room(spec, coordinates)
     soon = 2 * now - room(spec, before)
     margins = np.array([limit.margin for limit in limits_of(spec).keep])
-    with np.errstate(invalid="ignore"):  # a side without an end has infinite room
+    with np.errstate(invalid="ignore"):  # the distance to a missing end is infinite
         return np.asarray((np.fmin(now, soon) < margins).any(axis=1))
 
 
 def fallback_action(spec: EnvironmentSpec, coordinates: Array) -> Array:
-    """Action (F,) of the fallback at coordinates (C,)."""
+    """Return the action (F,) that the fallback takes at coordinates (C,)."""
     values = [float(evaluate(spec, term, coordinates[None])[0]) for term in limits_of(spec).fallback]
     low, high = np.array(_action_ranges(spec)).T
     return np.asarray(np.clip(values, low, high))
 
 
 def nearest(spec: EnvironmentSpec, coordinates: Array) -> tuple[Limit, float]:
-    """Return the limit with the least room at coordinates (C,), in units of its margin if it has one, and the room."""
+    """Return the limit that is nearest to coordinates (C,), and the distance to it.
+
+    Distances are compared in units of the limits' margins, if they have one.
+    """
     every = room(spec, coordinates[None])[0]
     index = int(np.argmin([r / (limit.margin or 1.0) for r, limit in zip(every, limits_of(spec).keep, strict=True)]))
     return limits_of(spec).keep[index], float(every[index])
 
 
 def check_limits(spec: EnvironmentSpec) -> None:
-    """Check the limits of a specification against the rest of it.
+    """Check that the limits of a specification fit its other entries and each other.
 
     Raises:
         ValueError: a limit names an unknown coordinate, other units, or an angle that jumps; limits contradict each
@@ -120,7 +124,7 @@ def _check_term(spec: EnvironmentSpec, limit: Limit) -> None:
 
 
 def _check_pairs(declared: Limits) -> None:
-    """Check that limits of the same term leave room between them."""
+    """Check that limits of the same term leave values between their margins. Raises ``ValueError``."""
     for one, other in product(declared.keep, repeat=2):
         if one.term == other.term and one.low is not None and other.high is not None:
             require(
@@ -157,7 +161,8 @@ def _action_ranges(spec: EnvironmentSpec) -> list[tuple[float, float]]:
 
 
 def _starts(spec: EnvironmentSpec) -> Iterator[Array]:
-    """Yield states (n, C) at which episodes may start: the listed ones, or corners and random ones of the ranges."""
+    """Yield states (n, C) at which episodes may start: the listed states, or corners and random states of the start
+    ranges."""
     if spec.starts:
         yield np.array(spec.starts)
         return

@@ -65,7 +65,7 @@ class Network:
     whose bounds are ``low`` and ``high`` (F,).
     """
 
-    mean: Array  # (D,) subtracted from an observation
+    mean: Array  # (D,) mean that is subtracted from an observation
     deviation: Array  # (D,) standard deviation by which the difference is divided
     layers: tuple[Layer, ...]
     low: Array
@@ -126,7 +126,8 @@ class Network:
         Raises:
             ValueError: the file has another form, or more than ``MAX_BYTES``.
         """
-        from surrogym_shared.archives import read_arrays, read_entries, require_finite  # only for reading
+        # Imported here, because only reading a file needs it.
+        from surrogym_shared.archives import read_arrays, read_entries, require_finite
 
         try:
             entries = read_entries(path, MAX_BYTES)

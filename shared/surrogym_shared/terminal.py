@@ -90,7 +90,7 @@ def on_interrupt(words: Callable[[], str]) -> Iterator[None]:
         yield
     except KeyboardInterrupt:
         if sys.stderr.isatty():
-            typer.echo(err=True)  # the terminal has shown ^C, perhaps behind a progress bar
+            typer.echo(err=True)  # new line, because the terminal shows ^C in the last one
         say(words())
         raise
 

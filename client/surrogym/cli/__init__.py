@@ -108,4 +108,4 @@ def _version(
     ),
 ) -> None:
     """Learn a virtual environment from a handful of real steps, serve it, and train on it."""
-    del version  # its callback has printed the version
+    del version  # the callback of the option has printed the version

@@ -76,7 +76,7 @@ class Commands(TyperGroup):
         try:
             return super().invoke(ctx)
         except Exception as error:
-            option = getattr(error, "option_name", None)  # typer may hide the class NoSuchOption
+            option = getattr(error, "option_name", None)  # only NoSuchOption has it, which typer hides
             if option is not None and (said := remark(f"option of {ctx.invoked_subcommand}", option)):
                 error.message += said  # type: ignore[attr-defined]
                 error.possibilities = None  # type: ignore[attr-defined]

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from surrogym.cli.groups import Service
 
 ENTRY_POINTS = "surrogym.twins"  # group of entry points with which the server's package writes a surrogate as an FMU
-FILE = ".surrogate"  # ending of a surrogate's file
+FILE = ".surrogate"  # suffix of a surrogate's file
 
 
 def is_surrogate(name: str) -> bool:

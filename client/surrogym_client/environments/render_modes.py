@@ -62,7 +62,7 @@ def drawn_with(name: str) -> list[tuple[str, str]]:
 
 
 def read_of(spec: EnvironmentSpec, name: str) -> Read | None:
-    """Return a function that computes a coordinate from an observation; None if no entries determine it."""
+    """Return a function that computes a coordinate from an observation; None if no entry shows the coordinate."""
     found: dict[str, tuple[int, float, float]] = {}  # index of the entry, factor and offset, by the entry's function
     for index, entry in enumerate(spec.observation):
         parts = [part for part in entry.term.parts if part.function != "one"]

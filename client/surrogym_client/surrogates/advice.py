@@ -13,7 +13,7 @@ from surrogym_shared.wire import DoubtfulRegion, ModelView, OutputFidelity, Reac
 
 NEARLY = 0.9  # share of the target that counts as nearly reached
 MOST_STEPS = 10.0  # most real steps that a forecast may need, as a multiple of the present samples
-NOTICEABLE = 0.9  # factor on the leave-one-out error: a smaller one shows that real steps helped
+NOTICEABLE = 0.9  # real steps helped if they multiplied the leave-one-out error by less than this factor
 FEWEST_MODELS = 4  # fewest models from which to estimate a rate
 NOISY_SLACK = 1.25  # factor on the allowed leave-one-out error once noise is confirmed
 NOISE_BAND = 1.5  # standard deviations of the noise that the server adds to a tolerance in the confidence index

@@ -249,7 +249,7 @@ def token_in(path: Path) -> str:
     Raises:
         UnusableToken: the file can't be read, or does not contain exactly one token.
     """
-    from surrogym_shared.secret_files import tokens_in  # only for a token in a file
+    from surrogym_shared.secret_files import tokens_in  # imported here, because only a token file needs it
 
     try:
         tokens = tokens_in(path)

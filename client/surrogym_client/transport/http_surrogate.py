@@ -238,7 +238,7 @@ class HttpSurrogate:
                 if behind is None or behind >= sent.seq or returns == _RETURNS:
                     raise
                 returns += 1
-                with suppress(SeqConflict):  # restored once more: the next attempt shows how far
+                with suppress(SeqConflict):  # the server went back again; the next attempt shows how far
                     self._send_again(live, window, behind)
 
     def _send_again(self, live: _Live, window: Window, behind: int) -> None:

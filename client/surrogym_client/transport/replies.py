@@ -22,7 +22,7 @@ def parse(reply: type[R], content: bytes, path: str) -> R:
     try:
         return reply.model_validate_json(content)
     except ValidationError as error:
-        from surrogym_shared.faults import first_fault  # only for an error
+        from surrogym_shared.faults import first_fault  # imported here, because only an error needs it
 
         raise ProtocolMismatch(f"the answer of {path} can't be read: {first_fault(error)}") from error
 

@@ -27,8 +27,8 @@ SINGLE = {
     "episode": ("episode", "episode_id", "trajectory", "run"),
     "time": ("time", "t", "timestamp", "time_stamp", "seconds"),
 }
-# Names that Gym and Stable-Baselines3 use for any end of an episode. With a column of timeouts beside it, such a column
-# counts for other ends only.
+# Names of a column that marks any end of an episode in Gym and Stable-Baselines3. If there is also a column of
+# timeouts, the ends that it marks don't count as terminations.
 EITHER_END = (
     "done",
     "dones",

@@ -14,7 +14,7 @@ MARKED = (
     (codecs.BOM_UTF16_BE, "utf-16"),
 )
 WINDOWS = "cp1252"
-SAMPLED = 4_096  # bytes at the start that show whether a text without a mark is UTF-16
+SAMPLED = 4_096  # number of first bytes by which UTF-16 without a byte order mark is recognised
 MOST_ODD = 0.1  # largest share of zero bytes among those bytes of UTF-16 that hold Latin letters
 
 AS_CSV = "save the table as CSV"

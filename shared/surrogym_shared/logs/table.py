@@ -16,13 +16,13 @@ from surrogym_shared.logs.errors import UnusableLog
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
-Cells = NDArray[Any]  # (n,) numbers, or text
+Cells = NDArray[Any]  # (n,) cells of a column: numbers, or text
 
 TRUE, FALSE = ("true", "t", "yes"), ("false", "f", "no")
 NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 NO_FINITE = ("nan", "+nan", "-nan", "inf", "+inf", "-inf", "infinity", "+infinity", "-infinity")
 BOOLEANS = {"True": 1.0, "False": 0.0, "true": 1.0, "false": 0.0, "TRUE": 1.0, "FALSE": 0.0}
-DATES, DURATIONS = "M", "m"  # kinds of NumPy types
+DATES, DURATIONS = "M", "m"  # kinds of NumPy's types datetime64 and timedelta64
 NO_NUMBERS = {DATES: "dates", DURATIONS: "durations", "c": "complex numbers", "V": "records"}
 FEWEST_STAMPS = 3  # least number of numbers from which a column is recognised as time stamps
 MOST_STAMPS = 0.9  # a column has time stamps if more than this share of its numbers are dates
@@ -126,7 +126,7 @@ def stamps(values: Floats) -> Floats | None:
     other numbers.
     """
     finite = np.where(np.isfinite(values), values, 0)
-    for below in (1, 100, 10_000, 1_000_000):  # to the day, hour, minute or second
+    for below in (1, 100, 10_000, 1_000_000):  # divisors of stamps that end with day, hour, minute or second
         day = np.floor(finite / below)
         if len(values) < FEWEST_STAMPS or not ((day >= 1900_01_01) & (day < 2200_00_00)).mean() > MOST_STAMPS:
             continue

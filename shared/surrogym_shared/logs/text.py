@@ -33,7 +33,7 @@ class _Head:
     comments: tuple[str, ...]
     line: str
     row: str
-    before: int  # lines before ``line``
+    before: int  # number of lines before ``line``
 
 
 def table_of_text(text: str, where: str, most_rows: int = MOST_ROWS, remarks: Sequence[str] = ()) -> Table:

@@ -17,7 +17,7 @@ class Limit(Frozen):
     ``margin``: distance from ``low`` and ``high``, in the term's unit, within which the fallback acts. It has to be
     larger than what one step can add to the change of the step before.
 
-    ``unit``: of ``low``, ``high`` and ``margin``; of a single coordinate it has to be the coordinate's own.
+    ``unit``: unit of ``low``, ``high`` and ``margin``. If the term is a single coordinate, it is the coordinate's unit.
     """
 
     name: Name
