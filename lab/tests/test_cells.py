@@ -17,21 +17,21 @@ from surrogym_lab.reproduce.rows import Row, read_rows, row_of
 from surrogym_lab.settings import StudySettings
 
 
-def test_every_combination_is_a_cell_and_seeds_come_evenly():
+def test_the_study_runs_every_combination_of_settings_ordered_by_seed():
     found = list(cells(["pendulum", "acrobot"], ["default", "paper"], range(3), shares=(1, 0.5), steps=8))
     assert len({cell.name for cell in found}) == len({cell.key for cell in found}) == 24
     assert [cell.settings.seed for cell in found] == [0] * 8 + [1] * 8 + [2] * 8
     assert {cell.key[2] for cell in found if cell.settings.task == "pendulum"} == {14, 7}
 
 
-def test_a_cell_is_a_demo_that_a_person_could_run(tmp_path):
+def test_a_study_run_is_a_valid_demo_command(tmp_path):
     (cell,) = cells(["acrobot"], ["no_loop"], [2], shares=(0.5,), steps=8, episodes=3)
     values = parse(demo_command(cell, tmp_path)[3:], build)
     names = ("task", "seed", "arm", "budget", "steps", "episodes", "pictures")
     assert [values[name] for name in names] == ["acrobot", 2, "no_loop", 50, 8, 3, False]
 
 
-def test_a_row_answers_its_own_cell_and_no_other():
+def test_a_result_row_marks_only_its_own_study_run_as_done():
     cell = Cell(StudySettings("pendulum", seed=1))
     row = Row("pendulum", "default", 1, 14, mean=-1.0, specification=cell.specification)
     assert done_already(cell, [row])
@@ -45,7 +45,7 @@ def test_a_row_answers_its_own_cell_and_no_other():
         assert not done_already(cell, [other])
 
 
-def test_a_study_has_the_default_everywhere_and_the_arms_on_four_tasks():
+def test_a_study_runs_the_default_on_every_task_and_variants_on_four():
     made = Counter((cell.settings.task, cell.settings.arm) for cell in study(list(TASKS), range(10)))
     assert {made[task, "default"] for task in TASKS} == {10}
     assert {task for task, arm in made if arm != "default"} == {"pendulum", "cartpole", "mountaincar", "swingup"}
@@ -65,7 +65,7 @@ def test_the_hash_of_settings_does_not_depend_on_the_seed():
     assert len({plain.specification, *(Cell(StudySettings(**change)).specification for change in changes)}) == 6
 
 
-def test_cells_run_side_by_side_and_one_that_fails_stops_no_other(tmp_path):
+def test_study_runs_are_parallel_and_a_failed_one_stops_no_other(tmp_path):
     todo = list(cells(["pendulum"], ["default"], range(4)))
     seen = []
     rows = run_cells(todo, [], tmp_path, 2, seen.append, stand_in(0.2, fails={1}))
@@ -82,7 +82,7 @@ def test_cells_run_side_by_side_and_one_that_fails_stops_no_other(tmp_path):
     assert not any(row.error for row in again)
 
 
-def test_an_interruption_ends_what_runs_and_keeps_what_is_done(tmp_path):
+def test_an_interrupted_study_ends_its_runs_and_keeps_finished_results(tmp_path):
     def interrupt(now):
         if now.done == 1:
             raise KeyboardInterrupt
@@ -95,14 +95,14 @@ def test_an_interruption_ends_what_runs_and_keeps_what_is_done(tmp_path):
     assert [row.seed for row in read_rows(tmp_path / "rows.csv")] == [0]
 
 
-def test_old_rows_stay(tmp_path):
+def test_a_study_keeps_earlier_result_rows(tmp_path):
     old = replace(row_of(METRICS), task="reacher")
     rows = run_cells(list(cells(["pendulum"], ["default"], [3])), [old], tmp_path, 1, ignore, stand_in())
     assert old in rows
     assert len(rows) == 2
 
 
-def test_every_arm_has_a_colour_of_its_own():
+def test_every_study_variant_has_its_own_colour():
     from surrogym_lab.reproduce.pictures import COLOURS
 
     assert set(COLOURS) == set(ARMS)

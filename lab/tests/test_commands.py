@@ -18,13 +18,13 @@ ROW = Row("pendulum", "default", 0, 14, 4, 5, 9, mean=-150.0, min=-400.0, reache
         ("--shares=0", "expected numbers above 0"),
     ],
 )
-def test_what_is_not_known_is_refused(lab, option, words):
+def test_unknown_tasks_and_variants_are_refused_by_the_efficiency_command(lab, option, words):
     said = lab("efficiency", option)
     assert said.code == 1
     assert words in said.err
 
 
-def test_finished_stages_are_not_run_again(lab, tmp_path):
+def test_finished_stages_of_a_study_are_not_run_again(lab, tmp_path):
     row = Row(**{**vars(ROW), "specification": Cell(StudySettings("pendulum")).specification})
     write_rows(tmp_path / "out" / "rows.csv", [row])
     said = lab("efficiency", "--tasks=pendulum", "--seeds=1", "--out=out", "--json")
@@ -33,7 +33,7 @@ def test_finished_stages_are_not_run_again(lab, tmp_path):
     assert [found["mean"] for found in said.json["rows"]] == [-150.0]
 
 
-def test_the_study_of_trust_runs_the_unseen_tasks(lab, tmp_path):
+def test_the_trust_study_runs_the_unseen_tasks(lab, tmp_path):
     made = Cell(StudySettings("kinetics", seed=7, pictures=False))
     row = Row(
         **{**vars(ROW), "task": "kinetics", "seed": 7, "budget": made.key[2], "specification": made.specification}
@@ -45,7 +45,7 @@ def test_the_study_of_trust_runs_the_unseen_tasks(lab, tmp_path):
     assert "unknown task 'x': expected all, unseen, or some of" in lab("trust", "--tasks=x").err
 
 
-def test_rows_of_several_sittings_become_one_table(lab, tmp_path):
+def test_result_rows_of_several_sessions_are_merged_into_one_table(lab, tmp_path):
     write_rows(tmp_path / "night.csv", [ROW])
     oracle = Row("pendulum", "oracle", 0, 14, 0, 0, 300_000, mean=-170.0, min=-300.0, seconds=9.0)
     write_rows(tmp_path / "day.csv", [oracle])
@@ -60,7 +60,7 @@ def test_rows_of_several_sittings_become_one_table(lab, tmp_path):
     )
 
 
-def test_a_page_takes_the_table(lab, tmp_path):
+def test_the_table_command_writes_the_table_into_a_page(lab, tmp_path):
     write_rows(tmp_path / "rows.csv", [ROW])
     (tmp_path / "page.md").write_text("<!-- efficiency: begin -->\n<!-- efficiency: end -->\n")
     assert lab("table", "--rows=rows.csv", "--out=.", "--page=page.md").code == 0

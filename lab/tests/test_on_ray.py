@@ -47,7 +47,7 @@ def work_of(value: int) -> Callable[[Path], int]:
     return work
 
 
-def test_a_task_continues_from_files_and_gives_back_what_it_wrote(address: str, tmp_path: Path):
+def test_a_ray_task_gets_its_files_and_returns_those_it_wrote(address: str, tmp_path: Path):
     connect(address)
     (tmp_path / "other").write_text("stays here")
     results: dict[int, object] = {}
@@ -63,14 +63,16 @@ def test_a_task_continues_from_files_and_gives_back_what_it_wrote(address: str, 
     assert {path.name: path.read_text() for path in (tmp_path / "done").iterdir()} == {"4": "0", "-1": "1", "1": "2"}
 
 
-def test_a_machine_of_other_versions_is_named(address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_ray_machine_with_other_package_versions_is_refused_for_studies(
+    address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     connect(address)
     monkeypatch.setattr(cluster, "versions", lambda: {"python": "2.7"})
     with pytest.raises(TaskFailed, match=r"expected python 2\.7 on every machine of the cluster, got 3\."):
         Task(work_of(1), tmp_path).result()
 
 
-def test_a_cell_of_the_paper_continues_in_the_cluster_from_its_files(
+def test_a_run_of_the_paper_study_continues_on_ray_from_its_files(
     address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     """The second run has the real steps of the first one. A cell that breaks leaves the others alone."""
@@ -91,7 +93,7 @@ def test_a_cell_of_the_paper_continues_in_the_cluster_from_its_files(
     assert result.read_bytes() == first
 
 
-def test_a_seed_of_the_paper_has_the_same_table_in_the_cluster_as_here(address: str, tmp_path: Path):
+def test_a_seed_of_the_paper_study_gives_the_same_table_on_ray_as_locally(address: str, tmp_path: Path):
     connect(address)
     todo = list(paper_cases.cells(["cartpole"], 1, paper_cases.QUICK))
     there, failed = paper.run_on_ray(todo, tmp_path / "there", 2, lambda *_: None)
@@ -102,7 +104,7 @@ def test_a_seed_of_the_paper_has_the_same_table_in_the_cluster_as_here(address: 
     assert files[0] == files[1]
 
 
-def test_cells_run_in_the_cluster_and_leave_the_same_as_here(address: str, tmp_path: Path):
+def test_study_runs_on_ray_leave_the_same_files_as_local_ones(address: str, tmp_path: Path):
     connect(address)
     todo = list(cells(["pendulum"], ["default"], range(3)))
     here = run_cells(todo, [], tmp_path / "here", 2, ignore, stand_in(fails={1}))
@@ -119,7 +121,7 @@ def test_cells_run_in_the_cluster_and_leave_the_same_as_here(address: str, tmp_p
     assert not any(row.error for row in again)
 
 
-def test_an_interruption_ends_runs_in_the_cluster(address: str, tmp_path: Path):
+def test_interrupting_a_study_ends_its_runs_on_ray(address: str, tmp_path: Path):
     """The run ends with the process that started it, as a demo does."""
     connect(address)
     mark = tmp_path / "mark"
@@ -144,7 +146,7 @@ def test_an_interruption_ends_runs_in_the_cluster(address: str, tmp_path: Path):
         time.sleep(0.05)
 
 
-def test_peers_run_in_the_cluster_and_leave_the_same_as_here(
+def test_peer_runs_on_ray_leave_the_same_files_as_local_ones(
     address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     """The method ``here`` is known to this process alone, so its cell breaks in the cluster."""
@@ -171,12 +173,12 @@ def test_peers_run_in_the_cluster_and_leave_the_same_as_here(
     ("address", "said"),
     [("127.0.0.1:9", "expected a cluster at '127.0.0.1:9', got none"), ("there", "expected auto or host:port")],
 )
-def test_an_address_without_a_cluster_is_one_sentence(address: str, said: str):
+def test_a_ray_address_without_a_cluster_gives_a_one_sentence_error(address: str, said: str):
     with pytest.raises(NoCluster, match=said):
         connect(address)
 
 
-def test_without_ray_one_sentence_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch):
+def test_a_study_on_ray_without_ray_tells_how_to_install_it(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(ray_cluster, "find_spec", lambda _: None)
     with pytest.raises(NoCluster, match=r"pip install 'surrogym\[ray\]'"):
         connect("auto")

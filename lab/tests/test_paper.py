@@ -15,7 +15,7 @@ from surrogym_sampler.original import make
 from surrogym_shared.spec import Fixed
 
 
-def test_designs_have_the_papers_numbers_of_real_steps():
+def test_reproduced_designs_have_the_papers_numbers_of_real_steps():
     designs = {(c.task, c.arm): c.spec.design for c in cells(list(TASKS), 1)}
     assert (designs["pendulum", "paper"].initial, designs["pendulum", "paper"].budget) == (40, 125)
     assert (designs["cartpole", "paper"].initial, designs["cartpole", "paper"].budget) == (50, 120)
@@ -27,7 +27,7 @@ def test_designs_have_the_papers_numbers_of_real_steps():
     assert ("cartpole", "hypercube") not in designs
 
 
-def test_a_cell_is_named_after_all_that_it_depends_on():
+def test_the_name_of_a_paper_study_run_contains_all_its_settings():
     one = Cell("pendulum", "paper", 0)
     longer = replace(one, scale=replace(WHOLE, steps=1_000))
     assert one.name == Cell("pendulum", "paper", 0).name == longer.name
@@ -36,7 +36,7 @@ def test_a_cell_is_named_after_all_that_it_depends_on():
 
 
 @pytest.mark.parametrize(("upward", "least"), [(True, 1.0), (False, 0.05)])
-def test_only_the_named_quantities_are_off(upward, least):
+def test_a_biased_environment_varies_only_the_named_quantities(upward, least):
     variation = Variation("any", 1, {"theta": Fixed(value=1.0), "speed": Fixed(value=0.5)}, ("m",), 0.5, upward)
     spec = make("Pendulum-v1").spec().model_copy(update={"start": variation.start})
     masses = []
@@ -50,7 +50,7 @@ def test_only_the_named_quantities_are_off(upward, least):
     assert min(masses) < 1 or upward
 
 
-def test_a_full_command_stays_the_full_torque():
+def test_in_a_biased_environment_a_full_action_gives_the_full_torque():
     variation = Variation(
         "any", 1, {"theta": Fixed(value=0.0), "speed": Fixed(value=0.0)}, ("max_torque",), limit="max_torque"
     )
@@ -61,14 +61,14 @@ def test_a_full_command_stays_the_full_torque():
     assert abs(episode._env.last_u + 2.0) > 1e-3
 
 
-def test_quantities_derived_from_a_mass_follow_its_change():
+def test_a_biased_mass_also_changes_the_quantities_derived_from_it():
     variation = Variation("any", 1, None, ("masspole",), 0.5)
     episode = BiasedEpisode(make("CartPole-v1").spec(), variation)
     episode.reset(3)
     assert episode._env.total_mass == episode._env.masscart + episode._env.masspole != 1.1
 
 
-def test_episodes_are_counted_traced_and_repeatable():
+def test_episodes_of_the_paper_study_are_counted_traced_and_reproducible():
     spec = make("Pendulum-v1").spec().model_copy(update={"time_limit": 5})
 
     def still(observations):
@@ -83,14 +83,14 @@ def test_episodes_are_counted_traced_and_repeatable():
         assert sum(trace["reward"]) == pytest.approx(returned)
 
 
-def test_unseen_steps_are_the_same_for_every_model():
+def test_every_model_of_the_paper_study_is_tested_on_the_same_unseen_steps():
     spec = make("CartPole-v1", preset="paper").spec()
     one, same = Unseen(spec, 8), Unseen(spec, 8)
     assert (one.coordinates, one.action, one.reward.tolist()) == (same.coordinates, same.action, same.reward.tolist())
     assert set(one.reward) == {0.0, 1.0}
 
 
-def test_some_models_are_the_first_the_last_and_between():
+def test_models_chosen_for_evaluation_are_evenly_spaced_from_first_to_last():
     assert some(list(range(80)), 5) == [0, 20, 40, 59, 79]
     assert some([1, 2], 5) == [1, 2]
 
@@ -98,11 +98,11 @@ def test_some_models_are_the_first_the_last_and_between():
 @pytest.mark.parametrize(
     ("angles", "seconds"), [([3.0, 2.0, 0.1, 0.0], 0.1), ([0.0, 3.0, 0.0], 0.1), ([0.1, 0.1], 0.0), ([0.0, 3.0], None)]
 )
-def test_the_pole_has_settled_when_it_stays_upright(angles, seconds):
+def test_the_pole_counts_as_settled_once_it_stays_upright(angles, seconds):
     assert settling_time([[angle, 0.0] for angle in angles]) == seconds
 
 
-def test_a_run_counts_only_when_all_its_trials_are_whole():
+def test_a_paper_study_run_counts_only_if_all_its_trials_are_complete():
     def row(seed, lengths):
         episodes = {v.name: {"lengths": lengths} for v in TASKS["cartpole"].variations}
         told = {"reward": 0.7, "reward_printed": math.pi}
@@ -116,7 +116,7 @@ def test_a_run_counts_only_when_all_its_trials_are_whole():
     assert markdown(list(lines.values())).startswith("| what | the paper | preset paper |")
 
 
-def test_a_task_that_is_not_the_papers_is_refused(lab):
+def test_the_paper_study_refuses_a_task_that_is_not_in_the_paper(lab):
     said = lab("paper", "--tasks", "acrobot")
     assert said.code == 1
     assert "unknown task 'acrobot': expected some of pendulum, cartpole" in said.err
@@ -129,7 +129,7 @@ def test_a_task_that_is_not_the_papers_is_refused(lab):
         (("--on-ray", "127.0.0.1:9"), "expected a cluster at '127.0.0.1:9', got none"),
     ],
 )
-def test_runs_at_once_need_a_cluster(lab, options, told):
+def test_parallel_runs_of_the_paper_command_require_a_ray_cluster(lab, options, told):
     said = lab("paper", *options)
     assert said.code == 1
     assert told in said.err
@@ -139,7 +139,7 @@ def test_runs_at_once_need_a_cluster(lab, options, told):
 @pytest.mark.e2e
 @pytest.mark.slow
 @pytest.mark.long
-def test_a_quick_run_gives_table_and_pictures_and_is_not_made_twice(lab, tmp_path):
+def test_a_quick_paper_study_writes_table_and_pictures_and_is_not_repeated(lab, tmp_path):
     quick = ("paper", "--quick", "--tasks", "cartpole", "--seeds", "1", "--out", str(tmp_path), "--json")
     said = lab(*quick)
     assert said.code == 0, said.err

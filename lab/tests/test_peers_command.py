@@ -7,7 +7,7 @@ from surrogym_lab.peers.study import PeerCell
 from surrogym_lab.reproduce.rows import write_records
 
 
-def test_the_command_shows_what_there_is(lab, tmp_path):
+def test_the_peers_command_shows_finished_results(lab, tmp_path):
     cell = PeerCell("pendulum", "sac", 0)
     point = Point("pendulum", "sac", 0, 1, 20_000, mean=-170.0, episodes=100, ended=BUDGET)
     write_records(cell.file(tmp_path / "out"), Point, [Point(**{**vars(point), "specification": cell.specification})])
@@ -20,7 +20,7 @@ def test_the_command_shows_what_there_is(lab, tmp_path):
     assert "not reached by 20,000" in (tmp_path / "out" / "peers.md").read_text()
 
 
-def test_a_run_with_other_settings_is_never_overwritten(lab, tmp_path):
+def test_peer_results_of_other_settings_are_never_overwritten(lab, tmp_path):
     """Hours of computing would be lost."""
     cell = PeerCell("pendulum", "sac", 0, budget=300)
     point = Point("pendulum", "sac", 0, 1, 300, ended=BUDGET, specification=cell.specification)
@@ -36,13 +36,13 @@ def test_a_run_with_other_settings_is_never_overwritten(lab, tmp_path):
     assert lab(*asked, "--budget=300").code == 0
 
 
-def test_the_command_refuses_what_it_does_not_know(lab):
+def test_the_peers_command_refuses_unknown_methods_and_tasks(lab):
     assert "unknown task 'nothing'" in lab("peers", "--tasks=nothing").err
     assert "unknown method 'x'" in lab("peers", "--methods=x").err
 
 
 @pytest.mark.parametrize(("task", "words"), [("nomod:Nope", "No module named 'nomod'"), ("mine:Nope", "'Nope'")])
-def test_a_class_that_does_not_exist_is_refused_before_anything_runs(lab, tmp_path, task, words):
+def test_the_peers_command_refuses_a_missing_environment_class_before_running(lab, tmp_path, task, words):
     """It was refused by the process of the first cell, after those of other tasks had begun."""
     (tmp_path / "mine.py").touch()
     said = lab("peers", f"--tasks=pendulum,{task}", "--methods=ppo", "--seeds=1")
@@ -53,7 +53,7 @@ def test_a_class_that_does_not_exist_is_refused_before_anything_runs(lab, tmp_pa
     assert not (tmp_path / "runs").exists()
 
 
-def test_a_method_that_has_to_know_the_reward_is_refused_before_anything_runs(lab, tmp_path):
+def test_the_peers_command_refuses_methods_that_need_an_unknown_reward_before_running(lab, tmp_path):
     """Its process said so after half a minute, with exit status 0."""
     said = lab("peers", "--tasks=invertedpendulum", "--methods=pets,pilco", "--seeds=1")
     assert said.code == 1
@@ -63,7 +63,7 @@ def test_a_method_that_has_to_know_the_reward_is_refused_before_anything_runs(la
 
 
 @pytest.mark.slow
-def test_the_command_fails_if_no_run_came_to_its_end(lab, tmp_path):
+def test_the_peers_command_fails_if_no_run_finished(lab, tmp_path):
     (tmp_path / "ending.py").write_text("import os\n\n\ndef ends():\n    os._exit(3)\n")
     said = lab("peers", "--tasks=ending:ends", "--methods=ppo", "--seeds=1", "--out=out")
     assert said.code == 1
@@ -71,7 +71,7 @@ def test_the_command_fails_if_no_run_came_to_its_end(lab, tmp_path):
     assert "none of 1 runs came to its end" in said.err
 
 
-def test_a_missing_file_of_rows_is_refused(lab, tmp_path):
+def test_the_peers_command_refuses_a_missing_result_file(lab, tmp_path):
     """Else the table would lack our runs without a word. Nothing runs before."""
     said = lab("peers", "--tasks=pendulum", "--methods=sac", "--seeds=1", "--rows=none.csv")
     assert said.code == 1
@@ -79,7 +79,7 @@ def test_a_missing_file_of_rows_is_refused(lab, tmp_path):
     assert not (tmp_path / "runs").exists()
 
 
-def test_a_method_of_ours_leads_to_the_files_of_rows(lab):
+def test_asking_the_peers_command_for_our_method_refers_to_its_result_files(lab):
     """The help names it, so "unknown" would be wrong."""
     said = lab("peers", "--methods=sac,default")
     assert said.code == 1
@@ -88,7 +88,7 @@ def test_a_method_of_ours_leads_to_the_files_of_rows(lab):
 
 
 @pytest.mark.slow
-def test_a_run_leaves_its_points_and_is_not_repeated(lab, tmp_path):
+def test_a_peer_run_stores_its_curve_points_and_is_not_repeated(lab, tmp_path):
     asked = ("peers", "--tasks=pendulum", "--methods=ppo", "--seeds=1", "--out=out", "--budget=64")
     said = lab(*asked, "--episodes=1")
     assert said.code == 0

@@ -22,7 +22,7 @@ ROWS = read_rows(RESULTS / "efficiency.csv")
         ("lab/records/results/efficiency.md", "efficiency", "efficiency", "lab/records/results"),
     ],
 )
-def test_the_tables_are_those_of_the_rows(page, name, rows, out):
+def test_the_tables_of_result_pages_equal_those_made_from_the_csv_rows(page, name, rows, out):
     made = section(name, read_rows(RESULTS / f"{rows}.csv"), ".")
     again = f"python -m surrogym_lab table --rows lab/records/results/{rows}.csv --out {out} --page {page}"
     assert present_sections(ROOT / page) == {name: made}, again
@@ -38,7 +38,7 @@ def test_the_tables_are_those_of_the_rows(page, name, rows, out):
         ("fastppo", "again"),
     ],
 )
-def test_tables_of_fresh_seeds_are_those_of_their_rows(page, name):
+def test_the_tables_of_fresh_seeds_equal_those_made_from_their_csv_rows(page, name):
     rows = read_rows(RESULTS / f"efficiency-{name}.csv")
     again = f"python -m surrogym_lab table --rows lab/records/results/efficiency-{name}.csv"
     text = (RESULTS / f"{page}.md").read_text()
@@ -47,7 +47,7 @@ def test_tables_of_fresh_seeds_are_those_of_their_rows(page, name):
 
 
 @pytest.mark.parametrize("study", ["trust", "trust-again", "trust-third", "trust-fourth", "trust-fifth", "trust-sixth"])
-def test_every_table_of_the_unseen_tasks_is_that_of_its_rows(study):
+def test_the_tables_of_unseen_tasks_equal_those_made_from_their_csv_rows(study):
     text, rows = (RESULTS / f"{study}.md").read_text(), read_rows(RESULTS / f"{study}.csv")
     made = summary(rows) + promise_tables(grouped(rows))
     tables = [line for line in made.splitlines() if line.startswith("|")]
@@ -55,6 +55,6 @@ def test_every_table_of_the_unseen_tasks_is_that_of_its_rows(study):
     assert set(tables) <= set(text.splitlines())
 
 
-def test_each_cell_has_one_row_and_each_task_its_picture():
+def test_each_recorded_run_has_one_row_and_each_task_a_picture():
     assert merge(ROWS) == ROWS
     assert all((RESULTS / f"efficiency-{task}.png").exists() for task in tasks_with_results(ROWS))

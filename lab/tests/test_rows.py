@@ -11,7 +11,7 @@ from surrogym_lab.reproduce.rows import LATER, Row, UnusableRows, merge, read_ro
 ROW = Row("pendulum", "default", 0, 14, 4, 5, 9, mean=-150.123, success=0.97, reached=True, phase="ready")
 
 
-def test_a_row_says_what_the_run_gave():
+def test_a_result_row_contains_the_metrics_of_its_run():
     row = row_of(METRICS)
     assert row.key == ("pendulum", "default", 14, 3)
     assert (row.real_steps, row.failures, row.also_success, row.seconds) == (9, 7, 0.9, 50.0)
@@ -21,7 +21,7 @@ def test_a_row_says_what_the_run_gave():
     assert row_of({**METRICS, "also": None, "success_rate": None}).failures is None
 
 
-def test_rows_survive_the_file(tmp_path):
+def test_result_rows_survive_writing_and_reading(tmp_path):
     rows = [
         replace(ROW, trusted=False, promise=-150.0),
         Row("cartpole", "paper", 1, 8, error="exit code 1: no, nothing"),
@@ -31,7 +31,7 @@ def test_rows_survive_the_file(tmp_path):
     assert read_rows(tmp_path / "none.csv") == []
 
 
-def test_a_file_from_before_promises_is_read(tmp_path):
+def test_a_result_file_without_promise_columns_is_still_read(tmp_path):
     path = tmp_path / "rows.csv"
     write_rows(path, [ROW])
     with path.open(newline="") as file:
@@ -41,7 +41,7 @@ def test_a_file_from_before_promises_is_read(tmp_path):
     assert read_rows(path) == [ROW]
 
 
-def test_two_writers_of_one_file_do_not_disturb_each_other(tmp_path):
+def test_two_concurrent_writers_of_a_result_file_lose_no_rows(tmp_path):
     """Two studies may share a folder. The second writer moved the first one's partial file away."""
 
     def rows(last):
@@ -55,7 +55,7 @@ def test_two_writers_of_one_file_do_not_disturb_each_other(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["rows.csv"]
 
 
-def test_a_write_that_fails_leaves_the_file_as_it_was(tmp_path):
+def test_a_failed_write_leaves_the_result_file_unchanged(tmp_path):
     def broken():
         yield ROW
         raise RuntimeError("no more")
@@ -75,7 +75,7 @@ def test_a_write_that_fails_leaves_the_file_as_it_was(tmp_path):
         ((",yes,", ",maybe,"), "line 2: expected yes or no, got 'maybe'"),
     ],
 )
-def test_a_foreign_file_is_refused(tmp_path, change, words):
+def test_a_csv_file_with_other_columns_is_refused_as_result_file(tmp_path, change, words):
     path = tmp_path / "rows.csv"
     write_rows(path, [ROW])
     path.write_text(path.read_text().replace(*change, 1))
@@ -86,13 +86,13 @@ def test_a_foreign_file_is_refused(tmp_path, change, words):
 @pytest.mark.parametrize(
     ("content", "words"), [(b"task,arm\xff\n", "expected a CSV file in UTF-8"), (b"", "got an empty one")]
 )
-def test_a_file_that_is_no_text_or_empty_is_refused(tmp_path, content, words):
+def test_a_binary_or_empty_result_file_is_refused(tmp_path, content, words):
     (tmp_path / "rows.csv").write_bytes(content)
     with pytest.raises(UnusableRows, match=words):
         read_rows(tmp_path / "rows.csv")
 
 
-def test_later_rows_win_but_no_error_hides_a_result():
+def test_when_merging_later_rows_win_unless_they_are_errors():
     better, bad, other = replace(ROW, mean=-140.0), replace(ROW, mean=None, error="died"), replace(ROW, seed=1)
     assert merge([ROW], [better, other]) == [better, other]
     assert merge([ROW], [bad]) == [ROW]

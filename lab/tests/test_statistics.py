@@ -7,7 +7,7 @@ import scipy.stats
 from surrogym_lab.reproduce.statistics import bootstrap_interval, difference_interval, exact_interval
 
 
-def test_the_interval_covers_the_truth_about_as_often_as_it_says():
+def test_the_bootstrap_interval_has_about_its_nominal_coverage():
     rng = np.random.default_rng(0)
     inside = 0
     for _ in range(60):
@@ -16,7 +16,7 @@ def test_the_interval_covers_the_truth_about_as_often_as_it_says():
     assert 48 <= inside <= 60
 
 
-def test_a_difference_is_decided_only_where_there_is_one():
+def test_the_difference_interval_excludes_zero_only_if_there_is_a_difference():
     rng = np.random.default_rng(1)
     first, second = rng.normal(0.0, 1.0, 10), rng.normal(0.0, 1.0, 10)
     low, high = difference_interval(first, second)
@@ -25,13 +25,13 @@ def test_a_difference_is_decided_only_where_there_is_one():
     assert 3 < low < high < 7
 
 
-def test_a_few_terrible_seeds_show_in_the_interval():
+def test_the_bootstrap_interval_includes_the_effect_of_a_few_bad_seeds():
     low, high = bootstrap_interval(np.array([-150.0] * 6 + [-1500.0] * 4))
     assert low < -900
     assert high == -150.0
 
 
 @pytest.mark.parametrize(("count", "of"), [(0, 10), (10, 10), (9, 10), (1, 100), (45, 50)])
-def test_the_exact_interval_is_that_of_scipy(count, of):
+def test_the_exact_binomial_interval_equals_that_of_scipy(count, of):
     expected = scipy.stats.binomtest(count, of).proportion_ci(method="exact")
     assert exact_interval(count, of) == pytest.approx((expected.low, expected.high), abs=1e-9)

@@ -37,7 +37,7 @@ def line(text: str, *cells: str) -> str:
     return found
 
 
-def test_no_seed_is_left_out():
+def test_the_study_table_includes_every_seed():
     text = report(DEFAULT)
     assert line(text, "pendulum", "default") == (
         "| pendulum | default | 4 | 10.5 (9 to 12) | -157.5 (-1000.0 to -150.0) | -1000.0 | -400.0 | 20 % | 99 % |"
@@ -48,7 +48,7 @@ def test_no_seed_is_left_out():
     assert "| 954,224 (900,000 to 1,008,448) |" in line(report(oracle), "pendulum", "oracle")
 
 
-def test_a_run_that_ended_badly_counts_as_one_that_missed_the_target():
+def test_a_failed_study_run_counts_as_missing_the_target():
     bad = Row("pendulum", "default", 4, 14, error="exit code 1: no")
     text = report([*DEFAULT, bad])
     assert "| 5, 1 ended badly |" in line(text, "pendulum", "default")
@@ -56,7 +56,7 @@ def test_a_run_that_ended_badly_counts_as_one_that_missed_the_target():
     assert "| 1, 1 ended badly | - |" in report([bad])
 
 
-def test_pairs_of_arms_answer_questions_with_an_interval():
+def test_study_variants_are_compared_in_pairs_with_an_interval():
     adaptive = [replace(row, arm="no_loop") for row in DEFAULT]
     text = report([*HYPERCUBE, *[row for row in adaptive if row.seed != 2]])
     told = line(text, "pendulum", "adaptive queries", "no_loop, latin_hypercube", "3, 4")
@@ -68,7 +68,7 @@ def test_pairs_of_arms_answer_questions_with_an_interval():
     assert text.index("| pendulum | no_loop |") < text.index("| pendulum | latin_hypercube |")
 
 
-def test_an_arm_without_a_closed_loop_is_described_so():
+def test_the_study_table_describes_variants_without_closed_loop():
     """A budget of 14 is all the design's, one of 60 leaves queries for three rounds."""
     asked = [*DEFAULT, *[replace(row, arm="no_loop") for row in DEFAULT]]
     assert line(report(asked), "pendulum", "an early stop", "default, no_loop")
@@ -79,7 +79,7 @@ def test_an_arm_without_a_closed_loop_is_described_so():
     assert line(report(with_rounds), "swingup", "closed loop", "default, no_loop")
 
 
-def test_rows_with_different_origins_cause_a_warning():
+def test_the_study_table_warns_about_rows_of_different_origin():
     assert "configurations" not in report(DEFAULT)
     assert "of 2 commits" not in report(DEFAULT)
     assert "pendulum, default, budget 14: rows of 2 commits" in report([*DEFAULT, replace(ROW, seed=9, commit="d")])
@@ -88,18 +88,18 @@ def test_rows_with_different_origins_cause_a_warning():
     )
 
 
-def test_other_budgets_stand_beside():
+def test_the_study_table_lists_runs_with_other_budgets_separately():
     text = report([*DEFAULT, replace(ROW, budget=7, mean=-900.0)])
     assert line(text, "pendulum", "default, budget 7", "1")
 
 
-def test_each_task_gets_a_picture(tmp_path):
+def test_each_study_task_gets_a_picture(tmp_path):
     written = draw_tasks(tmp_path, [*DEFAULT, *HYPERCUBE, Row("cartpole", "default", 0, 8, error="no")])
     assert [path.name for path in written] == ["efficiency-pendulum.png"]
     assert written[0].stat().st_size > 5_000
 
 
-def test_tables_and_pictures_go_between_the_marks_of_a_page(tmp_path):
+def test_study_tables_and_pictures_are_inserted_between_the_marks_of_a_page(tmp_path):
     page = tmp_path / "docs" / "page.md"
     page.parent.mkdir()
     page.write_text("before\n<!-- efficiency: begin -->\nold\n<!-- efficiency: end -->\nafter\n")
@@ -116,7 +116,7 @@ def test_tables_and_pictures_go_between_the_marks_of_a_page(tmp_path):
         update(page, DEFAULT, tmp_path)
 
 
-def test_promises_are_counted_where_there_are_some():
+def test_the_study_table_counts_kept_promises_if_there_are_any():
     """Seed 1 is below its promise and, of a gain of 30, 20 short of it."""
     interval = {"promise": -150.0, "promise_low": -155.0, "promise_high": -145.0, "without": -180.0}
     kept = replace(ROW, trusted=True, audit_steps=8, **interval)
@@ -136,7 +136,7 @@ def test_promises_are_counted_where_there_are_some():
     assert "Promises" not in report([ROW])
 
 
-def test_the_table_of_a_study_fits_a_terminal(tmp_path):
+def test_the_study_table_fits_a_terminal(tmp_path):
     """The file keeps its wide Markdown."""
     rows = [
         Row("pendulum", "default", seed, 14, 4, 5, 9, mean=-150.0 - seed, min=-400.0, reached=True, seconds=1.0)

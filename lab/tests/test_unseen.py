@@ -18,13 +18,13 @@ from surrogym_trainer.evaluation.evaluator import EvaluationSettings, evaluate
 SETTABLE = [name for name in UNSEEN if name != "reset-only"]
 
 
-def test_there_are_ten_and_none_is_a_task_of_the_demo():
+def test_there_are_ten_unseen_tasks_and_none_is_a_demo_task():
     assert len(UNSEEN) == 10
     assert not set(UNSEEN) & set(TASKS)
 
 
 @pytest.mark.parametrize("task", UNSEEN)
-def test_each_is_an_environment_with_a_specification_that_the_server_takes(task):
+def test_each_unseen_task_has_a_specification_that_the_server_accepts(task):
     settings = StudySettings(task, seed=3)
     environment = make(settings.demo_task.environment)
     definition_from_spec(settings.spec())
@@ -35,7 +35,7 @@ def test_each_is_an_environment_with_a_specification_that_the_server_takes(task)
 
 
 @pytest.mark.parametrize("task", SETTABLE)
-def test_steps_from_anywhere_are_finite_and_depend_on_the_action(task):
+def test_steps_of_unseen_tasks_are_finite_and_depend_on_the_action(task):
     machine = make(UNSEEN[task].environment)
     assert isinstance(machine, Machine)
     rng = np.random.default_rng(0)
@@ -53,7 +53,7 @@ def test_steps_from_anywhere_are_finite_and_depend_on_the_action(task):
 
 
 @pytest.mark.parametrize("task", SETTABLE)
-def test_starts_lie_within_the_sampling_ranges(task):
+def test_start_states_of_unseen_tasks_lie_within_the_sampling_ranges(task):
     machine = make(UNSEEN[task].environment)
     assert isinstance(machine, Machine)
     assert set(machine.start) == set(machine.ranges)
@@ -61,7 +61,7 @@ def test_starts_lie_within_the_sampling_ranges(task):
         assert machine.ranges[name][0] <= low < high <= machine.ranges[name][1]
 
 
-def test_noise_differs_between_instances_and_is_as_large_as_declared():
+def test_the_noise_of_unseen_tasks_has_its_declared_size_and_differs_between_instances():
     first, second = NoisySensors(), NoisySensors()
     q, u = np.array([0.5, 0.0]), np.zeros(1)
     seen = np.array([first.step_from(q, u).next_coordinates for _ in range(2_000)])
@@ -69,7 +69,7 @@ def test_noise_differs_between_instances_and_is_as_large_as_declared():
     assert not np.allclose(first.step_from(q, u).next_coordinates, second.step_from(q, u).next_coordinates)
 
 
-def test_what_can_only_be_reset_repeats_a_seeded_episode():
+def test_reset_only_unseen_tasks_repeat_a_seeded_episode():
     machine = answering(ResetOnly())
     assert machine.spec().query == "rollout"
     ways = []
@@ -80,7 +80,7 @@ def test_what_can_only_be_reset_repeats_a_seeded_episode():
 
 
 @pytest.mark.parametrize("task", UNSEEN)
-def test_an_episode_of_each_can_be_evaluated(task):
+def test_an_episode_of_each_unseen_task_can_be_evaluated(task):
     settings = StudySettings(task, episodes=2)
     idle = evaluate(
         lambda o: np.zeros((len(o), settings.spec().action.size)), episodes_of(settings), EvaluationSettings(episodes=2)

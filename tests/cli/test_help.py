@@ -17,7 +17,7 @@ def test_the_help_of_every_command_contains_an_example(surrogym, command):
     assert f"Example: surrogym {command} " in said.out
 
 
-def test_surrogym_without_arguments_lists_all_commands(surrogym):
+def test_the_main_help_lists_all_commands(surrogym):
     said = surrogym("--help")
     assert said.code == 0
     assert all(f"  {command} " in said.out for command in (*COMMANDS, "serve"))

@@ -61,7 +61,7 @@ def test_the_schema_check_finds_a_misspelt_field_of_a_pod() -> None:
 OBJECTS_OF = {one["kind"]: one for one in OBJECTS.values()}
 
 
-def test_every_kubernetes_manifest_is_listed_for_application() -> None:
+def test_every_kubernetes_manifest_is_listed_in_the_kustomization() -> None:
     applied = {*KUSTOMIZATION["resources"], "kustomization.yaml"}
     assert {path.name for path in FOLDER.glob("*.yaml")} == applied
 

@@ -48,7 +48,7 @@ def probed(kettle: Kettle) -> tuple[Probed, int]:
     return found, counted.steps
 
 
-def test_declared_limits_that_the_states_run_away_from_are_not_trusted():
+def test_declared_limits_are_not_trusted_if_states_run_far_beyond_them():
     found, steps = probed(Kettle(faster=50.0))
     assert found.settable
     assert 0.1 < found.leaving < 0.6

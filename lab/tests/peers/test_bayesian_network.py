@@ -38,7 +38,7 @@ def taught(n=200, steps=800):
     return model
 
 
-def test_the_network_learns_and_is_unsure_where_it_has_no_samples():
+def test_a_bayesian_network_is_uncertain_far_from_its_samples():
     model, n = taught(), 200
     inside, outside = torch.full((n, 1), 0.3).double(), torch.full((n, 1), 4.0).double()
     masks = model.masks(n)
@@ -47,14 +47,14 @@ def test_the_network_learns_and_is_unsure_where_it_has_no_samples():
     assert far.std() > 3 * near.std()
 
 
-def test_a_mask_is_the_same_function_at_every_call():
+def test_a_dropout_mask_gives_the_same_function_at_every_call():
     model = taught(steps=1)
     x, masks = torch.rand(6, 1).double(), model.masks(6)
     torch.testing.assert_close(model(x, masks), model(x, masks))
     assert not torch.equal(model(x, masks), model(x, model.masks(6)))
 
 
-def test_redrawn_particles_have_the_mean_and_covariance_of_the_others():
+def test_redrawn_particles_keep_the_mean_and_covariance():
     rng = np.random.default_rng(0)
     root = torch.from_numpy(rng.standard_normal((2, 3, 3)))
     q = torch.from_numpy(rng.standard_normal((2, 20_000, 3))) @ root.mT + torch.arange(3).double()
@@ -65,7 +65,7 @@ def test_redrawn_particles_have_the_mean_and_covariance_of_the_others():
 
 
 @pytest.mark.parametrize("name", [SWING_UP, "Acrobot-v1", "CartPole-v1"])
-def test_the_cost_of_a_state_is_pilcos_of_a_narrow_belief(name):
+def test_the_cost_of_a_state_equals_pilcos_cost_of_a_narrow_gaussian(name):
     q = torch.from_numpy(np.random.default_rng(0).uniform(-1, 1, (4, 4)))
     narrow = 1e-10 * torch.eye(4).double().expand(4, 4, 4)
     cost = TOLD[name].cost
@@ -82,7 +82,7 @@ def imagined(count=50):
     return Particles(states, model, TOLD["Pendulum-v1"].cost, beliefs, count), policy
 
 
-def test_the_gradient_is_the_slope_of_the_cost():
+def test_the_gradient_of_the_bayesian_network_policy_cost_equals_finite_differences():
     particles, policy = imagined()
 
     def cost():
@@ -100,7 +100,7 @@ def test_the_gradient_is_the_slope_of_the_cost():
     assert slope == pytest.approx((ahead - behind).item() / 2, rel=0.05)
 
 
-def test_a_search_lowers_the_cost():
+def test_a_bayesian_network_policy_search_lowers_the_cost():
     particles, policy = imagined()
 
     def mean_cost():
@@ -113,14 +113,14 @@ def test_a_search_lowers_the_cost():
     assert mean_cost() < before - 0.05
 
 
-def test_the_policy_stays_within_its_limits():
+def test_the_bayesian_network_policy_stays_within_its_action_limits():
     _, policy = imagined()
     with torch.no_grad():
         policy.weights *= 100
     assert np.abs(policy.control(np.random.default_rng(0).uniform(-3, 3, (100, 2)))).max() <= 1
 
 
-def test_a_round_is_an_episode_and_its_policy_stays_as_it_was():
+def test_each_round_is_one_episode_and_its_policy_is_not_changed_later():
     spec = make(SWING_UP).spec()
     real = Real(spec, lambda: open_episode(SWING_UP, spec, lambda: make(SWING_UP)), 0, 90, Clock(600.0))
     found = []
@@ -138,7 +138,7 @@ def test_a_round_is_an_episode_and_its_policy_stays_as_it_was():
     np.testing.assert_allclose(policy.actions([2, 3], shown), acted)
 
 
-def test_a_task_without_a_cost_is_refused():
+def test_a_task_without_a_known_cost_is_refused_by_this_peer():
     spec = make("MountainCar-v0").spec()
     real = Real(spec, lambda: open_episode("MountainCar-v0", spec, lambda: make("MountainCar-v0")), 0, 9, Clock(600.0))
     with pytest.raises(NotApplicable):

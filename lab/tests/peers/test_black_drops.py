@@ -10,7 +10,7 @@ from surrogym_lab.peers.methods.told import told
 from surrogym_sampler.original import make
 
 
-def test_a_search_finds_the_top_within_the_bounds():
+def test_the_black_drops_search_finds_the_maximum_within_its_bounds():
     top = np.array([0.5, -2.0, 9.0])
 
     def returns(theta, rollouts=1):
@@ -21,7 +21,7 @@ def test_a_search_finds_the_top_within_the_bounds():
     np.testing.assert_allclose(found, [0.5, -2.0, BOUND], atol=0.05)
 
 
-def test_the_policy_before_competes():
+def test_the_black_drops_search_includes_the_previous_policy():
     def returns(theta, rollouts=1):
         return theta.sum(1)
 
@@ -43,13 +43,13 @@ def imagined():
     return Imagined(states, told(spec), model, seen, np.abs(q).max(0), Settings())
 
 
-def test_a_resting_cart_earns_each_step():
+def test_the_imagined_return_of_a_resting_cart_is_one_per_step():
     made = imagined()
     theta = np.random.default_rng(1).uniform(-1, 1, (3, made.size))
     np.testing.assert_allclose(made.returns(theta, np.random.default_rng(2)), 500.0)
 
 
-def test_all_policies_are_batched_as_one():
+def test_batched_policies_give_the_same_controls_as_single_ones():
     made, rng = imagined(), np.random.default_rng(3)
     theta, q = rng.uniform(-1, 1, (3, made.size)), rng.uniform(-1, 1, (3, 2, 4))
     alone = np.stack([made.controls(theta[i : i + 1], q[i : i + 1])[0] for i in range(3)])

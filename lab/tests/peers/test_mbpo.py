@@ -27,7 +27,7 @@ def ensemble(networks=4):
     return Ensemble(1, 1, networks=networks, hidden=(32, 32), decay=(0.0, 0.0, 0.0))
 
 
-def test_training_ends_by_itself_and_the_elites_are_the_best_on_held_out_samples():
+def test_mbpo_training_stops_by_itself_and_keeps_the_networks_best_on_held_out_samples():
     x, y = samples()
     model = ensemble()
     trained = fit(model, torch.optim.Adam(model.parameters(), 3e-3), x, y, 2, 1, np.random.default_rng(0), lambda: None)
@@ -38,7 +38,7 @@ def test_training_ends_by_itself_and_the_elites_are_the_best_on_held_out_samples
     assert ((drawn - y) ** 2).mean() < 0.01
 
 
-def test_a_training_that_makes_networks_worse_leaves_them_as_they_were():
+def test_mbpo_keeps_earlier_networks_if_training_makes_them_worse():
     x, y = samples(200)  # one step an epoch
     model = ensemble()
     model.scale_by(x)
@@ -57,7 +57,7 @@ def test_a_training_that_makes_networks_worse_leaves_them_as_they_were():
         torch.testing.assert_close(part.detach(), kept)
 
 
-def test_an_epoch_of_few_samples_passes_them_several_times():
+def test_an_mbpo_epoch_over_few_samples_repeats_them():
     x, y = samples(500)  # two batches
     model, steps = ensemble(), 0
 
@@ -69,7 +69,7 @@ def test_an_epoch_of_few_samples_passes_them_several_times():
     assert steps == 7 * 6  # seven epochs of three passes
 
 
-def test_draws_come_from_every_elite_and_from_no_other_network():
+def test_mbpo_samples_predictions_from_every_elite_network_and_no_other():
     model = ensemble(networks=3)
     with torch.no_grad():
         for part in model.weights:
@@ -92,7 +92,7 @@ class Pushed:
         return outputs
 
 
-def test_rollouts_branch_off_at_real_states_and_end_with_the_episode():
+def test_mbpo_rollouts_start_at_real_states_and_end_with_the_episode():
     states = States(make("CartPole-v1").spec())
     model = Model(states, Settings(every=10, rollouts=5, length=3), np.random.default_rng(0))
     model._trained = Pushed()
@@ -106,7 +106,7 @@ def test_rollouts_branch_off_at_real_states_and_end_with_the_episode():
     assert len(found.seen) == 50 + 2 * (first == 0).sum() + (first > 0).sum()
 
 
-def test_a_batch_has_its_share_of_real_transitions():
+def test_an_mbpo_batch_contains_its_share_of_real_transitions():
     pools = Pools(10, 1, 1, np.random.default_rng(0), share=0.05)
     for _ in range(3):
         pools.add(np.ones(1), np.ones(1), 1.0, np.ones(1), ended=True)
@@ -120,7 +120,7 @@ def test_a_batch_has_its_share_of_real_transitions():
 
 
 @pytest.mark.parametrize("name", ["Pendulum-v1", "CartPole-v1"])
-def test_a_policy_comes_every_fifty_real_steps_after_the_random_ones(name):
+def test_mbpo_returns_a_policy_every_fifty_real_steps_after_the_random_ones(name):
     spec = make(name).spec()
     real = Real(spec, lambda: open_episode(name, spec, lambda: make(name)), 0, 140, Clock(600.0))
     found = []

@@ -52,7 +52,7 @@ def processes(size=2, outputs=3, n=12):
     return conditioned(x, y, lengthscale, torch.tensor([1.0, 0.8, 1.2]).double(), torch.full((outputs,), 0.3).double())
 
 
-def test_moments_of_processes_are_those_of_samples():
+def test_the_predicted_moments_of_gaussian_processes_equal_those_of_samples():
     model, (mean, covariance) = processes(), belief(2, 0)
     x = draws(mean, covariance)
     found = [model.predict(x[:, k]) for k in range(2)]
@@ -62,19 +62,19 @@ def test_moments_of_processes_are_those_of_samples():
     agree(through_processes(model, mean, covariance, certain=True), sampled(x, means, covariance))
 
 
-def test_moments_of_angles_are_those_of_samples():
+def test_the_moments_of_angle_encodings_equal_those_of_samples():
     mean, covariance = belief(2, 4)
     x = draws(mean, covariance)
     agree(through_angles(mean, covariance), sampled(x, torch.cat([x.sin(), x.cos()], -1), covariance))
 
 
-def test_moments_of_a_squashed_control_are_those_of_samples():
+def test_the_moments_of_a_squashed_control_equal_those_of_samples():
     mean, covariance = belief(2, 5)
     x = draws(mean, covariance)
     agree(squashed(mean, covariance), sampled(x, 9 / 8 * x.sin() + (3 * x).sin() / 8, covariance))
 
 
-def test_the_expected_cost_is_the_mean_of_costs():
+def test_the_expected_cost_equals_the_mean_cost_of_samples():
     mean, covariance = belief(2, 6)
     goal = torch.tensor([0.5, -0.2]).double()
     distance = ((draws(mean, covariance) - goal) ** 2).sum(-1)
@@ -82,7 +82,7 @@ def test_the_expected_cost_is_the_mean_of_costs():
     np.testing.assert_allclose(saturating_cost(mean, covariance, goal, 0.6), expected, atol=0.01, rtol=0.01)
 
 
-def test_predictions_are_those_of_the_covariances():
+def test_predictions_by_blocked_inverses_equal_the_explicit_formula():
     """Inverses in blocks of rows are the same as solving, with a number of samples that no block divides."""
     model, at = processes(n=150), torch.from_numpy(np.random.default_rng(4).uniform(-3, 3, (40, 2)))
     k = kernel(at, model.x, model.lengthscale, model.signal)
@@ -92,7 +92,7 @@ def test_predictions_are_those_of_the_covariances():
     np.testing.assert_allclose(deviation**2, (model.signal[:, None] ** 2 - explained).T, atol=1e-9)
 
 
-def test_the_gradient_of_the_evidence_is_its_slope():
+def test_the_gradient_of_the_log_marginal_likelihood_equals_finite_differences():
     rng = np.random.default_rng(6)
     x, y, theta = rng.uniform(-2, 2, (25, 3)), rng.standard_normal(25), rng.uniform(-1, 0.5, 5)
     _, slope = negative_log_evidence(x, y, theta)
@@ -101,7 +101,7 @@ def test_the_gradient_of_the_evidence_is_its_slope():
     np.testing.assert_allclose(slope, np.array(rises) / 2e-5, rtol=1e-6, atol=1e-6)
 
 
-def test_a_search_goes_on_after_a_step_too_far():
+def test_the_hyperparameter_search_continues_after_a_too_large_step():
     """The first step from 10 meets no value. A search that ended there would stay."""
 
     def objective(at):
@@ -114,7 +114,7 @@ def test_a_search_goes_on_after_a_step_too_far():
     np.testing.assert_allclose(lowest(steep, np.array([10.0])), 1, atol=1e-3)
 
 
-def test_a_fitted_process_predicts_and_knows_how_well():
+def test_a_fitted_process_predicts_with_a_matching_deviation():
     rng = np.random.default_rng(0)
     x = rng.uniform(-2, 2, (60, 2))
     y = np.stack([np.sin(2 * x[:, 0]), 5 * x[:, 1] ** 2], 1) + 0.05 * rng.standard_normal((60, 2))

@@ -12,7 +12,7 @@ from surrogym_sampler.original import make
 from surrogym_shared.terms import observe
 
 
-def test_the_loss_is_the_likelihood_of_normal_distributions():
+def test_the_pets_loss_equals_the_normal_negative_log_likelihood():
     rng = np.random.default_rng(0)
     mean, log_variance, y = (torch.from_numpy(rng.standard_normal((3, 5, 2))) for _ in range(3))
     normal = torch.distributions.Normal(mean, torch.exp(log_variance / 2))
@@ -21,7 +21,7 @@ def test_the_loss_is_the_likelihood_of_normal_distributions():
     np.testing.assert_allclose(negative_log_likelihood(mean, log_variance, y), expected)
 
 
-def test_an_ensemble_learns_a_mean_and_a_noise_that_depends_on_the_input():
+def test_the_pets_ensemble_learns_a_mean_and_input_dependent_noise():
     torch.manual_seed(0)
     x = torch.rand(600, 1) * 2 - 1
     y = torch.sin(2 * x) + torch.where(x > 0, 0.3, 0.03) * torch.randn_like(x)
@@ -34,7 +34,7 @@ def test_an_ensemble_learns_a_mean_and_a_noise_that_depends_on_the_input():
     assert deviation[0] < 0.1 < 0.2 < deviation[1] < 0.45
 
 
-def test_the_cross_entropy_method_finds_the_top_of_a_hill():
+def test_the_cross_entropy_method_finds_a_maximum():
     top = np.array([[0.6, -0.3], [-0.9, 0.1]])
     found = cross_entropy(
         lambda plans: -((plans - top) ** 2).sum((1, 2)),
@@ -57,7 +57,7 @@ class Exact(torch.nn.Module):
         return mean, torch.full_like(mean, -40.0)
 
 
-def test_plans_earn_what_the_model_says_until_the_episode_ends():
+def test_planned_returns_are_the_models_rewards_until_termination():
     spec = make("CartPole-v1").spec()
     settings = Settings(networks=2, particles=4)
     planner = Planner(States(spec), told(spec), Exact(), settings, np.random.default_rng(0))
@@ -66,7 +66,7 @@ def test_plans_earn_what_the_model_says_until_the_episode_ends():
     assert earned.tolist() == [3.0, 10.0]
 
 
-def test_every_episode_has_a_plan_of_its_own():
+def test_parallel_episodes_have_separate_plans():
     spec = make("CartPole-v1").spec()
     planner = Planner(States(spec), told(spec), Exact(), Settings(networks=2, particles=4), np.random.default_rng(0))
     shown = observe(spec, np.array([[2.3, 0, 0, 0], [-2.3, 0, 0, 0]])).astype(np.float32)

@@ -30,7 +30,7 @@ def parameters(basis=6):
     return theta + 0.3 * rng.standard_normal(len(theta))
 
 
-def test_a_narrow_belief_moves_as_the_model_says():
+def test_a_narrow_gaussian_state_moves_as_the_pilco_model_predicts():
     policy, at = pilco._policy(STATES, parameters()), np.array([[0.4, -0.7]])
     narrow = 1e-8 * torch.eye(2).double()[None]
     mean, covariance = belief.next_belief(STATES, model(), policy, torch.from_numpy(at), narrow)
@@ -40,7 +40,7 @@ def test_a_narrow_belief_moves_as_the_model_says():
     np.testing.assert_allclose(covariance[0].diagonal().sqrt(), deviation[0], atol=1e-3, rtol=1e-2)
 
 
-def test_the_gradient_is_the_slope_of_the_cost():
+def test_the_gradient_of_the_pilco_cost_equals_finite_differences():
     objective = partial(
         belief.expected_cost,
         belief.Imagination(STATES, model()),
@@ -56,7 +56,7 @@ def test_the_gradient_is_the_slope_of_the_cost():
     np.testing.assert_allclose((ahead - behind) / 2, leaf.grad.numpy() @ along, rtol=1e-4)
 
 
-def test_compiled_episodes_are_those_of_torch():
+def test_compiled_pilco_episodes_equal_those_of_torch():
     """Values and gradients, with two angles and two controls, whose covariances a single one would not have."""
     action = BoxAction(low=(-1.0, -1.0), high=(1.0, 1.0))
     states, rng = States(make("Acrobot-v1").spec().model_copy(update={"action": action})), np.random.default_rng(5)
@@ -88,7 +88,7 @@ def test_compiled_episodes_are_those_of_torch():
         np.testing.assert_allclose(got, wanted, rtol=1e-9, atol=1e-10)
 
 
-def test_a_search_lowers_the_cost():
+def test_a_pilco_policy_search_lowers_the_cost():
     objective = partial(
         belief.expected_cost,
         belief.Imagination(STATES, model()),
@@ -101,13 +101,13 @@ def test_a_search_lowers_the_cost():
     assert objective(pilco._policy(STATES, found)) < objective(pilco._policy(STATES, theta)) - 1e-3
 
 
-def test_a_circle_of_starts_has_several_beliefs():
+def test_start_angles_over_the_whole_circle_are_split_into_several_gaussians():
     means, covariances = pilco.start_beliefs(SPEC, 4)
     np.testing.assert_allclose(means[:, 0], np.pi * np.array([-0.75, -0.25, 0.25, 0.75]))
     np.testing.assert_allclose(covariances[0].diagonal(), [(np.pi / 2) ** 2 / 12, 4 / 12])
     assert len(pilco.start_beliefs(make("CartPole-v1").spec(), 4)[0]) == 1
 
 
-def test_the_policy_stays_within_its_limits():
+def test_the_pilco_policy_stays_within_its_action_limits():
     control = pilco._acting(STATES, pilco._policy(STATES, 50 * parameters()))
     assert np.abs(control(np.random.default_rng(0).uniform(-3, 3, (100, 2)))).max() <= 1

@@ -19,7 +19,7 @@ def real_of(name, budget=1_000, seconds=60.0):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_coordinates_are_read_from_observations(name):
+def test_peers_recover_the_coordinates_from_observations(name):
     states = States(make(name).spec())
     q = np.random.default_rng(0).uniform(-1, 1, (5, len(states.angles)))
     np.testing.assert_allclose(states.coordinates(observe(states.spec, q)), q, atol=1e-9)
@@ -27,7 +27,7 @@ def test_coordinates_are_read_from_observations(name):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_told_reward_is_the_environments(name):
+def test_the_reward_formula_given_to_peers_equals_the_environments_reward(name):
     real, states = real_of(name), States(make(name).spec())
     rng, moment = np.random.default_rng(1), real.reset()
     for _ in range(20):
@@ -38,27 +38,27 @@ def test_the_told_reward_is_the_environments(name):
         moment = real.reset() if after.terminated else after
 
 
-def test_angles_change_by_the_shorter_way():
+def test_angle_changes_for_peers_take_the_shorter_direction():
     states = States(make("Pendulum-v1").spec())
     change = states.change(np.array([[3.0, 5.0]]), np.array([[-3.0, -5.0]]))
     np.testing.assert_allclose(change, [[2 * np.pi - 6, -10.0]])
 
 
 @pytest.mark.parametrize(("u", "snapped", "native"), [(-0.4, -1, 0), (0.2, 1, 1), (3.0, 1, 1)])
-def test_discrete_actions_are_the_nearest(u, snapped, native):
+def test_continuous_controls_are_rounded_to_the_nearest_discrete_action(u, snapped, native):
     states = States(make("CartPole-v1").spec())
     assert states.snapped(np.array([[u]])).item() == snapped
     assert states.native(np.array([[u]])).item() == native
 
 
-def test_each_step_of_a_held_control_counts():
+def test_each_real_step_of_a_repeated_control_counts():
     real, states = real_of("Pendulum-v1"), States(make("Pendulum-v1").spec())
     found = episode(real, states, random_control(states, np.random.default_rng(0)), decisions=7, repeat=2)
     assert len(found) == 7
     assert real.steps == 14
 
 
-def test_the_budget_and_the_time_end_a_cell():
+def test_a_peer_run_ends_at_its_step_budget_or_time_limit():
     real = real_of("Pendulum-v1", budget=3)
     real.reset()
     for _ in range(3):
@@ -71,7 +71,7 @@ def test_the_budget_and_the_time_end_a_cell():
         late.step(np.zeros(1))
 
 
-def test_a_held_action_lasts_through_its_steps():
+def test_a_controller_with_action_repeat_holds_its_action():
     states = States(make("Pendulum-v1").spec())
     controller = Held(states, lambda q: q[:, 1:], repeat=2)
     shown = observe(states.spec, np.array([[0.0, 0.1], [0.0, 0.2]])).astype(np.float32)
@@ -80,7 +80,7 @@ def test_a_held_action_lasts_through_its_steps():
     np.testing.assert_allclose(controller.actions([1], shown[:1]), [[0.2]], rtol=1e-6)
 
 
-def test_a_task_that_nobody_wrote_down_is_refused():
+def test_a_task_without_a_reward_formula_for_peers_is_refused():
     spec = make("MountainCar-v0").spec()
     with pytest.raises(NotApplicable, match="has to know the reward"):
         told(spec)

@@ -35,7 +35,7 @@ def jumps(episodes=20, steps=30):
     return found
 
 
-def test_the_network_learns_two_branches_the_reward_and_the_end():
+def test_the_world_model_learns_a_bimodal_step_reward_and_termination():
     torch.manual_seed(0)
     model = MixtureNetwork(1, 1, hidden=16, components=5)
     train(model, torch.optim.Adam(model.parameters(), 1e-2), jumps(), steps=500, check=lambda: None)
@@ -54,7 +54,7 @@ def test_the_network_learns_two_branches_the_reward_and_the_end():
     assert ended.all()  # half of them do, and an end weighs ten times as much
 
 
-def test_a_warmer_draw_is_wider():
+def test_a_higher_sampling_temperature_widens_world_model_draws():
     torch.manual_seed(0)
     model = MixtureNetwork(1, 1, hidden=4, components=1)
     noise = torch.full((200, 2), 0.5), torch.randn(200, 2)
@@ -77,7 +77,7 @@ class Paying:
         return action[:, 0], seen, seen[:, 0] > 0.9, state
 
 
-def test_a_dream_pays_each_controller_until_its_end():
+def test_a_world_model_rollout_sums_rewards_until_termination_for_each_controller():
     states = States(make("Pendulum-v1").spec())
     dream = Dream(Paying(), states, longest=10, temperature=1.0)
     theta = np.zeros((2, 6))
@@ -89,7 +89,7 @@ def test_a_dream_pays_each_controller_until_its_end():
     np.testing.assert_allclose(dream.returns(theta, 8, rng), steps.mean() * np.tanh([0.3, -20.0]), rtol=1e-5)
 
 
-def test_a_search_finds_the_top_of_a_hill():
+def test_the_world_model_policy_search_finds_a_maximum():
     top = np.array([0.4, -0.3, 0.2])
     found = search(
         lambda theta, _: -((theta - top) ** 2).sum(1),
@@ -101,7 +101,7 @@ def test_a_search_finds_the_top_of_a_hill():
     np.testing.assert_allclose(found, top, atol=0.01)
 
 
-def test_a_controller_remembers_each_episode_by_itself():
+def test_a_recurrent_controller_keeps_separate_memory_for_each_episode():
     torch.manual_seed(0)
     states = States(make("Pendulum-v1").spec())
     model, rng = MixtureNetwork(3, 1, hidden=4, components=2), np.random.default_rng(0)
@@ -116,7 +116,7 @@ def test_a_controller_remembers_each_episode_by_itself():
 
 
 @pytest.mark.parametrize("name", ["Pendulum-v1", "CartPole-v1"])
-def test_a_round_has_whole_real_episodes(name):
+def test_a_world_model_round_takes_whole_real_episodes(name):
     spec = make(name).spec()
     real = Real(spec, lambda: open_episode(name, spec, lambda: make(name)), 0, 450, Clock(600.0))
     found = []
