@@ -31,7 +31,7 @@ def test_result_rows_survive_writing_and_reading(tmp_path):
     assert read_rows(tmp_path / "none.csv") == []
 
 
-def test_a_result_file_without_promise_columns_is_still_read(tmp_path):
+def test_a_result_file_without_promised_return_columns_is_still_read(tmp_path):
     path = tmp_path / "rows.csv"
     write_rows(path, [ROW])
     with path.open(newline="") as file:

@@ -116,7 +116,7 @@ def test_study_tables_and_pictures_are_inserted_between_the_marks_of_a_page(tmp_
         update(page, DEFAULT, tmp_path)
 
 
-def test_the_study_table_counts_kept_promises_if_there_are_any():
+def test_the_study_table_counts_promised_returns_that_held():
     """Seed 1 is below its promise and, of a gain of 30, 20 short of it."""
     interval = {"promise": -150.0, "promise_low": -155.0, "promise_high": -145.0, "without": -180.0}
     kept = replace(ROW, trusted=True, audit_steps=8, **interval)

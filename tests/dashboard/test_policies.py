@@ -49,7 +49,7 @@ def url(pendulum_server: ServerProcess) -> Iterator[str]:
             api.delete_surrogate(name)
 
 
-def test_the_dashboard_shows_promise_and_real_return_of_a_policy(url: str, open_page: Open, complaints: list[str]):
+def test_the_dashboard_shows_promised_and_real_return_of_a_policy(url: str, open_page: Open, complaints: list[str]):
     page = open_page(f"{url}/#/s/better")
     part = page.locator("#policies")
     expect(part.locator("summary").first).to_contain_text(

@@ -81,7 +81,7 @@ def test_the_single_remote_environment_takes_no_autoreset_mode():
         RemoteEnv(ExactPendulum(), autoreset_mode="same_step")
 
 
-def test_rendering_a_remote_environment_without_render_mode_is_refused():
+def test_a_remote_environment_with_render_mode_human_is_refused():
     with pytest.raises(ValueError, match=r"expected render_mode.*'human'"):
         RemoteEnv(ExactPendulum(), render_mode="human")
 

@@ -81,7 +81,7 @@ SETTINGS: dict[type[BaseAlgorithm], dict[str, int]] = {
 
 
 @pytest.mark.parametrize("algorithm", list(SETTINGS))
-def test_algorithms_of_several_libraries_train_on_a_remote_environment(pendulum_server, algorithm: type[BaseAlgorithm]):
+def test_stable_baselines3_algorithms_train_on_a_remote_environment(pendulum_server, algorithm: type[BaseAlgorithm]):
     envs = SurrogateVecEnv(pendulum_server.url, "pendulum", num_envs=4, time_limit=10)
     model = algorithm("MlpPolicy", envs, seed=0, device="cpu", **SETTINGS[algorithm])
     model.learn(total_timesteps=64)

@@ -98,7 +98,7 @@ def test_an_int_seed_repeats_and_an_unseeded_reset_continues():
 
 
 @pytest.mark.parametrize("mode", ["same_step", "SameStep", AutoresetMode.SAME_STEP])
-def test_the_metadata_contain_gymnasiums_autoreset_mode_enum(mode: object):
+def test_any_form_of_the_autoreset_mode_becomes_gymnasiums_enum(mode: object):
     envs = RemoteVectorEnv(ExactPendulum(), 2, autoreset_mode=mode)
     assert envs.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
 

@@ -60,7 +60,7 @@ def test_errors_within_the_tolerance_but_above_the_predicted_deviation_are_surpr
 @pytest.mark.parametrize(
     ("after", "passed"), [(-155.0, True), (-250.0, True), (-300.0, False), (-60.0, True), (0.0, False)]
 )
-def test_an_audit_fails_if_its_samples_move_the_promise_too_far(after: float, passed: bool):
+def test_an_audit_fails_if_its_samples_change_the_promised_return_too_much(after: float, passed: bool):
     later = Promise(median=after, low=after - 10, high=after + 10, functions=32, episodes=256)
     assert judge(compared(np.zeros((8, 1))), PROMISE, later, UNTRAINED).passed is passed
 

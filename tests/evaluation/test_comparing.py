@@ -69,7 +69,7 @@ def test_a_single_mispredicted_step_is_reported_in_the_singular() -> None:
     assert second == "  episode of seed 1: 1 such step; its compared steps earned 1.5 more than predicted"
 
 
-def test_a_correct_model_has_no_disagreements() -> None:
+def test_no_real_step_is_reported_as_differing_from_a_correct_model() -> None:
     found = held(episodes(2, 10), np.zeros((20, 2)))
     assert Differing(found, 0).in_words(SPEC) == [
         "none of 20 real steps differs from the model by more than the model's uncertainty"
@@ -134,7 +134,7 @@ def test_a_small_systematic_error_is_reported_with_its_region_and_cost() -> None
     assert np.mean([sample.action[0] > 0 for sample in learned]) > 0.8, "the steps that show the error"
 
 
-def test_a_correct_model_has_no_systematic_error_even_if_the_promise_is_missed() -> None:
+def test_no_systematic_error_is_found_in_a_correct_model_despite_a_missed_return() -> None:
     effects, share = effects_of(SPEC, shared(0.0), None)
     assert not effects
     assert not share.any()

@@ -31,7 +31,7 @@ def log(tmp_path: Path) -> Path:
     return reactor.log(runs=6, length=20).write(tmp_path / "log.csv")
 
 
-def test_a_policy_that_starts_outside_the_log_gets_no_promise(server_process: ServerProcess, log: Path) -> None:
+def test_a_policy_that_starts_outside_the_log_gets_no_promised_return(server_process: ServerProcess, log: Path) -> None:
     drafted = read_log(log, Options()).spec
     place = next(i for i, c in enumerate(drafted.coordinates) if c.name == "temperature")
     fields = drafted.model_dump(mode="json")
@@ -45,7 +45,9 @@ def test_a_policy_that_starts_outside_the_log_gets_no_promise(server_process: Se
     assert words_of_handover(found).startswith("no promise, not trusted: ")
 
 
-def test_a_policy_that_stays_within_the_log_gets_an_untrusted_promise(server_process: ServerProcess, log: Path) -> None:
+def test_a_policy_that_stays_within_the_log_gets_an_untrusted_promised_return(
+    server_process: ServerProcess, log: Path
+) -> None:
     found = handed_over(server_process.url, log, "inside-of-log", read_log(log, Options()).spec)
     assert found.promise is not None
     assert not found.trusted

@@ -50,7 +50,7 @@ def test_the_error_for_a_log_format_with_missing_package_tells_what_to_install(
         read_log("pendulum/random-v0")
 
 
-def test_a_minari_data_set_gives_its_steps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_the_steps_of_a_minari_data_set_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     minari = pytest.importorskip("minari")
     pytest.importorskip("h5py")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))

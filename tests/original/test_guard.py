@@ -67,7 +67,7 @@ def states(diary: Path) -> np.ndarray:
     return np.array(rows, dtype=np.float64).reshape(-1, 3)
 
 
-def test_no_action_takes_the_cart_off_its_rail() -> None:
+def test_no_action_can_drive_the_guarded_cart_beyond_its_declared_limit() -> None:
     free = answering(Cart(with_limits(None)))
     free.begin(0)  # type: ignore[union-attr]
     reached = [free.act(RIGHT).next_coordinates for _ in range(30)]  # type: ignore[union-attr]
@@ -80,7 +80,7 @@ def test_no_action_takes_the_cart_off_its_rail() -> None:
         assert not past(SPEC, np.array([step.next_coordinates for step in steps])).any()
 
 
-def test_a_step_of_the_fallback_has_the_action_that_was_applied() -> None:
+def test_a_step_replaced_by_the_fallback_records_the_action_applied() -> None:
     guarded = keeping_limits(answering(PatientCart()))
     assert isinstance(guarded, GuardedRollouts)
     steps = pushed(guarded, 30)
@@ -91,7 +91,7 @@ def test_a_step_of_the_fallback_has_the_action_that_was_applied() -> None:
         assert np.asarray(step.action)[0] == pytest.approx(np.clip(-0.5 * x - 1.6 * v, -1, 1))
 
 
-def test_without_an_action_for_a_period_the_fallback_stops_the_cart(cart: GuardedRollouts, diary: Path) -> None:
+def test_if_no_action_arrives_for_a_period_the_fallback_stops_the_cart(cart: GuardedRollouts, diary: Path) -> None:
     pushed(cart, 3)
     until(lambda: len(states(diary)) > 3 and abs(states(diary)[-1, 2]) < 0.1)
     with pytest.raises(StepFailed, match="no action came"):
@@ -100,7 +100,7 @@ def test_without_an_action_for_a_period_the_fallback_stops_the_cart(cart: Guarde
     assert np.asarray(cart.act(RIGHT).action)[0] == 1.0
 
 
-def test_a_simulator_waits_for_its_actions(diary: Path) -> None:
+def test_a_simulator_waits_for_actions_instead_of_using_the_fallback(diary: Path) -> None:
     simulator = keeping_limits(answering(PatientCart()))
     assert isinstance(simulator, GuardedRollouts)
     pushed(simulator, 3)
@@ -109,7 +109,7 @@ def test_a_simulator_waits_for_its_actions(diary: Path) -> None:
     simulator.act(RIGHT)
 
 
-def test_the_fallback_acts_before_the_environment_closes(cart: GuardedRollouts, diary: Path) -> None:
+def test_the_fallback_stops_the_machine_before_the_environment_closes(cart: GuardedRollouts, diary: Path) -> None:
     pushed(cart, 3)
     cart.close()
     lines = diary.read_text().splitlines()
@@ -119,7 +119,9 @@ def test_the_fallback_acts_before_the_environment_closes(cart: GuardedRollouts, 
 
 
 @pytest.mark.parametrize("ends", ["kill", "term", "close"])
-def test_the_fallback_acts_when_the_sampler_is_killed_or_ends(tmp_path: Path, diary: Path, ends: str) -> None:
+def test_the_fallback_stops_the_machine_if_the_sampler_ends_or_is_killed(
+    tmp_path: Path, diary: Path, ends: str
+) -> None:
     program = tmp_path / "program.py"
     program.write_text(KILLED)
     path = os.pathsep.join(map(str, ("tests", os.environ.get("PYTHONPATH", ""))))
@@ -139,14 +141,14 @@ def test_the_fallback_acts_when_the_sampler_is_killed_or_ends(tmp_path: Path, di
     assert abs(states(diary)[-1, 2]) < 0.1
 
 
-def test_an_isolated_environment_keeps_its_limits() -> None:
+def test_an_isolated_environment_keeps_its_declared_limits() -> None:
     with IsolatedEnvironment(PatientCart) as environment:
         environment.begin(0)
         reached = [environment.act(RIGHT).next_coordinates for _ in range(30)]
     assert not past(SPEC, np.array(reached)).any()
 
 
-def test_a_state_within_a_margin_is_not_set() -> None:
+def test_setting_a_state_within_the_margin_of_a_limit_is_refused() -> None:
     class Settable:
         def spec(self):
             return SPEC.model_copy(update={"query": "step"})
@@ -164,7 +166,7 @@ def test_a_state_within_a_margin_is_not_set() -> None:
         environment.step_from(np.array([0.95, 0.0]), RIGHT)
 
 
-def test_an_episode_names_the_fallback_that_replaced_an_action() -> None:
+def test_an_episode_step_reports_if_the_fallback_replaced_its_action() -> None:
     episode = open_episode("cart:Cart", None, PatientCart)
     episode.reset(0)
     moments = [episode.step(RIGHT) for _ in range(30)]

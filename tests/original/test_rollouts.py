@@ -120,7 +120,7 @@ def test_evaluating_a_reset_only_class_uses_resets_and_refuses_set_states():
     episode.close()
 
 
-def test_a_class_that_supports_set_states_and_rollouts_can_be_used_either_way():
+def test_a_class_that_supports_set_states_and_rollouts_can_be_used_for_both():
     class Both(Rail):
         def spec(self):
             return super().spec().model_copy(update={"query": "step", "max_rollout": None})

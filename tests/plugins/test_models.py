@@ -122,7 +122,7 @@ def cases(installed: Path) -> Iterator[dict[str, ModelCase]]:
 
 @pytest.mark.parametrize("name", CASES)
 @pytest.mark.parametrize("law", LAWS_OF_MODELS, ids=lambda law: law.__name__)
-def test_the_example_model_plugin_passes_the_model_laws(cases: dict[str, ModelCase], law, name: str):
+def test_the_example_model_plugin_passes_the_model_interface_tests(cases: dict[str, ModelCase], law, name: str):
     law(cases[name])
 
 

@@ -73,7 +73,7 @@ def surrogate() -> LocalSurrogate:
 @pytest.mark.parametrize("law", POLICY_SEARCH_LAWS)
 @pytest.mark.parametrize("name", SEARCHED)
 @pytest.mark.usefixtures("installed")
-def test_every_policy_search_passes_the_policy_search_laws(
+def test_every_policy_search_passes_the_policy_search_interface_tests(
     surrogate: LocalSurrogate, tmp_path: Path, name: str, law: Callable[[SurrogatePort, TrainSettings, Path], None]
 ):
     settings = TrainSettings(algorithm=name, total_steps=1_280, num_envs=8, hyperparameters=SEARCHED[name])

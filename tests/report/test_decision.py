@@ -109,7 +109,7 @@ def told(known: Known, cuts: Sequence[Cut] = ()) -> Parts:
     return {"": text[0], **dict(zip(text[1::2], text[2::2], strict=True))}
 
 
-def test_the_report_of_a_tested_policy_is_complete(modelled: Known):
+def test_the_report_of_an_evaluated_policy_has_every_section(modelled: Known):
     parts = told(replace(modelled, policy=policy(), real=evaluation(), without=without()))
     assert parts[""].startswith(
         "In 100 real episodes the controller earned -143.2 (-160.0 to -127.0) on average. 97 of 100 (92 % to 99.0 %) "
@@ -181,7 +181,7 @@ def test_the_report_calls_returns_different_only_beyond_both_intervals(
     assert outcome(promise, evaluation(mean=mean, mean_interval=wire.Interval(low=low, high=high))).verdict == verdict
 
 
-def test_the_report_claims_no_difference_between_controllers_within_the_interval(modelled: Known):
+def test_the_report_states_no_difference_between_controllers_within_the_interval(modelled: Known):
     returns = [-140.0, -139.0] * 50
     other = without(episodes=100, returns=returns)
     real = evaluation(returns=[-139.0, -140.0] * 50)
@@ -250,7 +250,7 @@ def test_the_report_shows_the_reference_controller_beside_the_policy(modelled: K
     assert "--reference" not in parts["What to do next"]
 
 
-def test_the_report_lists_a_missed_promise_first_among_the_next_steps(modelled: Known):
+def test_the_report_lists_a_missed_promised_return_first_among_the_next_steps(modelled: Known):
     worse = evaluation(mean=-250.0, mean_interval=wire.Interval(low=-260.0, high=-240.0), promise_kept=False)
     parts = told(replace(modelled, policy=policy(evaluations=[worse]), real=worse))
     assert "worse than predicted, by 80.2 beyond" in parts["Was it predicted?"]

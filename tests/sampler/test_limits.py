@@ -70,7 +70,7 @@ def rollout(actions):
     return RolloutQuery(**LEASE, actions=actions)
 
 
-def test_a_server_that_returns_more_queries_than_claimed_causes_no_real_step(server_process, line):
+def test_a_server_that_returns_more_queries_than_requested_causes_no_real_step(server_process, line):
     machine = Machine()
     settings = SamplerSettings(max_queries=1, until_done=True, wait_seconds=5.0)
     with (
@@ -114,7 +114,7 @@ def test_repeatedly_refused_queries_are_reported_once(server_process, line):
     assert report.refused == len(told) == 2
 
 
-def test_the_samplers_time_limit_is_checked_between_queries_of_a_claim(server_process, line):
+def test_the_samplers_time_limit_is_checked_between_queries_fetched_together(server_process, line):
     machine = Machine(seconds=1.0)
     with Api(server_process.url) as api:
         Sampler(api, line, machine, SamplerSettings(batch=6, wait_seconds=5.0, time_limit=0.5)).run()

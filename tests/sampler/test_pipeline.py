@@ -116,7 +116,7 @@ def test_the_samplers_query_limit_counts_queries_in_progress(server_process, lin
     assert (report.answered, view.queries.pending, view.queries.leased) == (4, 2, 0)
 
 
-def test_a_query_claimed_ahead_is_released_if_the_current_step_takes_long(server_process, line, monkeypatch):
+def test_a_query_fetched_ahead_is_released_if_the_current_step_takes_long(server_process, line, monkeypatch):
     monkeypatch.setattr(pipeline, "HELD_SECONDS", 0.0)
     with Watched(server_process.url) as api:
 
@@ -136,7 +136,7 @@ def test_a_query_claimed_ahead_is_released_if_the_current_step_takes_long(server
 
 
 @pytest.mark.parametrize("error", [None, KeyboardInterrupt])
-def test_a_stopped_sampler_returns_queries_claimed_ahead_and_loses_no_sample(server_process, line, error):
+def test_a_stopped_sampler_returns_queries_fetched_ahead_and_loses_no_sample(server_process, line, error):
     with Watched(server_process.url) as api:
 
         def stop() -> None:
@@ -195,7 +195,7 @@ def test_the_error_of_a_sample_that_cannot_be_sent_is_raised_once():
     assert settled == [0]
 
 
-def test_a_real_step_that_ends_early_claims_no_query_ahead():
+def test_a_real_step_that_ends_early_fetches_no_query_ahead():
     made = flowing([], [])
     made._step_seconds = 3_600.0
 

@@ -192,7 +192,7 @@ def test_a_rollout_query_of_wrong_kind_or_length_is_refused(api, rail):
         api.add_queries(rail, rollouts=[[LEFT], [[3.0]]])
 
 
-def test_an_environment_that_answers_another_kind_of_query_is_refused(api, rail):
+def test_a_rollout_design_refuses_an_environment_that_answers_single_steps(api, rail):
     from support.moody import Line
 
     with pytest.raises(UnknownEnvironment, match=r"access to resets alone, got .* access to any state"):

@@ -110,7 +110,7 @@ def test_the_sampler_reports_a_real_step_it_cannot_submit(server_process, line, 
     assert "nobody answers" in str(error)
 
 
-def test_the_option_once_stops_the_sampler_after_one_claim(api, line):
+def test_the_option_once_stops_the_sampler_after_one_batch_of_queries(api, line):
     report = Sampler(api, line, Line(), SamplerSettings(once=True, batch=2, wait_seconds=5.0)).run()
     assert report.answered == 2
     assert api.surrogate(line).queries.pending == 4

@@ -96,7 +96,7 @@ def test_a_session_ends_if_another_server_deletes_and_recreates_its_surrogate(cl
     assert version(second, opened(second, "renewed")) >= 1
 
 
-def test_a_claim_waiting_at_one_server_gets_a_query_added_at_another(
+def test_a_sampler_waiting_at_one_server_gets_a_query_added_at_another(
     postgresql: Postgresql, monkeypatch: pytest.MonkeyPatch
 ):
     """By an announcement alone: the look from time to time is put off."""

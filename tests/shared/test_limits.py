@@ -24,7 +24,7 @@ def spec_with(**changed: Any) -> EnvironmentSpec:
     return EnvironmentSpec.model_validate({**SPEC.model_dump(), **changed})
 
 
-def test_a_limit_needs_an_end_and_room_between_its_margins() -> None:
+def test_a_declared_limit_without_bound_or_with_overlapping_margins_is_refused() -> None:
     with pytest.raises(ValidationError, match="expected low, high or both"):
         limit(low=None, high=None)
     with pytest.raises(ValidationError, match="expected room between"):
@@ -45,20 +45,20 @@ def test_a_limit_needs_an_end_and_room_between_its_margins() -> None:
         ((limit(),), (Term.linear(w=1.0),), "names unknown ['w']"),
     ],
 )
-def test_limits_that_do_not_fit_the_environment_are_refused(keep: Any, fallback: Any, said: str) -> None:
+def test_declared_limits_that_do_not_fit_the_environment_are_refused(keep: Any, fallback: Any, said: str) -> None:
     with pytest.raises(ValidationError) as refused:
         with_limits(Limits(keep=keep, fallback=fallback))
     assert said in str(refused.value)
 
 
-def test_limits_without_a_period_or_a_time_limit_are_refused() -> None:
+def test_declared_limits_without_sampling_period_or_time_limit_are_refused() -> None:
     with pytest.raises(ValidationError, match="sampling_period"):
         spec_with(sampling_period=None)
     with pytest.raises(ValidationError, match="time_limit"):
         spec_with(time_limit=None)
 
 
-def test_a_limit_on_a_wrapped_angle_is_refused_and_on_its_sine_accepted() -> None:
+def test_a_declared_limit_on_an_angle_is_refused_and_on_its_sine_accepted() -> None:
     coordinates = SPEC.model_dump()["coordinates"]
     coordinates[0]["kind"] = "angle"
     coordinates[0]["sampling"] = {"kind": "uniform", "low": -3.0, "high": 3.0}
@@ -68,7 +68,7 @@ def test_a_limit_on_a_wrapped_angle_is_refused_and_on_its_sine_accepted() -> Non
     assert spec_with(coordinates=coordinates, limits=Limits(keep=(sine,), fallback=STILL).model_dump()).limits
 
 
-def test_a_discrete_fallback_is_the_number_of_an_action() -> None:
+def test_a_discrete_fallback_must_be_a_valid_action_number() -> None:
     discrete = DiscreteAction(n=3).model_dump()
     for fallback, accepted in ((Term.constant(1.0), True), (Term.constant(0.5), False), (BRAKE, False)):
         limits = Limits(keep=(limit(),), fallback=(fallback,)).model_dump()
@@ -79,14 +79,14 @@ def test_a_discrete_fallback_is_the_number_of_an_action() -> None:
                 spec_with(action=discrete, limits=limits)
 
 
-def test_room_is_the_distance_to_the_nearer_end() -> None:
+def test_the_remaining_distance_to_a_limit_is_that_to_the_nearer_bound() -> None:
     q = np.array([[0.5, 0.0], [-0.5, -1.0], [1.2, 0.0]])
     np.testing.assert_allclose(room(SPEC, q)[:, 0], [0.5, 0.2, -0.2])
     assert past(SPEC, q).tolist() == [False, False, True]
     assert nearest(SPEC, q[1]) == (RAIL, pytest.approx(0.2))
 
 
-def test_the_fallback_acts_within_the_margin_and_one_step_before_it() -> None:
+def test_the_fallback_acts_within_the_margin_of_a_limit_and_one_step_before() -> None:
     far, near = np.array([[0.0, 0.0]]), np.array([[0.65, 0.0]])
     assert falls_back(SPEC, near, near).all()
     assert not falls_back(SPEC, far, far).any()
@@ -95,12 +95,12 @@ def test_the_fallback_acts_within_the_margin_and_one_step_before_it() -> None:
     assert not falls_back(SPEC, moving, far).any(), "it moves away"
 
 
-def test_the_fallback_is_clipped_to_the_range_of_the_action() -> None:
+def test_the_fallback_action_is_clipped_to_the_action_bounds() -> None:
     np.testing.assert_allclose(fallback_action(SPEC, np.array([0.1, 0.1])), [-0.21])
     np.testing.assert_allclose(fallback_action(SPEC, np.array([0.0, 3.0])), [-1.0])
 
 
-def test_a_limit_with_one_end_has_infinite_room_on_the_other_side() -> None:
+def test_a_one_sided_limit_has_infinite_distance_on_the_other_side() -> None:
     one = with_limits(LIMITS.model_copy(update={"keep": (limit(low=None),)}))
     assert room(one, np.array([[-1e6, 0.0]]))[0, 0] == pytest.approx(1e6 + 1)
     assert not falls_back(one, np.array([[-1.0, 0.0]]), np.array([[-1e6, 0.0]])).any()

@@ -103,7 +103,9 @@ def models(indices: list[float], error: float = 0.01) -> list[ModelView]:
         ),
     ],
 )
-def test_the_verdict_names_the_uncertain_outputs(outputs: tuple[OutputFidelity, ...], phase: str, words: str) -> None:
+def test_the_status_sentence_of_a_design_names_the_uncertain_outputs(
+    outputs: tuple[OutputFidelity, ...], phase: str, words: str
+) -> None:
     assert verdict(view(*outputs, phase=phase)) == words
 
 
@@ -116,13 +118,13 @@ def test_the_verdict_names_the_uncertain_outputs(outputs: tuple[OutputFidelity, 
         (-6.0, 6.0, True, "below -6 or above 6"),
     ],
 )
-def test_the_verdict_states_the_range_where_an_output_is_uncertain(low, high, outside, words) -> None:
+def test_the_status_sentence_states_the_range_where_an_output_is_uncertain(low, high, outside, words) -> None:
     region = DoubtfulRegion(input="theta", low=low, high=high, outside=outside, share=0.9)
     said = verdict(view(output("x", 1.0), output("r", 0.98, region=region)))
     assert said == f"ready but for r where theta is {words} (confidence 0.98 of 0.999)"
 
 
-def test_established_noise_allows_a_larger_error_in_the_verdict() -> None:
+def test_with_established_noise_a_larger_error_counts_as_certain() -> None:
     assert verdict(view(output("x", 1.0, error=0.06, noise=0.05), output("r", 0.9))).startswith("ready but for r")
 
 
@@ -134,7 +136,7 @@ def test_the_estimated_noise_is_shown_as_share_of_the_squared_error() -> None:
     assert noise_in_words(view(output("x", 1.0))) == noise_in_words(view()) == ""
 
 
-def test_a_surrogate_without_model_has_no_verdict_and_no_advice() -> None:
+def test_a_surrogate_without_model_gets_no_status_sentence_and_no_advice() -> None:
     assert verdict(view()) == ""
     assert advice(view(), []) == ""
 

@@ -66,14 +66,14 @@ def run(
     return trainings, *training.train()
 
 
-def test_a_training_continues_if_the_audit_lowers_the_promise_clearly(monkeypatch, tmp_path: Path) -> None:
+def test_a_training_continues_if_the_audit_clearly_lowers_the_promised_return(monkeypatch, tmp_path: Path) -> None:
     trainings, result, handover = run(monkeypatch, tmp_path, found(95.6, -21.6), found(97.4, 97.5))
     assert (trainings.made, result.virtual_steps) == (2, 200)
     assert trainings.trained_from == [None, tmp_path / "p.zip"]
     assert handover.promise.median == 97.5
 
 
-def test_a_training_continues_if_the_promise_is_far_below_the_imagined_return(monkeypatch, tmp_path: Path) -> None:
+def test_a_training_continues_if_the_promised_return_is_far_below_the_imagined(monkeypatch, tmp_path: Path) -> None:
     trainings, _, _ = run(monkeypatch, tmp_path, found(52.6, 69.7), found(97.4, 97.5), imagined=99.4)
     assert trainings.made == 2
 
@@ -83,13 +83,13 @@ def test_a_training_with_a_step_limit_does_not_continue_after_an_audit(monkeypat
     assert trainings.made == 1
 
 
-def test_an_imagined_return_below_the_promise_causes_no_further_training(monkeypatch, tmp_path: Path) -> None:
+def test_an_imagined_return_below_the_promised_one_causes_no_further_training(monkeypatch, tmp_path: Path) -> None:
     trainings, _, _ = run(monkeypatch, tmp_path, found(95.6, 94.0), imagined=60.0)
     assert trainings.made == 1
 
 
 @pytest.mark.parametrize("after", [94.0, 120.0])
-def test_a_policy_whose_promise_stays_or_grows_after_the_audit_is_handed_over(
+def test_training_ends_if_the_promised_return_stays_or_grows_after_the_audit(
     monkeypatch, tmp_path: Path, after: float
 ) -> None:
     trainings, _, handover = run(monkeypatch, tmp_path, found(95.6, after))
@@ -97,13 +97,13 @@ def test_a_policy_whose_promise_stays_or_grows_after_the_audit_is_handed_over(
     assert handover.trusted
 
 
-def test_after_a_failed_audit_training_continues_if_the_promise_fell(monkeypatch, tmp_path: Path) -> None:
+def test_after_a_failed_audit_training_continues_if_the_promised_return_fell(monkeypatch, tmp_path: Path) -> None:
     trainings, _, handover = run(monkeypatch, tmp_path, found(95.6, -21.6, passed=False), found(97.4, 97.5))
     assert trainings.made == 2
     assert handover.trusted
 
 
-def test_after_a_failed_audit_with_unchanged_promise_the_policy_is_handed_over_untrusted(
+def test_after_a_failed_audit_with_unchanged_promised_return_the_policy_is_untrusted(
     monkeypatch, tmp_path: Path
 ) -> None:
     trainings, _, handover = run(monkeypatch, tmp_path, found(95.6, 94.0, passed=False))
@@ -153,7 +153,7 @@ def rounds_taken(
 @pytest.mark.parametrize(
     ("role", "unspent", "improved"), [("admin", 0, []), ("admin", 1, [12]), ("admin", 2, [12, 12]), ("trainer", 2, [])]
 )
-def test_a_failed_audit_uses_the_unspent_steps_of_earlier_rounds(
+def test_after_a_failed_audit_the_unspent_real_steps_of_earlier_rounds_are_taken(
     monkeypatch, tmp_path: Path, role: str, unspent: int, improved: list[int]
 ) -> None:
     """The budget has none left: the loop raises it by a round's steps, and it took none where the model seemed sure."""
@@ -172,14 +172,14 @@ def test_a_failed_audit_uses_the_unspent_steps_of_earlier_rounds(
         (3, "ready", 0.9, []),
     ],
 )
-def test_a_passed_audit_uses_unspent_steps_if_visited_states_became_uncertain(
+def test_after_a_passed_audit_unspent_steps_are_taken_if_visited_states_became_uncertain(
     monkeypatch, tmp_path: Path, unspent: int, phase: str, certain: float | None, improved: list[int]
 ) -> None:
     taken, made = rounds_taken(monkeypatch, tmp_path, passed=True, unspent=unspent, phase=phase, certain=certain)
     assert (taken, made) == (improved, 1 + len(improved))
 
 
-def test_unspent_steps_are_used_if_the_confidence_of_a_ready_design_fell(monkeypatch, tmp_path: Path) -> None:
+def test_after_an_audit_unspent_steps_are_taken_if_the_designs_confidence_fell(monkeypatch, tmp_path: Path) -> None:
     taken, _ = rounds_taken(monkeypatch, tmp_path, passed=True, unspent=3, phase="ready", certain=0.9, index=0.9986)
     assert taken == [12, 12]
 
@@ -193,7 +193,7 @@ def test_unspent_steps_are_used_if_the_confidence_of_a_ready_design_fell(monkeyp
         (76.0, 3, "over_budget", []),
     ],
 )
-def test_a_passed_audit_uses_unspent_steps_if_the_promise_interval_is_wide(
+def test_after_a_passed_audit_unspent_steps_are_taken_if_the_promised_interval_is_wide(
     monkeypatch, tmp_path: Path, low: float, unspent: int, phase: str, improved: list[int]
 ) -> None:
     """94 is promised, beyond an untrained policy's 0. A fifth of that is 18.8."""

@@ -243,7 +243,7 @@ class Broken(Changed):
         return super().step_from(coordinates, action)
 
 
-def test_a_failed_audit_step_counts_against_the_model(server_process: ServerProcess) -> None:
+def test_a_policy_is_not_trusted_if_the_environment_failed_at_an_audit_query(server_process: ServerProcess) -> None:
     with placed(server_process.url, SPEC, Broken()) as place:
         place.environment.changed = True
         handover = hand_over(place.subject(), AUDIT)

@@ -46,7 +46,7 @@ def small(**settings) -> TrainSettings:
     return TrainSettings(**{"algorithm": "PPO", "total_steps": 256, "num_envs": 8, "hyperparameters": SMALL} | settings)
 
 
-def test_the_promise_of_an_earlier_policy_is_deleted_before_the_new_one_is_saved(surrogate, tmp_path: Path):
+def test_the_promised_return_of_an_earlier_policy_is_deleted_before_saving_a_new_one(surrogate, tmp_path: Path):
     """Else a kill between the two files leaves a new policy with an old verdict."""
     out = tmp_path / "policy.zip"
     out.mkdir()
@@ -176,7 +176,7 @@ def test_training_keeps_the_policy_with_the_best_imagined_return(surrogate, tmp_
     assert imagined_returns_of(surrogate, kept, settings).mean() == pytest.approx(result.imagined_return)
 
 
-def test_imagined_returns_are_whole_episodes_from_the_declared_starts(surrogate):
+def test_imagined_returns_are_over_whole_episodes_from_the_declared_starts(surrogate):
     def nothing(observation: np.ndarray) -> np.ndarray:
         return np.zeros((len(observation), 1), np.float32)
 

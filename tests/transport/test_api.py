@@ -68,14 +68,14 @@ def test_the_client_reports_which_samples_were_stored_before_a_refusal():
         assert [wire.AddSamples.model_validate_json(r.body).complete for r in server.received] == [False, False]
 
 
-def test_a_claim_is_not_repeated_after_a_lost_reply():
+def test_a_request_for_queries_is_not_repeated_after_a_lost_reply():
     with api_of(lost_reply) as (api, server):
         with pytest.raises(errors.ServerUnreachable):
             api.claim("pendulum", "me")
         assert len(server.received) == 1
 
 
-def test_all_pages_of_samples_are_read():
+def test_the_client_reads_all_pages_of_samples():
     full = wire.SamplePage(samples=[sample(1), sample(2)], next_after=2)
     last = wire.SamplePage(samples=[], next_after=None)
     with api_of(said(full), said(last)) as (api, server):
@@ -84,7 +84,7 @@ def test_all_pages_of_samples_are_read():
 
 
 @pytest.mark.parametrize("name", ["", ".", "..", "a/b", "a%2Fb", "../sessions", "a b", "a?b", "a#b", "a\n", "x" * 65])
-def test_an_invalid_name_is_refused_without_a_request(name: str):
+def test_an_invalid_surrogate_name_is_refused_without_a_request(name: str):
     with api_of(reply("{}")) as (api, server):
         remote = HttpSurrogate(server.url, name)
         calls = [
@@ -145,7 +145,7 @@ def summary(name: str) -> wire.SurrogateSummary:
     )
 
 
-def test_all_pages_of_surrogates_are_read():
+def test_the_client_reads_all_pages_of_the_surrogate_list():
     pages = [
         wire.SurrogateList(surrogates=[summary("a")], next_after=7),
         wire.SurrogateList(surrogates=[summary("b")]),

@@ -146,7 +146,7 @@ def test_a_stream_closed_within_a_message_raises_with_the_servers_reason():
         lost_reply,
     ],
 )
-def test_a_server_without_streams_and_a_refused_stream_raise_different_errors(answer):
+def test_a_server_that_offers_no_stream_raises_stream_unavailable(answer):
     with scripted_server(answer) as server, stream(server.url) as opened, pytest.raises(StreamUnavailable):
         opened.exchange(b"", 30)
 

@@ -62,7 +62,7 @@ def evaluating(most_episodes: int = 10) -> Environment:
     return Environment(pendulum(), lambda: GymnasiumEpisode(pendulum()), most_episodes)
 
 
-def test_a_worker_stores_a_trained_policy_with_learning_curve_and_promise(api: Api, run_one, tmp_path: Path):
+def test_a_worker_stores_a_trained_policy_with_learning_curve_and_promised_return(api: Api, run_one, tmp_path: Path):
     job = run_one(SHORT)
     assert (job.status, job.error, job.worker) == ("done", None, "tester")
     assert job.version is not None

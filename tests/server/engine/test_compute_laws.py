@@ -13,5 +13,5 @@ from surrogym_server.testing import LAWS_OF_COMPUTE, ComputeCase
 
 
 @pytest.mark.parametrize("law", LAWS_OF_COMPUTE, ids=lambda law: law.__name__)
-def test_local_fitting_processes_pass_the_laws_of_the_compute_interface(law, job: DesignJob, tmp_path: Path):
+def test_local_fitting_processes_pass_the_compute_interface_tests(law, job: DesignJob, tmp_path: Path):
     asyncio.run(law(ComputeCase(Fits, job, tmp_path)))

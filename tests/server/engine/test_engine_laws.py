@@ -20,7 +20,7 @@ SURROGATE = 5
 
 
 @pytest.mark.parametrize("law", LAWS_OF_ENGINES, ids=lambda law: law.__name__)
-def test_the_local_engine_passes_the_laws_of_the_engine_interface(
+def test_the_local_session_engine_passes_the_engine_interface_tests(
     law, definition: EnvironmentDefinition, fitted: Callable[[int], DynamicsModel]
 ):
     def load(surrogate: int, version: int) -> DynamicsModel:

@@ -46,7 +46,7 @@ def test_the_predicted_next_speed_can_be_an_additional_input(pendulum_definition
     assert_features(made, 0, 0, 0, math.sqrt(3))
 
 
-def test_a_full_turn_changes_no_feature(pendulum_definition):
+def test_turning_an_angle_by_a_full_turn_changes_no_feature(pendulum_definition):
     for state in ("cos_sin", "wrapped", "both"):
         near, far = (encode(pendulum_definition, FeatureMap(state), row(a, 1), row(1)) for a in (1, 1 + 2 * math.pi))
         torch.testing.assert_close(near, far)

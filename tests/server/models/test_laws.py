@@ -15,5 +15,5 @@ CASES |= {f"through inducing points, {case}": case for case in THROUGH_INDUCING_
 
 @pytest.mark.parametrize("name", CASES)
 @pytest.mark.parametrize("law", LAWS_OF_MODELS, ids=lambda law: law.__name__)
-def test_a_family_keeps_the_laws(law, name):
+def test_every_built_in_model_family_passes_the_model_interface_tests(law, name):
     law(CASES[name])

@@ -47,7 +47,7 @@ def value(model: GaussianProcessModel, candidates: Candidates, criterion: str, c
 
 
 @pytest.mark.parametrize("name", ACQUISITIONS.names)
-def test_every_acquisition_function_passes_the_acquisition_laws(model, candidates, name):
+def test_every_acquisition_function_is_pure_finite_and_monotone_along_paths(model, candidates, name):
     """Pure, one finite value for each candidate and beginning of a path, no decrease along a path."""
     kept = candidates.points.q.clone()
     first, again = (value(model, candidates, name, 1) for _ in range(2))

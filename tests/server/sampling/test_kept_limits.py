@@ -52,13 +52,13 @@ def allowed_pushes(limits: Limits | None, std: float) -> int:
     return int(predict_paths(exact, torch.zeros(1, 2, dtype=torch.float64), pushes).running.sum())
 
 
-def test_planned_rollouts_end_before_a_limit() -> None:
+def test_planned_rollouts_end_before_a_declared_limit() -> None:
     free, limited = (np.array([farthest(model(limits, 40), seed) for seed in range(4)]) for limits in (None, WALL))
     assert free.max() > 0.5
     assert limited.max() < 0.5
 
 
-def test_a_plan_ends_where_the_fallback_would_act_or_sooner_if_the_model_is_unsure() -> None:
+def test_a_planned_rollout_ends_where_the_fallback_would_act_or_sooner_if_uncertain() -> None:
     """Four steps lead to 0.36, from where another one would reach the margin, which begins at 0.4."""
     assert allowed_pushes(WALL, 0.0) == 4
     assert allowed_pushes(None, 0.0) == 20
@@ -66,7 +66,7 @@ def test_a_plan_ends_where_the_fallback_would_act_or_sooner_if_the_model_is_unsu
 
 
 @pytest.mark.parametrize("limits", [None, WALL])
-def test_initial_queries_of_a_settable_environment_lie_outside_all_margins(limits: Limits | None) -> None:
+def test_initial_queries_of_a_settable_environment_avoid_the_margins_of_declared_limits(limits: Limits | None) -> None:
     queries = initial_queries(definition(limits), 40)
     farthest_state = max(abs(query.coordinates[0]) for query in queries)
     assert (farthest_state <= 0.4) == (limits is not None)

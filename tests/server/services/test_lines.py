@@ -39,7 +39,7 @@ def run(test: Callable[[Shop, Notices, Callable[..., Awaitable[int | str]]], Awa
 
 
 @pytest.mark.parametrize("waiting", [10, MANY])
-def test_the_number_of_database_reads_does_not_grow_with_waiting_claims(waiting: int):
+def test_the_number_of_database_reads_does_not_grow_with_waiting_samplers(waiting: int):
     async def test(shop: Shop, notices: Notices, claim: Callable[..., Awaitable[int | str]]) -> None:
         claims = [claim() for _ in range(waiting)]
         await asyncio.sleep(0.2)
@@ -54,7 +54,7 @@ def test_the_number_of_database_reads_does_not_grow_with_waiting_claims(waiting:
     run(test)
 
 
-def test_all_new_queries_of_one_notice_are_handed_to_the_waiting_claims():
+def test_all_new_queries_are_handed_to_the_waiting_samplers():
     async def test(shop: Shop, notices: Notices, claim: Callable[..., Awaitable[int | str]]) -> None:
         claims = [claim() for _ in range(MANY)]
         await asyncio.sleep(0.1)
@@ -65,7 +65,7 @@ def test_all_new_queries_of_one_notice_are_handed_to_the_waiting_claims():
     run(test)
 
 
-def test_a_claim_without_waiting_gets_new_queries_despite_waiting_claims():
+def test_a_sampler_that_does_not_wait_gets_new_queries_despite_waiting_samplers():
     async def test(shop: Shop, notices: Notices, claim: Callable[..., Awaitable[int | str]]) -> None:
         claims = [claim(1.0) for _ in range(FIRST)]
         await asyncio.sleep(0.1)
@@ -78,7 +78,7 @@ def test_a_claim_without_waiting_gets_new_queries_despite_waiting_claims():
     run(test)
 
 
-def test_a_waiting_claim_whose_caller_disconnected_takes_no_query():
+def test_a_waiting_sampler_that_disconnected_is_given_no_query():
     async def test(shop: Shop, notices: Notices, _: object) -> None:
         async def present() -> None:
             raise ConnectionError

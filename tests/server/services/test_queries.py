@@ -37,7 +37,7 @@ def emptied(storage: Storage) -> Storage:
     return storage
 
 
-def test_a_claim_returns_at_once_if_queries_are_pending(storage: Storage, definitions: Definitions):
+def test_a_sampler_gets_pending_queries_without_waiting(storage: Storage, definitions: Definitions):
     async def run() -> Claim:
         return await QueryService(storage, definitions, Notices()).claim(NAME, "tester", 2, 60, PATIENCE)
 
@@ -45,7 +45,7 @@ def test_a_claim_returns_at_once_if_queries_are_pending(storage: Storage, defini
     assert (len(claim.queries), claim.phase, claim.paused) == (2, "collecting", False)
 
 
-def test_a_claim_with_zero_waiting_time_returns_no_queries_if_none_are_pending(
+def test_a_sampler_that_does_not_wait_gets_an_empty_list_if_no_query_is_pending(
     emptied: Storage, definitions: Definitions
 ):
     async def run() -> Claim:
@@ -54,7 +54,7 @@ def test_a_claim_with_zero_waiting_time_returns_no_queries_if_none_are_pending(
     assert asyncio.run(run()).queries == []
 
 
-def test_a_new_query_wakes_a_waiting_claim(emptied: Storage, definitions: Definitions):
+def test_a_new_query_is_given_to_a_waiting_sampler_at_once(emptied: Storage, definitions: Definitions):
     async def run() -> tuple[Claim, float]:
         service = QueryService(emptied, definitions, Notices())
         return await waiting_claim(service, lambda: service.add(NAME, steps([[0.0, 0.0]], [[0.0]]), None))
@@ -64,7 +64,7 @@ def test_a_new_query_wakes_a_waiting_claim(emptied: Storage, definitions: Defini
     assert seconds < PATIENCE / 2
 
 
-def test_the_end_of_the_design_wakes_waiting_claims(emptied: Storage, definitions: Definitions):
+def test_a_waiting_sampler_returns_when_the_design_ends(emptied: Storage, definitions: Definitions):
     async def run() -> tuple[Claim, float]:
         notices = Notices()
 
@@ -79,7 +79,7 @@ def test_the_end_of_the_design_wakes_waiting_claims(emptied: Storage, definition
     assert seconds < PATIENCE / 2
 
 
-def test_the_end_of_the_server_wakes_waiting_claims(emptied: Storage, definitions: Definitions):
+def test_a_waiting_sampler_returns_when_the_server_stops(emptied: Storage, definitions: Definitions):
     async def run() -> tuple[Claim, float]:
         notices = Notices()
         return await waiting_claim(QueryService(emptied, definitions, notices), notices.close)
@@ -99,7 +99,7 @@ def test_two_waiting_samplers_share_new_queries(emptied: Storage, definitions: D
     assert len(set(ids)) == len(ids) == 2
 
 
-def test_deleting_a_surrogate_ends_waiting_claims_with_an_error(emptied: Storage, definitions: Definitions):
+def test_a_waiting_sampler_gets_an_error_when_the_surrogate_is_deleted(emptied: Storage, definitions: Definitions):
     async def run() -> None:
         notices = Notices()
 

@@ -32,7 +32,7 @@ def at_once(work: Callable[[int], T]) -> list[T]:
         return list(threads.map(run, range(THREADS)))
 
 
-def test_concurrent_claims_never_get_the_same_query(
+def test_samplers_that_fetch_queries_concurrently_never_get_the_same_one(
     storage: Storage, make: Callable[..., str], answer: Callable[..., NewSample]
 ) -> None:
     name = make(queries=60)

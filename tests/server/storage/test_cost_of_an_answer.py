@@ -56,7 +56,7 @@ def claim_and_answer(storage: Storage, name: str, answer: Callable[..., NewSampl
     storage.designs.hopeless()
 
 
-def test_claiming_and_answering_a_query_takes_few_precompiled_sql_statements(
+def test_fetching_and_answering_a_query_takes_few_precompiled_sql_statements(
     storage: Storage, make: Callable[..., str], answer: Callable[..., NewSample]
 ) -> None:
     name = make(queries=4)
@@ -85,7 +85,7 @@ def test_reading_the_ledger_counts_only_samples_added_since_the_last_read(
     assert storage.ledger.read(name).total == storage.samples.count(name) == 2
 
 
-def test_the_cached_standing_equals_phase_and_pause_of_the_surrogate(
+def test_the_short_read_of_phase_and_pause_equals_the_full_surrogate_record(
     storage: Storage, make: Callable[..., str]
 ) -> None:
     name = make()

@@ -158,7 +158,7 @@ ASKED_ANEW = ({"tolerances": {"theta": 0.5}}, {"target": 0.9}, {"budget": 3})
 
 
 @pytest.mark.parametrize("change", ASKED_ANEW)
-def test_changing_the_target_withdraws_queries_that_no_sampler_has_begun(
+def test_changing_the_target_withdraws_queries_that_no_sampler_has_started(
     storage: Storage, due: str, design: Callable[..., NewDesign], change: dict[str, Any]
 ) -> None:
     """A tolerance typed wrong costs no real step; a step that may have been taken stays in the ledger."""

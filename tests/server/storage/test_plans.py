@@ -53,7 +53,7 @@ Read = Callable[[Storage], object]
     ],
     ids=["page", "claim"],
 )
-def test_paging_and_claiming_statements_use_a_postgresql_index(
+def test_sql_statements_for_paging_and_fetching_queries_use_a_postgresql_index(
     filled: str, storage: Storage, read: Read, words: tuple[str, ...], indexes: set[tuple[str, str]]
 ):
     [sent] = [sent for sent in statements(storage, read) if all(word in sent[0] for word in words)]

@@ -166,7 +166,7 @@ def test_a_sample_for_a_failed_query_answers_it(
     assert storage.ledger.read(name) == LedgerRecord(initial=1)
 
 
-def test_a_query_returned_before_it_was_begun_counts_as_no_attempt(
+def test_a_query_returned_before_it_was_started_counts_as_no_attempt(
     storage: Storage, make: Callable[..., str], answer: Callable[..., NewSample]
 ) -> None:
     name = make(queries=1)

@@ -97,7 +97,7 @@ def test_a_leased_query_whose_snapshot_was_dropped_is_not_handed_out_again(
     assert storage.ledger.read(name).unresolved == 0
 
 
-def test_a_possibly_begun_query_is_set_aside_when_its_snapshot_is_dropped(
+def test_a_possibly_started_query_is_set_aside_when_its_snapshot_is_dropped(
     storage: Storage, name: str, chosen: list[LeasedQuery]
 ) -> None:
     again = storage.queries.claim(name, "a", 1, LONG)[0]

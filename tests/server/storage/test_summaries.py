@@ -121,7 +121,7 @@ def test_summaries_of_many_surrogates_take_as_many_sql_statements_as_of_few(
     assert sent[0] == sent[1] <= 6
 
 
-def test_a_design_without_samples_is_hopeless_once_all_its_queries_are_set_aside(
+def test_a_design_without_samples_is_listed_as_failed_once_all_queries_failed(
     storage: Storage, make: Callable[..., str], by_hand: Callable[..., NewSample]
 ) -> None:
     hopeless, sampled, waiting = (make(queries=1, name=name) for name in ("hopeless", "sampled", "waiting"))
@@ -137,7 +137,7 @@ def test_a_design_without_samples_is_hopeless_once_all_its_queries_are_set_aside
     assert storage.queries.counts(waiting).pending == 1
 
 
-def test_a_design_with_a_budget_and_no_query_or_sample_is_unbegun(
+def test_a_design_with_a_budget_and_no_query_or_sample_is_listed_as_not_started(
     storage: Storage, make: Callable[..., str], by_hand: Callable[..., NewSample]
 ) -> None:
     late, sampled = (make(queries=0, name=name, budget=0) for name in ("late", "sampled"))

@@ -187,7 +187,7 @@ def test_compiled_steps_agree_with_torch_when_the_sampling_range_is_left(choice,
 
 @needs_numba
 @pytest.mark.parametrize("choice", ["mean", "penalty, same step", "drawn functions", "noise, trust, box"])
-def test_a_lane_that_approaches_a_limit_ends_alike_in_compiled_steps_and_in_torch(choice):
+def test_compiled_steps_and_torch_end_episodes_equally_near_a_declared_limit(choice):
     """It ends before the limit, where the fallback would act, and pays for the steps that it lacks."""
     limit = Limit(name="speed", term=Term.linear(speed=1.0), low=-4.0, high=4.0, margin=0.5)
     limits = Limits(keep=(limit,), fallback=(Term.constant(0.0),)).model_dump()

@@ -105,7 +105,7 @@ def listed(value: Any) -> Any:
     return None if value is None else np.array(value)
 
 
-def test_seeds_of_each_lane_are_the_same_over_every_transport(client: httpx.Client, session: str):
+def test_per_environment_seeds_have_the_same_effect_over_every_transport(client: httpx.Client, session: str):
     seeds, mask = [2**63 - 1, 0], np.array([True, False])
     client.post(f"/v1/sessions/{session}/reset", json={"seq": 1}).raise_for_status()
     framed = over_http(client, session)(frames.reset_request(2, seeds, mask))
@@ -115,7 +115,7 @@ def test_seeds_of_each_lane_are_the_same_over_every_transport(client: httpx.Clie
     np.testing.assert_array_equal(frames.reset_result(framed, SHAPE).observation, np.float32(again["observation"]))
 
 
-def test_the_stream_continues_after_the_problem_frame_of_a_refusal(stream: ClientConnection):
+def test_the_stream_continues_after_an_error_reply(stream: ClientConnection):
     exchange = over_stream(stream)
     refused = exchange(frames.step_request(1, ACTION, None, False))
     assert isinstance(refused, frames.ProblemReply)

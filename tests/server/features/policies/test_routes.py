@@ -139,7 +139,7 @@ def test_a_policy_with_the_largest_specification_and_a_learning_curve_is_stored(
     assert api.policies.push(surrogate, large, curve, "zip", network_file(tmp_path)).created
 
 
-def test_a_stored_evaluation_has_confidence_intervals_and_tells_if_the_promise_held(
+def test_a_stored_evaluation_has_confidence_intervals_and_tells_if_the_promised_return_held(
     api: Api, surrogate: str, tmp_path: Path
 ):
     api.policies.push(surrogate, card(), [], "zip", network_file(tmp_path))
@@ -168,7 +168,9 @@ def test_a_stored_evaluation_has_confidence_intervals_and_tells_if_the_promise_h
     assert [one.id for one in policy.evaluations] == [said.id, worse.id, kept.id, wide.id]
 
 
-def test_a_policy_whose_latest_evaluation_missed_the_promise_is_not_trusted(api: Api, surrogate: str, tmp_path: Path):
+def test_a_policy_whose_latest_evaluation_missed_its_promised_return_is_not_trusted(
+    api: Api, surrogate: str, tmp_path: Path
+):
     """Episodes elsewhere judge nothing, and a later evaluation that keeps the promise gives the trust back."""
     api.policies.push(surrogate, card(reason="an audit passed"), [], "zip", network_file(tmp_path))
     said = []
@@ -183,7 +185,7 @@ def test_a_policy_whose_latest_evaluation_missed_the_promise_is_not_trusted(api:
     assert said[2].reason == "an audit passed"
 
 
-def test_reported_drift_makes_a_policy_untrusted_until_an_evaluation_meets_the_promise(
+def test_reported_drift_makes_a_policy_untrusted_until_an_evaluation_confirms_its_return(
     api: Api, client: httpx.Client, surrogate: str, tmp_path: Path
 ):
     api.policies.push(surrogate, card(reason="an audit passed"), [], "zip", network_file(tmp_path))
@@ -222,7 +224,7 @@ def test_a_drift_report_with_invalid_values_is_refused_and_changes_nothing(
     assert api.policies.get(surrogate, 1).trusted is True
 
 
-def test_evaluations_in_another_environment_do_not_decide_on_the_promise(api: Api, surrogate: str, tmp_path: Path):
+def test_evaluations_in_another_environment_do_not_judge_the_promised_return(api: Api, surrogate: str, tmp_path: Path):
     api.policies.push(surrogate, card(), [], "zip", network_file(tmp_path))
     many: dict[str, Any] = {"returns": [-180.0] * 30, "lengths": [200] * 30}
     names = ("", "Pendulum-v1", "plants:Heavy")
@@ -246,7 +248,9 @@ def test_if_the_specification_names_no_environment_the_first_evaluation_defines_
         api.delete_surrogate(name)
 
 
-def test_evaluations_of_fewer_than_30_episodes_do_not_decide_on_the_promise(api: Api, surrogate: str, tmp_path: Path):
+def test_evaluations_of_fewer_than_30_episodes_do_not_judge_the_promised_return(
+    api: Api, surrogate: str, tmp_path: Path
+):
     """Their mean is too uncertain. `surrogym evaluate` says so, and the server has to agree."""
     api.policies.push(surrogate, card(), [], "zip", network_file(tmp_path))
     few = api.policies.evaluate(surrogate, 1, episodes(returns=[-180.0] * 29, lengths=[200] * 29))

@@ -45,7 +45,7 @@ pytestmark = [pytest.mark.postgresql, pytest.mark.timeout(600), pytest.mark.filt
 
 
 @pytest.mark.parametrize("law", LAWS_OF_ENGINES, ids=lambda law: law.__name__)
-def test_the_ray_engine_passes_the_laws_of_the_engine_interface(law, case: EngineCase):
+def test_the_ray_session_engine_passes_the_engine_interface_tests(law, case: EngineCase):
     asyncio.run(law(case))
 
 

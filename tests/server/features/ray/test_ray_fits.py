@@ -47,7 +47,7 @@ def job(pendulum_samples: Samples) -> DesignJob:
 
 
 @pytest.mark.parametrize("law", LAWS_OF_COMPUTE, ids=lambda law: law.__name__)
-def test_ray_fitting_tasks_pass_the_laws_of_the_compute_interface(law, job: DesignJob, tmp_path: Path):
+def test_ray_fitting_tasks_pass_the_compute_interface_tests(law, job: DesignJob, tmp_path: Path):
     asyncio.run(law(ComputeCase(fits.RayFits, job, tmp_path)))
 
 

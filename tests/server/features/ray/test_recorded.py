@@ -89,7 +89,7 @@ def end_lease(storage: Storage) -> Callable[[Host, str], None]:
 
 
 @pytest.mark.parametrize("law", LAWS_OF_ENGINES, ids=lambda law: law.__name__)
-def test_a_session_host_passes_the_laws_of_the_engine_interface(law, host):
+def test_a_ray_session_host_passes_the_engine_interface_tests(law, host):
     async def kept() -> None:
         one = host()
         await one.engine.start()
