@@ -44,7 +44,7 @@ def short_lives(seed: int, longest: int = 1_500) -> Iterator[int]:
         yield source.randint(0, longest) if source.random() < 0.8 else 6_000
 
 
-def test_a_training_result_is_unchanged_by_broken_connections(
+def test_a_stepped_trajectory_is_unchanged_by_broken_connections(
     pendulum_server: ServerProcess, expected: list[np.ndarray], transport: Transport
 ):
     with (
@@ -55,7 +55,7 @@ def test_a_training_result_is_unchanged_by_broken_connections(
         assert proxy.cuts > 3, "the proxy did its worst"
 
 
-def test_a_training_result_is_unchanged_by_lost_replies(
+def test_a_stepped_trajectory_is_unchanged_by_lost_replies(
     pendulum_server: ServerProcess, expected: list[np.ndarray], transport: Transport
 ):
     with (
@@ -66,7 +66,7 @@ def test_a_training_result_is_unchanged_by_lost_replies(
         assert proxy.count > 0, "the proxy did its worst"
 
 
-def test_a_training_result_is_unchanged_by_late_replies(
+def test_a_stepped_trajectory_is_unchanged_by_late_replies(
     pendulum_server: ServerProcess, expected: list[np.ndarray], transport: Transport
 ):
     with (
@@ -77,7 +77,7 @@ def test_a_training_result_is_unchanged_by_late_replies(
         assert proxy.count > 3, "the proxy did its worst"
 
 
-def test_a_training_result_is_unchanged_by_duplicated_requests(
+def test_a_stepped_trajectory_is_unchanged_by_duplicated_requests(
     pendulum_server: ServerProcess, expected: list[np.ndarray], transport: Transport
 ):
     """The stream's own messages are sent once by its protocol; what is sent twice are its requests over HTTP."""

@@ -97,7 +97,7 @@ def test_a_stopping_server_ends_waiting_requests_and_finishes_running_steps(rest
     restarting.start()
 
 
-def test_a_server_crash_truncates_the_episodes_and_training_continues(restarting: RestartingServer):
+def test_a_server_crash_truncates_the_episodes_and_stepping_continues(restarting: RestartingServer):
     envs = vec_env(restarting)
     envs.reset()
     last, *_ = envs.step(actions(1)[0])

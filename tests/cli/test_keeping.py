@@ -22,7 +22,7 @@ def episodes(returns: list[float]) -> Evaluation:
     [([np.inf, -1.0], "reward.0"), ([0.0] * 10_001, "returns")],
     ids=["a return that is not finite", "more episodes than one request holds"],
 )
-def test_real_episodes_refused_by_the_server_are_kept_in_a_file_and_reported(
+def test_real_episodes_the_server_cannot_store_are_reported_and_not_kept(
     returns: list[float], named: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     policy = tmp_path / "policy.zip"

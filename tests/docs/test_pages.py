@@ -56,7 +56,7 @@ def test_every_documentation_link_has_an_existing_target(page: Path) -> None:
 
 
 @each_page
-def test_every_test_named_in_the_documentation_exists(page: Path) -> None:
+def test_every_test_file_named_in_the_documentation_exists(page: Path) -> None:
     named = re.findall(
         r"(?<![\w/])(?:lab/)?(?:tests|benchmarks)/[\w/-]+(?:\.(?:py|json|toml))?", page.read_text(encoding="utf-8")
     )

@@ -40,7 +40,7 @@ def test_the_documentation_site_builds_with_every_page_in_its_navigation(site: P
     assert [str(page) for page in pages if f'href="{page}"' not in home] == []
 
 
-def test_site_links_to_records_outside_the_site_are_existing_repository_paths(site: Path) -> None:
+def test_the_site_shows_records_outside_of_it_as_paths_instead_of_links(site: Path) -> None:
     architecture = (site / "architecture.html").read_text(encoding="utf-8")
     assert "<code>lab/records/decisions/README.md</code>" in architecture
     outside = {

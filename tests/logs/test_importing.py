@@ -164,7 +164,9 @@ def test_importing_a_log_without_a_surrogate_name_sends_nothing(log: Path):
     assert (imported.surrogate, imported.sent, len(imported.log.steps)) == (None, 0, ROWS)
 
 
-def test_the_import_error_names_an_unknown_surrogate_or_unreachable_server(server_process: ServerProcess, log: Path):
+def test_importing_to_an_unknown_surrogate_or_with_conflicting_options_is_refused(
+    server_process: ServerProcess, log: Path
+):
     with pytest.raises(UnknownSurrogate):
         import_log(log, to="nobody", url=server_process.url)
     with pytest.raises(ValueError, match="expected to without register and spec"):

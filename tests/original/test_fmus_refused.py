@@ -31,7 +31,7 @@ def tanks(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ({"</fmiModelDescription>": ""}, "modelDescription.xml of .* can't be read"),
     ],
 )
-def test_a_specification_that_does_not_fit_the_fmu_is_refused_with_the_difference(
+def test_an_fmu_whose_model_description_is_unsupported_is_refused_with_the_reason(
     tanks: Path, tmp_path: Path, words, message: str
 ) -> None:
     with pytest.raises(UnknownEnvironment, match=message):
