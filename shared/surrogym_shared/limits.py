@@ -74,6 +74,20 @@ def nearest(spec: EnvironmentSpec, coordinates: Array) -> tuple[Limit, float]:
     return limits_of(spec).keep[index], float(every[index])
 
 
+def words_of_steps(spec: EnvironmentSpec, before: Array, after: Array) -> list[str]:
+    """Describe how real steps from ``before`` (n, C) to ``after`` (n, C) kept each limit. Empty without steps."""
+    if not len(after):
+        return []
+    least, near = room(spec, after), falls_back(spec, before, after).sum()
+    lines = [
+        f"limit {limit.name}: {(least[:, i] < 0).sum()} of {len(after)} real steps beyond it, least room "
+        f"{least[:, i].min():.4g} {limit.unit}".rstrip()
+        + f", margin {limit.margin:g}"
+        for i, limit in enumerate(limits_of(spec).keep)
+    ]
+    return [*lines, f"limits: the fallback was due after {near} of {len(after)} real steps"]
+
+
 def check_limits(spec: EnvironmentSpec) -> None:
     """Check that the limits of a specification fit its other entries and each other.
 

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -57,6 +58,12 @@ TimeLimit = Annotated[
 ]
 
 
+UNWATCHED = (
+    "limits: this sampler falls back when no action comes, but not after kill -9; then the program itself has to fall "
+    "back when its input closes"
+)
+
+
 @dataclass(frozen=True)
 class SnapshotOptions:
     """Options for the snapshots of visited states that a sampler keeps."""
@@ -70,6 +77,29 @@ class SnapshotOptions:
     ] = None
     most_snapshots: Annotated[int, typer.Option(min=1, help="Largest number of snapshots to keep.")] = 1_000
     most_bytes: Annotated[int, typer.Option(min=1, help="Largest size of all snapshots to keep, in bytes.")] = 1 << 30
+
+
+@dataclass(frozen=True)
+class CautionOptions:
+    """What a person sees of a query before it is taken."""
+
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Print and draw the queries that wait for a sampler, and take none.")
+    ] = False
+    approve: Annotated[
+        bool,
+        typer.Option(
+            "--approve",
+            help="Print and draw each query, and ask before it is taken. A refused one is never asked again.",
+        ),
+    ] = False
+
+    def require_fit(self, cluster: RayOptions, output: Output) -> None:
+        """Raise ``CommandError`` if nobody can be asked for approval."""
+        from surrogym.cli.errors import CommandError
+
+        if self.approve and (cluster.on_ray is not None or output.quiet or not sys.stdin.isatty()):
+            raise CommandError("--approve asks for each query: expected a terminal, without --quiet and --on-ray")
 
 
 def register(app: typer.Typer) -> None:
@@ -94,6 +124,7 @@ def command(
     exit_with_parent: ExitWithParent = False,
     *,
     keeping: SnapshotOptions,
+    caution: CautionOptions,
     cluster: RayOptions,
     service: Service,
     output: Output,
@@ -114,6 +145,7 @@ def command(
     from surrogym_sampler.queries.snapshots import Bounds
 
     cluster.require_fit(worker_limits=once or max_queries is not None)
+    caution.require_fit(cluster, output)
     if exit_with_parent:
         watch_parent()
     settings = SamplerSettings(
@@ -128,19 +160,45 @@ def command(
     )
     with service.connect(context, wait, quiet=output.quiet) as api:
         view = awaited_surrogate(api, surrogate, wait, quiet=output.quiet)
+        if caution.dry_run:
+            _show_queries(api, view, output)
+            return
         if _without_queries(view, output, until_done=until_done):
             return
         name, replaced = _environment(_named(env, program), read_spec(spec), view.spec)
         plan = SamplerPlan(api.url, service.token_for(context), surrogate, name, replaced, step_limit, settings)
         if cluster.on_ray is None:
-            _sample_here(api, plan, output)
+            _sample_here(api, plan, output, approved if caution.approve else None)
         else:
             _require_shared(view.spec, settings)
             _sample_on_ray(api, plan, cluster, output)
 
 
-def _sample_here(api: Api, plan: SamplerPlan, output: Output) -> None:
+def _show_queries(api: Api, view: SurrogateView, output: Output) -> None:
+    """Print and draw the queries of a surrogate that wait for a sampler."""
+    from surrogym_sampler.queries.words import words_of_query
+
+    waiting = [query for query in api.queries(view.name) if query.status == "pending"]
+    drawn = [line for query in waiting for line in words_of_query(view.spec, query)]
+    found = {"queries": [query.model_dump(mode="json") for query in waiting]}
+    output.give(found, lambda: "\n".join(drawn) or f"no query of {view.name} waits for a sampler")
+
+
+def approved(spec: EnvironmentSpec, query: Query) -> bool:
+    """Ask whether a query may be taken, after it was printed and drawn."""
+    from surrogym_sampler.queries.words import words_of_query
+    from surrogym_shared.terminal import say
+
+    for line in words_of_query(spec, query):
+        say(line)
+    return typer.confirm("take it?", default=False, err=True)
+
+
+def _sample_here(
+    api: Api, plan: SamplerPlan, output: Output, ask: Callable[[EnvironmentSpec, Query], bool] | None = None
+) -> None:
     from surrogym_client.runtime.lifetime import terminations
+    from surrogym_sampler.original.executables import is_executable
     from surrogym_sampler.original.loading import for_queries
     from surrogym_sampler.queries.on_ray import Line, line_of
     from surrogym_sampler.queries.worker import Sampler
@@ -148,8 +206,11 @@ def _sample_here(api: Api, plan: SamplerPlan, output: Output) -> None:
 
     with (
         closing(for_queries(plan.environment, plan.step_limit, plan.spec)) as environment,
-        _telling(api, plan.surrogate, quiet=output.quiet) as tell,
+        _telling(api, plan.surrogate, quiet=output.quiet, plain=ask is not None) as tell,
     ):
+        approve = None if ask is None else partial(ask, environment.spec())
+        if environment.spec().limits is not None and is_executable(plan.environment):
+            say(UNWATCHED, quiet=output.quiet)
 
         def report(query: Query, outcome: Outcome, error: str) -> None:
             if tell is not None:
@@ -159,7 +220,7 @@ def _sample_here(api: Api, plan: SamplerPlan, output: Output) -> None:
             if not plan.settings.until_done:  # with --until-done, the command prints its result now
                 say(_words_of_end(plan.surrogate, phase), quiet=output.quiet)
 
-        sampler = Sampler(api, plan.surrogate, environment, plan.settings, report, ended)
+        sampler = Sampler(api, plan.surrogate, environment, plan.settings, report, ended, approve)
         for number in terminations():
             signal.signal(number, lambda *_: sampler.stop())
         with on_interrupt(lambda: _words_of_interruption(sampler.summary())):
@@ -241,12 +302,12 @@ def _words_of_consent(name: str) -> str:
 
 
 @contextmanager
-def _telling(api: Api, surrogate: str, *, quiet: bool) -> Iterator[Tell | None]:
+def _telling(api: Api, surrogate: str, *, quiet: bool, plain: bool = False) -> Iterator[Tell | None]:
     """Context that shows progress: a bar for the design on a terminal, otherwise a line for each query. Yields the
-    function that shows a line; None if ``quiet``."""
+    function that shows a line; None if ``quiet``. ``plain``: lines, also on a terminal."""
     from surrogym_shared.terminal import progress, say
 
-    if quiet or not sys.stderr.isatty():
+    if quiet or plain or not sys.stderr.isatty():
         yield None if quiet else lambda line: say(line.text)
         return
     with progress("design") as update:

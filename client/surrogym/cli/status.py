@@ -78,7 +78,22 @@ def _one(api: Api, name: str, form: Form) -> str:
     if form == "short":
         return _short(view)
     models = api.models(name) if view.phase in ("over_budget", "unsure") else ()
-    return "\n".join([_detail(view, models), *_prior(api, name), *_untrusted(name, api.policies.list(name))])
+    return "\n".join(
+        [_detail(view, models), *_limits(api, view), *_prior(api, name), *_untrusted(name, api.policies.list(name))]
+    )
+
+
+def _limits(api: Api, view: SurrogateView) -> list[str]:
+    """Return lines on how all real steps kept the limits of the specification; empty without limits or steps."""
+    if view.spec.limits is None:
+        return []
+    import numpy as np
+
+    from surrogym_shared.limits import words_of_steps
+
+    pairs = [(sample.coordinates, sample.next_coordinates) for sample in api.samples(view.name)]
+    steps = np.array(pairs, dtype=np.float64).reshape(-1, 2, len(view.spec.coordinates))
+    return words_of_steps(view.spec, steps[:, 0], steps[:, 1])
 
 
 def _prior(api: Api, name: str) -> list[str]:

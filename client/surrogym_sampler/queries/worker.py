@@ -40,6 +40,7 @@ END_SECONDS = 2.0  # longest wait of a claim, in seconds, if the sampler has to 
 AGAIN_SECONDS = 1.0  # seconds to wait after a claim with no query that the environment allows
 MOST_GONE = 1_000  # largest number of deleted snapshots in one report to the server
 STOPPED = "the sampler was stopped"
+NOT_APPROVED = "the person at the machine did not approve the query"
 
 T = TypeVar("T")
 
@@ -95,6 +96,7 @@ class Sampler:
         settings: when to stop, and how many queries to claim.
         report: called after every query with the query, its outcome, and the error if there was one.
         ended: called with the phase whenever a claim shows that the design has ended, once for each end.
+        approve: called before each query; False refuses it. None takes every query.
 
     Examples:
         >>> with Api("http://127.0.0.1:8000") as api:
@@ -109,6 +111,7 @@ class Sampler:
         settings: SamplerSettings | None = None,
         report: Callable[[Query, Outcome, str], None] | None = None,
         ended: Callable[[Phase], None] | None = None,
+        approve: Callable[[Query], bool] | None = None,
     ) -> None:
         self._api = api
         self._surrogate = surrogate
@@ -116,6 +119,7 @@ class Sampler:
         self._settings = settings or SamplerSettings()
         self._report = report
         self._ended = ended
+        self._approve = approve
         self._counts: dict[Outcome, int] = dict.fromkeys(get_args(Outcome), 0)
         self._refused: set[int] = set()  # ids of refused queries, which the server may offer again
         self._failures = Failures()
@@ -248,6 +252,8 @@ class Sampler:
         outcome: Outcome = "failed"  # the outcome if no step is taken
         try:
             check_query(self._own, query)
+            if self._approve is not None and not self._approve(query):
+                raise StepRefused(NOT_APPROVED)
             self._take(query, taken)
         except QueryRefused as refused:
             outcome, error = "refused", str(refused)

@@ -11,6 +11,7 @@ import numpy as np
 
 from surrogym_client.runtime.versions import versions
 from surrogym_client.surrogates.phases import IN_WORDS
+from surrogym_shared.limits import words_of_steps
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import ModelView, OutputFidelity, Phase, SampleView, SurrogateView
 from surrogym_trainer.policies.controller_check import StoredCheck
@@ -70,7 +71,7 @@ def page(known: Known, cuts: Sequence[Cut] = ()) -> str:
 
 def _details(known: Known, cuts: Sequence[Cut]) -> list[str]:
     view, models, samples = known.view, known.models, known.samples
-    sections = [_summary(view), _spent(view)]
+    sections = [_summary(view, samples), _spent(view)]
     if models:
         sections.append(_fidelity(view, models))
     if samples:
@@ -98,7 +99,7 @@ def _covered(view: SurrogateView, samples: Sequence[SampleView]) -> str:
     return f"{shown}<p>{escape(coverage.words())}</p>"
 
 
-def _summary(view: SurrogateView) -> str:
+def _summary(view: SurrogateView, samples: Sequence[SampleView]) -> str:
     index = "no model yet" if view.confidence_index is None else f"{view.confidence_index:.4f}"
     facts = [
         ("phase", f"{PHASES[view.phase]}, paused" if view.paused else PHASES[view.phase]),
@@ -107,8 +108,17 @@ def _summary(view: SurrogateView) -> str:
         ("model", view.model_version),
         ("queries", ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in view.queries)),
         *([("last error", view.error)] if view.error else []),
+        *(("limits", words) for words in _limits(view, samples)),
     ]
     return section("State of the design", rows(facts))
+
+
+def _limits(view: SurrogateView, samples: Sequence[SampleView]) -> list[str]:
+    """Return lines on how the real steps kept the limits of the specification; empty without limits or steps."""
+    if view.spec.limits is None or not samples:
+        return []
+    before, after = (np.array([getattr(s, name) for s in samples]) for name in ("coordinates", "next_coordinates"))
+    return words_of_steps(view.spec, before, after)
 
 
 def _spent(view: SurrogateView) -> str:

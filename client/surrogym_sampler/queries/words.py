@@ -1,0 +1,36 @@
+"""A query as lines for a person: where it begins, and a small picture of its actions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from surrogym_sampler.original.fitting import action_ranges
+from surrogym_shared.spec import EnvironmentSpec
+from surrogym_shared.wire import Query, QueryView
+
+BARS = "▁▂▃▄▅▆▇█"  # from the lowest to the highest value of an entry
+
+
+def words_of_query(spec: EnvironmentSpec, query: Query | QueryView) -> list[str]:
+    """Describe a query: its start, then one line for each entry of the action, with a bar for each step."""
+    actions = query.actions if isinstance(query, QueryView) or query.kind == "rollout" else [query.action]
+    steps = f"{len(actions)} step{'s' * (len(actions) > 1)}"
+    lines = [f"query {query.id} ({query.purpose}): {steps} from {_start(spec, query)}"]
+    for entry, (low, high) in enumerate(action_ranges(spec)):
+        values = [action[entry] for action in actions]
+        bars = "".join(BARS[min(int((v - low) / (high - low) * len(BARS)), len(BARS) - 1)] for v in values)
+        lines.append(f"  action {entry} {bars} {_ends(values)} of {low:g} to {high:g}")
+    return lines
+
+
+def _start(spec: EnvironmentSpec, query: Query | QueryView) -> str:
+    coordinates: Sequence[float] | None = getattr(query, "coordinates", None)
+    if coordinates:
+        return ", ".join(f"{name} {value:.4g}" for name, value in zip(spec.coordinate_names, coordinates, strict=True))
+    snapshot: str | None = getattr(query, "snapshot", None)
+    return f"the saved state {snapshot}" if snapshot else "a reset"
+
+
+def _ends(values: Sequence[float]) -> str:
+    low, high = min(values), max(values)
+    return f"{low:.4g}" if low == high else f"{low:.4g} to {high:.4g}"

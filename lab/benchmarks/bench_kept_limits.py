@@ -1,0 +1,263 @@
+"""How well limits hold while a machine is learned that can only be reset, and what they cost.
+
+    python lab/benchmarks/bench_kept_limits.py --machines rail tanks levitation --first-seed 1 --seeds 10
+    python lab/benchmarks/bench_kept_limits.py --machines rotary --no-policy --first-seed 1 --seeds 10
+
+The machines are the cart-pole swing-up on a rail of +-0.8 m, two tanks of which the upper one runs over, a levitated
+ball between 6 and 14 mm, and a rotary pendulum whose arm must stay within +-1.5 rad and is only seen by an encoder, one
+step late. A row has one design and one policy, with limits or without:
+
+- real steps and rollouts of the design, and how many rollouts left a limit;
+- the mean real return of 50 episodes of a policy trained in the model, how many of them left a limit, and the share of
+  steps in which the fallback acted.
+
+A row without limits is judged by the same limits. Rows are kept in ``--out``/limits.csv, so that the same command goes
+on after Ctrl-C.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
+
+import numpy as np
+import torch
+from audit_resets import Rotary
+from common import OUT
+from scipy.stats import binomtest
+
+import surrogym
+from support import levitation
+from support.changing import Machine
+from surrogym_lab.reproduce.rows import read_records, write_records
+from surrogym_sampler import original
+from surrogym_sampler.original.episodes import open_episode
+from surrogym_sampler.original.loading import Respecified
+from surrogym_sampler.original.rollouts import answering, keeping_limits
+from surrogym_server.local import LocalSurrogate
+from surrogym_shared.limits import past
+from surrogym_shared.spec import EnvironmentSpec, Limit, Limits, Term
+from surrogym_trainer.evaluation.evaluator import EvaluationSettings, evaluate
+from surrogym_trainer.policies import load_policy
+from surrogym_trainer.training import TrainSettings, train
+
+EPISODES = 50
+SEARCH = "FASTPPO"
+HOVERING = Term.linear(gap=0.6, speed=14.0, current=-1.0)  # brings the levitated ball back to the middle of its range
+
+
+class Formula:
+    """A plant from a formula, which can only be reset and acted on."""
+
+    parallel = True
+
+    def __init__(self, machine: Machine, seed: int) -> None:
+        self._machine, self._rng = machine, np.random.default_rng([seed, 5])
+        self._q = np.zeros(len(machine.ranges))
+
+    def spec(self) -> EnvironmentSpec:
+        return self._machine.spec
+
+    def reset(self, *, seed: int | None = None) -> tuple[Any, dict[str, Any]]:
+        low, high = np.array(list(self._machine.start.values())).T
+        self._q = np.random.default_rng(seed).uniform(low, high)
+        return self._q.copy(), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        u = np.atleast_1d(np.asarray(action, dtype=float))[None]
+        after, reward, over = self._machine.step(self._q[None], u, self._machine.real, self._rng)
+        self._q = after[0]
+        return self._q.copy(), float(reward[0]), bool(over[0]), False, {}
+
+    def coordinates(self, observation: Any) -> Any:
+        return observation
+
+    def close(self) -> None:
+        pass
+
+
+class PatientRotary(Rotary):
+    """The rotary pendulum as a simulator, which waits for its actions."""
+
+    parallel = True
+
+
+@dataclass(frozen=True)
+class Plant:
+    """One machine with its limits."""
+
+    make: Callable[[int], Any]  # makes the machine, of a seed
+    limits: Limits
+    budget: int
+    period: float  # seconds of a step
+    changes: dict[str, Any]  # of the specification
+
+
+def _limits(fallback: Term, *keep: Limit) -> Limits:
+    return Limits(keep=keep, fallback=(fallback,))
+
+
+PLANTS = {
+    "rail": Plant(
+        lambda _: original.make("surrogym/CartPoleSwingUp-v0", access="reset"),
+        _limits(
+            Term.linear(x=-8.0, velocity=-6.0),
+            Limit(name="rail", term=Term.linear(x=1.0, velocity=0.1), low=-0.8, high=0.8, margin=0.2),
+        ),
+        budget=260,
+        period=0.1,
+        changes={},
+    ),
+    "tanks": Plant(
+        partial(Formula, replace(levitation.TANKS, start={"upper": (-5, 0), "lower": (-5, 0)})),
+        _limits(Term.constant(-1.0), Limit(name="brim", term=Term.linear(upper=1.0), high=4.0, margin=0.7)),
+        budget=60,
+        period=0.5,
+        changes={},
+    ),
+    "levitation": Plant(
+        partial(Formula, levitation.LEVITATION),
+        _limits(HOVERING, Limit(name="gap", term=Term.linear(gap=1.0, speed=20.0), low=-4.0, high=4.0, margin=1.0)),
+        budget=100,
+        period=0.005,
+        changes={"termination": ()},
+    ),
+    "rotary": Plant(
+        lambda _: PatientRotary(),
+        _limits(
+            Term.linear(**{"arm": -0.6, "arm.change1": -4.0}),
+            Limit(name="stop", term=Term.linear(**{"arm": 1.0, "arm.change1": 2.0}), low=-1.5, high=1.5, margin=0.5),
+        ),
+        budget=300,
+        period=0.03,
+        changes={},
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Row:
+    """One design and its policy."""
+
+    machine: str
+    limits: bool  # whether the limits were declared
+    seed: int
+    phase: str
+    steps: int  # real steps of the design
+    rollouts: int
+    left: int  # rollouts that left a limit
+    value: float  # mean real return of the policy; nan without one
+    episodes: int
+    violations: int  # episodes that left a limit
+    fallbacks: float  # share of the policy's steps in which the fallback acted
+
+
+def main() -> None:
+    options = _options()
+    sys.stdout.reconfigure(line_buffering=True)  # type: ignore[union-attr]
+    torch.set_num_threads(1)
+    path: Path = options.out / "limits.csv"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    rows = read_records(path, Row)
+    done = {(row.machine, row.limits, row.seed) for row in rows}
+    for seed in range(options.first_seed, options.first_seed + options.seeds):
+        for machine in options.machines:
+            for limited in (True, False):
+                if (machine, limited, seed) not in done:
+                    rows.append(run(machine, seed, limited=limited, policy=not options.no_policy))
+                    write_records(path, Row, rows)
+                    print(rows[-1])
+    print(table(rows))
+
+
+def specifications(plant: Plant, seed: int) -> tuple[EnvironmentSpec, EnvironmentSpec]:
+    """Specifications with the limits, and without."""
+    own = plant.make(seed).spec()
+    fields = {**own.model_dump(), "query": "rollout", "sampling_period": plant.period, **plant.changes}
+    fields["design"] = {**fields["design"], "seed": seed, "budget": plant.budget, "initial": None}
+    free = EnvironmentSpec.model_validate(fields)
+    return EnvironmentSpec.model_validate({**fields, "limits": plant.limits.model_dump()}), free
+
+
+def run(machine: str, seed: int, *, limited: bool, policy: bool) -> Row:
+    plant = PLANTS[machine]
+    judged, free = specifications(plant, seed)
+    spec = judged if limited else free
+
+    def made() -> Any:
+        return Respecified(plant.make(seed), spec)
+
+    environment, design = keeping_limits(answering(made())), surrogym.Design(spec, threads=1)
+    rollouts = left = 0
+    while (query := design.ask()) is not None:
+        environment.begin(int(np.random.SeedSequence([seed, query.id]).generate_state(1)[0]))
+        steps = []
+        for action in query.actions:
+            steps.append(environment.act(np.array(action)))
+            if steps[-1].terminated or steps[-1].truncated:
+                break
+        design.tell(query, steps)
+        rollouts += 1
+        left += bool(past(judged, np.array([step.next_coordinates for step in steps])).any())
+    so_far = machine, limited, seed, design.phase, design.steps, rollouts, left
+    if not policy:
+        return Row(*so_far, float("nan"), 0, 0, float("nan"))
+    result = _evaluated(design.surrogate(), spec, made, seed)
+    violations = sum(bool(past(judged, trace.coordinates).any()) for trace in result.traces)
+    share = 0.0 if result.limits is None else result.limits.fallbacks / result.limits.steps
+    return Row(*so_far, float(result.returns.mean()), EPISODES, violations, share)
+
+
+def _evaluated(model: LocalSurrogate, spec: EnvironmentSpec, made: Callable[[], Any], seed: int) -> Any:
+    with TemporaryDirectory() as folder:
+        trained = train(model, Path(folder) / "policy", TrainSettings(algorithm=SEARCH, seed=seed))
+        acts = load_policy(trained.path, SEARCH)
+    return evaluate(acts, lambda: open_episode("plant:Plant", spec, made), EvaluationSettings(EPISODES, parallel=1))
+
+
+def table(rows: Sequence[Row]) -> str:
+    """Pooled counts of each machine, with exact upper 95 % bounds."""
+    lines = [
+        "| machine | limits | seeds | real steps | rollouts that left | return | episodes that left | fallback |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for machine, limited in sorted({(row.machine, row.limits) for row in rows}):
+        here = [row for row in rows if (row.machine, row.limits) == (machine, limited)]
+        steps, values = [row.steps for row in here], [row.value for row in here]
+        lines.append(
+            f"| {machine} | {'yes' if limited else 'no'} | {len(here)} | {np.median(steps):g} "
+            f"({min(steps)} to {max(steps)}) | {_share(sum(r.left for r in here), sum(r.rollouts for r in here))} | "
+            f"{np.median(values):.4g} ({min(values):.4g} to {max(values):.4g}) | "
+            f"{_share(sum(r.violations for r in here), sum(r.episodes for r in here))} | "
+            f"{100 * np.mean([r.fallbacks for r in here]):.2g} % |"
+        )
+    return "\n".join(lines)
+
+
+def _share(count: int, of: int) -> str:
+    if not of:
+        return "-"
+    high = binomtest(count, of, alternative="less").proportion_ci(0.95, method="exact").high
+    return f"{count} of {of} (below {100 * high:.2g} %)"
+
+
+def _options() -> argparse.Namespace:
+    made = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    made.add_argument("--machines", nargs="+", choices=list(PLANTS), default=list(PLANTS))
+    made.add_argument("--first-seed", type=int, default=0)
+    made.add_argument("--seeds", type=int, default=1)
+    made.add_argument("--no-policy", action="store_true", help="designs alone")
+    made.add_argument("--out", type=Path, default=OUT)
+    return made.parse_args()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,71 @@
+"""``surrogym sample`` at a machine with limits: queries are shown before they are taken, and a person approves them."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+import typer
+
+from surrogym.cli import sample
+from surrogym_shared.wire import Query
+
+CART = ("--env", "support.limited:PatientCart")
+
+
+@pytest.fixture
+def cart(on_server: Any, name: str) -> str:
+    assert on_server("register", name, *CART).code == 0
+    return name
+
+
+def test_a_dry_run_draws_waiting_queries_and_takes_none(on_server: Any, cart: str) -> None:
+    shown = on_server("sample", cart, *CART, "--dry-run")
+    assert "(initial): 1 step from a reset" in shown.out
+    assert "action 0" in shown.out
+    assert len(json.loads(on_server("sample", cart, *CART, "--dry-run", "--json").out)["queries"]) == 5
+    assert json.loads(on_server("status", cart, "--json").out)["ledger"]["total"] == 0
+
+
+def test_a_query_that_a_person_does_not_approve_takes_no_real_step(
+    on_server: Any, cart: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[Query] = []
+
+    def second_refused(_: Any, query: Query) -> bool:
+        asked.append(query)
+        return len(asked) != 2
+
+    monkeypatch.setattr(sample, "approved", second_refused)
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True)
+    said = on_server("sample", cart, *CART, "--approve", "--max-queries", "3", "--json")
+    report = json.loads(said.out)
+    assert (report["answered"], report["refused"]) == (2, 1)
+    assert report["steps"] == sum(len(query.actions) for query in (asked[0], asked[2]))
+    assert "1 refused by the environment" in on_server("status", cart).out
+
+
+def test_a_person_sees_the_query_before_the_question(
+    monkeypatch: pytest.MonkeyPatch, on_server: Any, cart: str
+) -> None:
+    questions: list[str] = []
+    monkeypatch.setattr(typer, "confirm", lambda question, **_: questions.append(question) or False)
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True)
+    said = on_server("sample", cart, *CART, "--approve", "--max-queries", "1")
+    assert questions == ["take it?"]
+    assert "(initial): 1 step from a reset" in said.err
+
+
+def test_approval_without_a_terminal_is_refused(on_server: Any, cart: str) -> None:
+    said = on_server("sample", cart, *CART, "--approve")
+    assert said.code != 0
+    assert "expected a terminal" in said.err
+
+
+def test_status_shows_how_the_real_steps_kept_each_limit(on_server: Any, cart: str) -> None:
+    assert "limit rail" not in on_server("status", cart).out
+    assert on_server("sample", cart, *CART, "--max-queries", "2").code == 0
+    shown = on_server("status", cart).out
+    assert "limit rail: 0 of 3 real steps beyond it" in shown
+    assert "margin 0.4" in shown
