@@ -146,7 +146,7 @@ def test_interrupting_a_study_ends_its_runs_on_ray(address: str, tmp_path: Path)
         time.sleep(0.05)
 
 
-def test_peer_runs_on_ray_leave_the_same_files_as_local_ones(
+def test_comparison_runs_on_ray_leave_the_same_files_as_local_ones(
     address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     """The method ``here`` is known to this process alone, so its cell breaks in the cluster."""

@@ -20,7 +20,7 @@ def test_the_peers_command_shows_finished_results(lab, tmp_path):
     assert "not reached by 20,000" in (tmp_path / "out" / "peers.md").read_text()
 
 
-def test_peer_results_of_other_settings_are_never_overwritten(lab, tmp_path):
+def test_comparison_results_of_other_settings_are_never_overwritten(lab, tmp_path):
     """Hours of computing would be lost."""
     cell = PeerCell("pendulum", "sac", 0, budget=300)
     point = Point("pendulum", "sac", 0, 1, 300, ended=BUDGET, specification=cell.specification)
@@ -88,7 +88,7 @@ def test_asking_the_peers_command_for_our_method_refers_to_its_result_files(lab)
 
 
 @pytest.mark.slow
-def test_a_peer_run_stores_its_curve_points_and_is_not_repeated(lab, tmp_path):
+def test_a_comparison_run_stores_its_curve_points_and_is_not_repeated(lab, tmp_path):
     asked = ("peers", "--tasks=pendulum", "--methods=ppo", "--seeds=1", "--out=out", "--budget=64")
     said = lab(*asked, "--episodes=1")
     assert said.code == 0

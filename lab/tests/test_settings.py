@@ -22,7 +22,7 @@ KNOWN = [name for name, task in TASKS.items() if is_known(task.environment)]
 
 
 @pytest.mark.parametrize("budget", [2, 8, 14, 20, 21, 60, 100, 200])
-def test_the_closed_loop_of_a_study_stays_within_the_budget(budget):
+def test_the_closed_loop_training_of_a_study_stays_within_the_real_step_budget(budget):
     spent = design_budget(budget) + ROUNDS * queries_a_round(budget)
     assert budget - ROUNDS < spent <= budget
 

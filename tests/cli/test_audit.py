@@ -27,11 +27,11 @@ def view(noise: float, sensor: float = 0.0) -> SurrogateView:
     ],
     ids=["no noise", "confirmed after the training", "the user chose none", "compared along functions"],
 )
-def test_an_audit_session_uses_the_currently_established_noise(settings, noise, expected):
+def test_the_session_of_an_audit_uses_the_process_noise_currently_estimated(settings, noise, expected):
     assert session_of(PolicyCard(settings=settings), view(noise)) == expected
 
 
-def test_an_audit_session_uses_the_established_sensor_noise():
+def test_the_session_of_an_audit_uses_the_estimated_sensor_noise():
     expected = {"process_noise": True, "sensor_noise": {"x": 0.07}}
     assert session_of(PolicyCard(settings={"session": {}}), view(0.1, sensor=0.07)) == expected
 

@@ -175,7 +175,7 @@ def test_the_error_of_train_without_a_model_recommends_a_command(on_server, pend
     assert f"run surrogym sample {pendulum}" in said.err
 
 
-def test_sample_refuses_an_own_environment_class_unless_given_with_env(on_server, name, tmp_path, monkeypatch):
+def test_sample_refuses_a_user_defined_environment_class_unless_given_with_env(on_server, name, tmp_path, monkeypatch):
     """The server's word is never enough to import a module."""
     (tmp_path / "own_line.py").write_text(OWN)
     monkeypatch.syspath_prepend(str(tmp_path))

@@ -79,7 +79,7 @@ def test_invalid_uses_of_the_prior_command_are_refused_and_change_nothing(on_ser
         assert not PriorCalls(api.connection).get(hinge).awaited
 
 
-def test_prior_drop_ends_waiting_for_a_prior(on_server, server_process, hinge):
+def test_the_command_prior_drop_ends_a_designs_waiting_for_a_simulator_prior(on_server, server_process, hinge):
     with Api(server_process.url) as api:
         PriorCalls(api.connection).wait(hinge)
         assert "waits for its prior" in on_server("status", hinge).out

@@ -30,7 +30,7 @@ def test_the_recommended_evaluation_repeats_a_given_server():
     assert said.endswith("; next: surrogym evaluate p.zip --server http://other:8000")
 
 
-def test_the_recommended_evaluation_of_an_own_environment_class_contains_env():
+def test_the_recommended_evaluation_of_a_user_defined_environment_class_contains_env():
     said = words_of_result(replace(RESULT, path=Path("my tank.zip")), env_option=env_option("tank:Tank"))
     assert said.endswith("; next: surrogym evaluate 'my tank.zip' --env tank:Tank")
 

@@ -69,7 +69,7 @@ def test_a_policy_rollout_equals_single_steps_bit_for_bit(port: PolicyPort, open
 
 
 @pytest.mark.parametrize("variant", ["probabilistic", "pathwise"])
-def test_a_policy_rollout_of_other_variants_equals_single_steps(port: PolicyPort, opened: Opened, variant: str):
+def test_policy_rollouts_of_every_session_variant_equal_single_steps(port: PolicyPort, opened: Opened, variant: str):
     noisy = {"process_noise": True, "sensor_noise": {"speed": 0.1}}
     options = {"variant": variant, **noisy} | ({"particles": 9} if variant == "probabilistic" else {})
     whole, single, noise = opened(**options), opened(**options), NoiseKey(0)
@@ -186,7 +186,9 @@ def test_the_imagined_return_is_equal_by_rollouts_and_by_single_steps(port: Poli
     assert ours.penalty_share == pytest.approx(theirs.penalty_share)
 
 
-def test_fastppo_learns_the_same_policy_wherever_it_acts(port: PolicyPort, local_harness, tmp_path: Path):
+def test_fastppo_learns_the_same_policy_by_rollouts_and_by_single_steps(
+    port: PolicyPort, local_harness, tmp_path: Path
+):
     """By rollouts over each transport, and by single steps in process: the same parameters, bit for bit."""
     settings = TrainSettings(
         algorithm="fastppo",

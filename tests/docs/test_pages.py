@@ -107,5 +107,5 @@ def test_rows_of_documentation_tables_have_as_many_cells_as_their_header(page: P
         assert all(line.rstrip().endswith("|") for line in table.splitlines()), table
 
 
-def test_the_documentation_tests_find_pages() -> None:
+def test_the_documentation_tests_find_pages_to_check() -> None:
     assert {"README.md", "docs/architecture.md", "docs/http-api.md", "docs/glossary.md"} <= set(NAMES)

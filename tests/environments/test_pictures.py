@@ -127,7 +127,7 @@ def test_rendering_a_vector_environment_returns_one_picture_per_environment() ->
     assert RemoteVectorEnv(ExactPendulum(), 2).render() is None
 
 
-def test_virtual_states_are_rendered_by_an_own_environment_class(own: None) -> None:
+def test_virtual_states_are_rendered_by_a_user_defined_environment_class(own: None) -> None:
     pictures = Pictures(LINE, "line:Line")
     assert pictures.of(np.array([2.0]))[0, 14].tolist() == [255] * 3  # far = 2 x + 1, so x = 0.5
     assert pictures.frames_per_second == 5

@@ -98,7 +98,7 @@ def test_audit_states_spread_over_the_visited_states_within_the_sampling_range()
     assert 503 not in chosen, "the environment can't be set there"
 
 
-def test_few_visited_states_give_as_many_audit_states():
+def test_with_few_visited_states_an_audit_checks_each_of_them_once():
     q = np.zeros((3, 2))
     assert sorted(places(pendulum(), q, np.zeros((3, 1)), 8, np.random.default_rng(0))) == [0, 1, 2]
     assert len(places(pendulum(), q + 1e3, np.zeros((3, 1)), 8, np.random.default_rng(0))) == 0

@@ -130,7 +130,7 @@ def test_perturb_changes_physical_constants_and_the_quantities_derived_from_them
     assert env.polemass_length == env.masspole * env.length
 
 
-def test_perturbing_an_own_environment_class_is_refused():
+def test_perturbing_a_user_defined_environment_class_is_refused():
     """What its masses and lengths are, nobody here knows; that is no fault of the policy."""
     settings = EvaluationSettings(episodes=1, perturb=0.1)
     with pytest.raises(NotPerturbable):
@@ -141,7 +141,7 @@ def test_perturbing_an_own_environment_class_is_refused():
         )
 
 
-def test_an_own_environment_class_can_be_evaluated():
+def test_a_user_defined_environment_class_can_be_evaluated():
     result = evaluate(
         lambda o: -np.sign(o), partial(open_episode, "a line", None, Line), EvaluationSettings(episodes=3)
     )

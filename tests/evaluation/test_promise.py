@@ -18,7 +18,7 @@ def test_if_returns_vary_only_by_start_the_promised_interval_is_that_of_a_mean()
     assert promise.high - promise.median == pytest.approx(Z * spread, rel=0.1)
 
 
-def test_the_promised_return_interval_has_a_minimum_width_if_drawn_functions_agree():
+def test_the_promised_return_interval_has_a_minimum_width_if_posterior_draws_agree():
     returns = np.repeat(np.random.default_rng(0).normal(-20, 0.5, (400, 1)), 32, axis=1)
     promise = interval(returns, floor=-120.0)
     assert promise.median - promise.low == pytest.approx(UNNOTICED * 100, rel=0.1)
@@ -30,7 +30,7 @@ def test_the_promised_return_interval_stays_within_the_range_of_episode_returns(
     assert (promise.low, promise.median, promise.high) == (500.0, 500.0, 500.0)
 
 
-def test_drawn_functions_that_disagree_widen_the_promised_return_interval():
+def test_posterior_draws_that_disagree_widen_the_promised_return_interval():
     returns = np.tile(np.random.default_rng(0).normal(0, 50, 32), (8, 1))
     promise = interval(returns)
     low, high = np.quantile(returns[0], [0.05, 0.95])

@@ -90,7 +90,7 @@ def test_a_query_that_was_given_up_counts_against_the_budget():
         design.give_up(lost)
 
 
-def test_giving_up_every_adaptive_query_ends_the_design_unsure():
+def test_giving_up_every_adaptive_query_ends_the_design_in_phase_unsure():
     design = surrogym.Design(small())
     real = GymnasiumEnvironment(design.spec)
     while (query := design.ask()) is not None:

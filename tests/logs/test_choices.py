@@ -33,7 +33,7 @@ def asked(log: ReadLog) -> list[str]:
     return [note for note in log.notes if note.startswith("action") and "mapping file (--map)" in note]
 
 
-def test_integer_actions_not_numbered_from_0_are_asked_about():
+def test_a_draft_asks_whether_integer_actions_not_numbered_from_0_are_discrete():
     """{1, 2, 3}, {0, 2, 3} and {-1, 0, 1} were amounts without a word."""
     for seed in DRAWS:
         rng = np.random.default_rng(seed)
@@ -60,7 +60,7 @@ def test_integer_actions_not_numbered_from_0_are_asked_about():
         assert not asked(amounts)
 
 
-def test_several_integer_action_columns_become_discrete_actions_or_are_asked_about():
+def test_several_integer_action_columns_are_drafted_as_discrete_or_raise_a_question():
     for seed in DRAWS:
         rng = np.random.default_rng(seed)
         counts, low = rng.integers(2, 5, 2), int(rng.integers(0, 2))
@@ -77,7 +77,7 @@ def test_several_integer_action_columns_become_discrete_actions_or_are_asked_abo
             assert log.spec.action == MultiDiscreteAction(nvec=tuple(counts.tolist()))
 
 
-def test_one_hot_action_columns_are_asked_about():
+def test_a_draft_asks_whether_one_hot_action_columns_are_discrete():
     for seed in DRAWS:
         rng = np.random.default_rng(seed)
         count = int(rng.integers(2, 6))

@@ -80,7 +80,7 @@ def test_log_headings_with_units_are_recognised_with_their_role(tmp_path: Path, 
 
 
 @pytest.mark.parametrize("role", list(ASKED))
-def test_a_column_name_that_suggests_a_role_is_asked_about(tmp_path: Path, role: str):
+def test_a_log_column_whose_name_only_suggests_a_role_is_refused_with_a_question(tmp_path: Path, role: str):
     """The column became a state, and the reward was declared as 0."""
     shown = {"terminated": [0] * (ROWS - 1) + [1], "episode": [k // 8 for k in range(ROWS)]}
     for name, unit in itertools.product(ASKED[role], ["", " [x]", " (-)"]):

@@ -51,7 +51,7 @@ def drawn() -> Iterator[tuple[np.random.Generator, Plant]]:
         yield rng, Plant.drawn(rng, int(rng.integers(40, 400)))
 
 
-def test_equal_log_rows_without_a_time_column_are_all_steps():
+def test_identical_log_rows_without_a_time_column_are_all_kept_as_steps():
     """Equal rows were dropped as repeats, and their neighbours joined: 29 of 599 steps were left, 21 of them wrong."""
     for _, plant in drawn():
         rows = np.arange(len(plant))
@@ -60,7 +60,7 @@ def test_equal_log_rows_without_a_time_column_are_all_steps():
         assert plant.wrong(steps, rows, rows[-1:]) == 0
 
 
-def test_equal_log_rows_within_episodes_are_all_steps():
+def test_identical_log_rows_within_an_episode_are_all_kept_as_steps():
     for rng, plant in drawn():
         rows, episode = np.arange(len(plant)), np.arange(len(plant)) // int(rng.integers(5, 20))
         steps, last = plant.log(rows, episode=episode), np.flatnonzero(np.diff(episode, append=-1))

@@ -124,7 +124,7 @@ def test_an_rlds_log_without_a_step_is_refused(tmp_path: Path):
 
 
 @pytest.mark.parametrize("name", ["is_last", "is_terminal"])
-def test_a_single_rlds_episode_flag_is_asked_about(tmp_path: Path, name: str):
+def test_an_rlds_log_with_a_single_episode_flag_is_refused_with_a_question(tmp_path: Path, name: str):
     """Whether the row's own step ended, or the one before, can't be known."""
     arrays = {key: cells for key, cells in rlds(episodes()).items() if not key.startswith("is_") or key == name}
     np.savez(tmp_path / "log.npz", **arrays)

@@ -267,7 +267,7 @@ def test_describe_uses_the_observation_if_the_state_is_unreadable(registered: Re
     assert (found.spec.query, found.spec.coordinate_names) == ("rollout", ("o0", "o1"))
 
 
-def test_describe_asks_about_a_reward_that_is_mostly_constant(registered: Register) -> None:
+def test_describe_warns_about_a_reward_that_random_steps_rarely_change(registered: Register) -> None:
     def step(self, action):
         shown, _, *rest = Spiral.step(self, action)
         return shown, float(np.abs(shown).sum() < 0.1), *rest

@@ -115,7 +115,7 @@ def test_logged_start_states_get_lags_of_a_system_at_rest():
     assert with_history(spec, actions=1).starts == ((1.0, 1.0), (2.0, 1.0))
 
 
-def test_lags_of_discrete_actions_are_action_numbers():
+def test_the_lagged_coordinate_of_a_discrete_action_ranges_over_action_numbers():
     spec = EnvironmentSpec.model_validate(SPEC.model_dump() | {"action": DiscreteAction(n=3)})
     assert with_history(spec, actions=1).coordinates[-1].settable == (0.0, 2.0)
 

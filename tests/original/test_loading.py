@@ -97,7 +97,7 @@ def test_the_terminating_step_of_a_described_cart_pole_pays_the_same_each_time()
     machine.close()
 
 
-def test_a_built_in_task_returns_its_observation_only_if_declared_fully():
+def test_a_built_in_task_returns_observations_only_if_every_entry_is_declared():
     spec = original.make("Pendulum-v1").spec()
     fewer = spec.model_copy(update={"observation": spec.observation[:2]})
     at, force = np.array([0.1, 0.2]), np.array([0.5])
@@ -142,7 +142,7 @@ def test_contradicting_design_options_are_refused():
         original.make("CartPole-v1", bins=3)
 
 
-def test_an_own_environment_class_is_loaded_by_module_and_name(own_module):
+def test_a_user_defined_environment_class_is_loaded_by_module_and_name(own_module):
     environment = original.make(f"{own_module}:Cart", budget=12)
     assert environment.spec().design.budget == 12
     assert environment.spec().environment == "a cart"

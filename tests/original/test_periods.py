@@ -59,7 +59,7 @@ def test_specifications_with_different_sampling_periods_do_not_fit() -> None:
     check_policy(declared(0.05), declared(None))
 
 
-def test_the_sampling_period_of_an_own_environment_class_is_checked(
+def test_the_sampling_period_of_a_user_defined_environment_class_is_checked(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     code = """

@@ -205,7 +205,7 @@ def test_the_reports_sentence_about_model_uncertainty_matches_its_maps(modelled:
     assert words in told(modelled, [cut])["Where the model is unsure"]
 
 
-def test_the_report_of_an_own_environment_class_recommends_valid_commands(modelled: Known):
+def test_the_report_of_a_user_defined_environment_class_recommends_valid_commands(modelled: Known):
     spec = modelled.view.spec.model_copy(update={"success": None, "environment": "rail"})
     view = modelled.view.model_copy(update={"spec": spec, "environment": "rail"})
     bare = evaluation(success_rate=None, success_interval=None)

@@ -54,7 +54,7 @@ def asked(api, rail):
     return rail
 
 
-def test_a_rollout_design_is_answered_by_resets_and_actions(api, rail):
+def test_a_sampler_answers_a_rollout_design_by_resets_and_action_sequences(api, rail):
     with IsolatedEnvironment(Rail) as environment:
         report = Sampler(api, rail, environment, SamplerSettings(until_done=True, time_limit=90.0)).run()
     view, samples = api.surrogate(rail), list(api.samples(rail))
@@ -192,7 +192,7 @@ def test_a_rollout_query_of_wrong_kind_or_length_is_refused(api, rail):
         api.add_queries(rail, rollouts=[[LEFT], [[3.0]]])
 
 
-def test_a_rollout_design_refuses_an_environment_that_answers_single_steps(api, rail):
+def test_a_rollout_design_refuses_an_environment_declared_with_settable_states(api, rail):
     from support.moody import Line
 
     with pytest.raises(UnknownEnvironment, match=r"access to resets alone, got .* access to any state"):

@@ -183,7 +183,7 @@ def test_an_interrupted_step_counts_as_unresolved_and_later_queries_are_returned
     assert (view.queries.leased, view.queries.pending) == (0, 5)
 
 
-def test_two_samplers_share_the_queries(api, line):
+def test_two_concurrent_samplers_answer_each_query_once_between_them(api, line):
     settings = [SamplerSettings(name=name, batch=1, until_done=True, time_limit=90.0) for name in ("first", "second")]
     threads = [threading.Thread(target=Sampler(api, line, Line(), s).run) for s in settings]
     for thread in threads:

@@ -85,7 +85,7 @@ def sample(api, rail, folder, told=None, environment=SavedRail, **settings):
     return Sampler(api, rail, environment(), chosen, report).run()
 
 
-def test_a_design_uses_saved_snapshots_after_a_sampler_restart_and_damage(api, rail, tmp_path):
+def test_a_restarted_sampler_uses_its_intact_snapshots_and_reports_lost_ones(api, rail, tmp_path):
     """The first sampler answers the initial queries. Then one of its snapshots is damaged and one is lost."""
     told: list = []
     sample(api, rail, tmp_path, once=True)

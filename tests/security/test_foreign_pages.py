@@ -103,7 +103,7 @@ def changing(openapi: dict[str, Any]) -> list[tuple[str, str]]:
     ]
 
 
-def test_every_changing_route_refuses_requests_from_a_foreign_web_page(server: ServerProcess, foreign_page: Page):
+def test_every_state_changing_route_refuses_requests_from_a_foreign_web_page(server: ServerProcess, foreign_page: Page):
     with httpx.Client(base_url=server.url, timeout=60) as client:
         client.post(PATH, json={"name": "pendulum", "spec": pendulum.spec()}).raise_for_status()
         routes = changing(client.get("/openapi.json").json())
@@ -132,7 +132,7 @@ def sent(url: str, **headers: str) -> int:
     return httpx.post(f"{url}{PATH}", json={}, headers=named, timeout=60).status_code
 
 
-def test_the_servers_own_page_and_programs_can_send_changing_requests(server: ServerProcess):
+def test_the_servers_own_page_and_programs_can_send_state_changing_requests(server: ServerProcess):
     assert sent(server.url) == 422
     assert sent(server.url, origin=server.url, sec_fetch_site="same-origin") == 422
     for foreign in ("http://127.0.0.1:1", "https" + server.url[4:], "null", "http://evil.example"):
@@ -141,7 +141,7 @@ def test_the_servers_own_page_and_programs_can_send_changing_requests(server: Se
         assert sent(server.url, sec_fetch_site=site) == 403
 
 
-def test_behind_a_proxy_only_pages_of_the_public_url_can_send_changing_requests(tmp_path: Path):
+def test_behind_a_proxy_only_pages_of_the_public_url_can_send_state_changing_requests(tmp_path: Path):
     token = "the-token-behind-a-proxy"
     with running_server(tmp_path, "--public-url", "https://Plant.example", SURROGYM_TOKEN=token) as server:
         bearer = {"authorization": f"Bearer {token}"}

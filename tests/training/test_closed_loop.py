@@ -70,7 +70,7 @@ def sampling(url: str, name: str, spec: EnvironmentSpec) -> Iterator[None]:
     [(1e-9, 4, 4 + 2 * 3, 2), (1e3, 4, 4, 1), (1e3, 8, 6, 0)],
     ids=["unsure", "known where it goes", "ready"],
 )
-def test_closed_loop_rounds_end_once_visited_states_are_known_or_the_design_is_ready(
+def test_closed_loop_rounds_end_once_visited_states_are_certain_or_the_design_is_ready(
     own_server: ServerProcess,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -119,7 +119,7 @@ def test_closed_loop_rounds_end_once_visited_states_are_known_or_the_design_is_r
     assert all(isinstance(now, TrainProgress) and now.steps <= now.total_steps for now in seen)
 
 
-def test_a_chosen_session_variant_and_preset_paper_are_kept_in_training(pendulum_server: ServerProcess) -> None:
+def test_training_keeps_a_session_variant_given_by_the_user_or_by_preset_paper(pendulum_server: ServerProcess) -> None:
     with Api(pendulum_server.url) as api:
         view = api.surrogate("pendulum")
     unsure = view.model_copy(update={"phase": "over_budget"})

@@ -282,7 +282,9 @@ def test_training_cycles_continue_while_the_last_one_improved(
     assert result.gaining is gained
 
 
-def test_with_anew_the_saved_policy_is_kept_until_a_new_network_is_comparable(surrogate, tmp_path: Path, monkeypatch):
+def test_with_option_anew_the_saved_policy_is_kept_until_a_new_network_is_comparable(
+    surrogate, tmp_path: Path, monkeypatch
+):
     """With ``anew`` a new network learns beside it. The saved one is trained further only if that one falls short."""
     monkeypatch.setattr(searches, "PATIENT_ROLLOUTS", 2)
     small = {"total_steps": 2_048, "num_envs": 16, "hyperparameters": SMALL, "prolong": False}

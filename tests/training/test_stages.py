@@ -44,7 +44,7 @@ def test_first_stage_training_episodes_are_short_and_half_start_anywhere(limit: 
     [{"start_box": 0.2}, {"session": {"time_limit": 150}}, {"horizon": 20}, {"start_visited": 0.5}],
     ids=["starts", "limit", "horizon", "visited states"],
 )
-def test_chosen_training_starts_and_episode_lengths_are_kept(chosen: dict[str, Any]):
+def test_training_stages_keep_start_and_episode_length_settings_of_the_user(chosen: dict[str, Any]):
     given = task(TrainSettings(**chosen))
     stage = learn(given)
     assert stage.settings == given.settings

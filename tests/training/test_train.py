@@ -283,7 +283,7 @@ def test_a_training_without_given_steps_is_prolonged_except_with_preset_paper():
 
 
 @pytest.mark.parametrize("earned", [40.0, 160.0], ids=["less", "more"])
-def test_with_anew_the_saved_policy_is_kept_if_a_new_network_earns_less(
+def test_with_option_anew_the_saved_policy_is_kept_if_a_new_network_earns_less(
     surrogate, tmp_path: Path, monkeypatch, earned: float
 ):
     """An untrained network earns nothing, the saved policy 100."""

@@ -167,7 +167,7 @@ def test_a_broken_event_stream_continues_after_the_last_event():
     assert [r.headers["Last-Event-ID"] for r in server.received] == ["0", "2", "2", "3"]
 
 
-def test_a_patch_request_contains_only_the_given_fields():
+def test_fields_not_given_in_a_surrogate_change_are_sent_as_null():
     with api_of(problem(Code.FORBIDDEN)) as (api, server):
         with pytest.raises(errors.Forbidden):
             api.patch_surrogate("pendulum", paused=True)

@@ -54,7 +54,7 @@ def test_a_late_reply_never_answers_a_later_request():
         assert connection.send("POST", "/x", b"2") == b"third"
 
 
-def test_a_timeout_and_an_unreachable_server_raise_different_errors():
+def test_a_reply_later_than_its_timeout_raises_request_timeout():
     with (
         scripted_server(reply("late", delay=0.3)) as server,
         Connection(server.url, retries=NEVER) as connection,

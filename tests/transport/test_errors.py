@@ -47,7 +47,7 @@ def test_a_sequence_conflict_error_states_the_expected_number():
     assert error.expected_seq == 7
 
 
-def test_the_documented_tree_of_client_exceptions_is_the_real_one():
+def test_the_documented_tree_of_client_exceptions_matches_the_classes():
     drawn = [word for line in errors.__doc__.splitlines() if (word := line.strip("│├└─ ").split(" ")[0])]
     real = [cls.__name__ for cls in leaves(errors.SurrogymClientError) if cls.__module__ == errors.__name__]
     assert [word for word in drawn if word in real] == real

@@ -71,7 +71,7 @@ def test_a_pickled_client_can_repeat_the_requests_of_the_original():
         assert [seq for seq, _ in sent(server)] == [1, 2, 3, 1, 2, 3]
 
 
-def test_a_session_may_fall_back_again_while_requests_are_repeated():
+def test_a_session_may_fall_back_to_an_earlier_step_again_while_requests_are_repeated():
     script = (step(1), step(2), back_to(2), back_to(1), back_to(1), step(1), step(2), step(3))
     with scripted_server(session_view(replay=10), *script) as server, opened(server) as port:
         for number in range(1, 4):
@@ -104,7 +104,7 @@ def test_a_server_sequence_number_ahead_of_the_client_raises_a_conflict():
                 take(port, 2)
 
 
-def test_a_server_that_always_falls_back_raises_a_conflict():
+def test_a_session_that_always_falls_back_to_an_earlier_step_raises_a_conflict():
     with scripted_server(session_view(replay=10), step(1), back_to(1)) as server, opened(server) as port:
         take(port, 1)
         with pytest.raises(errors.SeqConflict):

@@ -138,7 +138,7 @@ def test_each_round_is_one_episode_and_its_policy_is_not_changed_later():
     np.testing.assert_allclose(policy.actions([2, 3], shown), acted)
 
 
-def test_a_task_without_a_known_cost_is_refused_by_this_peer():
+def test_the_bayesian_network_method_refuses_a_task_without_a_known_cost_function():
     spec = make("MountainCar-v0").spec()
     real = Real(spec, lambda: open_episode("MountainCar-v0", spec, lambda: make("MountainCar-v0")), 0, 9, Clock(600.0))
     with pytest.raises(NotApplicable):

@@ -35,7 +35,7 @@ def test_no_learning_curve_is_drawn_if_a_seed_has_no_result():
     assert curve([*rounds(0, (10, -100.0)), Point("pendulum", "sac", 1, 0, 0, ended="ValueError: no")]) is None
 
 
-def test_the_peer_table_counts_seeds_that_reached_the_target_and_failures():
+def test_the_comparison_table_counts_seeds_that_reached_the_target_and_failures():
     points = [
         *rounds(0, (1_000, -900.0), (2_000, -150.0), ended=REACHED, reached=True),
         *rounds(1, (1_000, -900.0), (5_000, -300.0), ended=TIME),
@@ -48,7 +48,7 @@ def test_the_peer_table_counts_seeds_that_reached_the_target_and_failures():
     assert "| -225.0 |" in line
 
 
-def test_the_peer_table_names_unfinished_cells():
+def test_the_method_comparison_table_names_unfinished_cells():
     points = [Point("pendulum", "sac", 0, 1, 1_000, mean=-900.0)]
     assert "not reached by 1,000; 1 not finished" in table(points)
     assert unfinished([("pendulum", "sac", 0), ("pendulum", "sac", 1)], points) == ["pendulum sac (seeds 0, 1)"]

@@ -57,7 +57,7 @@ class Exact(torch.nn.Module):
         return mean, torch.full_like(mean, -40.0)
 
 
-def test_planned_returns_are_the_models_rewards_until_termination():
+def test_the_return_of_a_plan_sums_the_models_rewards_until_termination():
     spec = make("CartPole-v1").spec()
     settings = Settings(networks=2, particles=4)
     planner = Planner(States(spec), told(spec), Exact(), settings, np.random.default_rng(0))

@@ -53,7 +53,7 @@ def gone(pid: int) -> bool:
     return not stat.exists() or stat.read_text().rpartition(")")[2].split()[0] == "Z"
 
 
-def test_a_dying_peer_process_does_not_affect_the_others(own: Path):
+def test_a_dying_comparison_process_does_not_affect_the_others(own: Path):
     """A cell may take 90 minutes, and a user waits for its first word."""
     dying, cell = PeerCell("peers_own:dies", "ppo", 0), PeerCell("cartpole", "ppo", 0, episodes=1, minutes=-1.0)
     rounds: list[tuple[PeerCell, int]] = []
@@ -67,7 +67,7 @@ def test_a_dying_peer_process_does_not_affect_the_others(own: Path):
     assert rounds == [(cell, 1)]
 
 
-def test_an_error_in_one_peer_run_ends_the_others_and_is_reported(own: Path, capfd: pytest.CaptureFixture[str]):
+def test_an_error_in_one_comparison_run_ends_the_others_and_is_reported(own: Path, capfd: pytest.CaptureFixture[str]):
     def told(cell: PeerCell, points: list[Point]) -> None:
         raise AssertionError(points)
 
@@ -79,7 +79,7 @@ def test_an_error_in_one_peer_run_ends_the_others_and_is_reported(own: Path, cap
     assert "Traceback" not in capfd.readouterr().err
 
 
-def test_a_peer_run_ends_with_its_parent_process(own: Path):
+def test_a_comparison_run_ends_with_its_parent_process(own: Path):
     """It went on for 90 minutes after kill -9, and wrote its file beside that of the next command."""
     code = """
 from pathlib import Path

@@ -19,7 +19,7 @@ def real_of(name, budget=1_000, seconds=60.0):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_peers_recover_the_coordinates_from_observations(name):
+def test_compared_methods_recover_the_coordinates_from_observations(name):
     states = States(make(name).spec())
     q = np.random.default_rng(0).uniform(-1, 1, (5, len(states.angles)))
     np.testing.assert_allclose(states.coordinates(observe(states.spec, q)), q, atol=1e-9)
@@ -27,7 +27,7 @@ def test_peers_recover_the_coordinates_from_observations(name):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_reward_formula_given_to_peers_equals_the_environments_reward(name):
+def test_the_reward_formula_given_to_compared_methods_equals_the_environments_reward(name):
     real, states = real_of(name), States(make(name).spec())
     rng, moment = np.random.default_rng(1), real.reset()
     for _ in range(20):
@@ -38,7 +38,7 @@ def test_the_reward_formula_given_to_peers_equals_the_environments_reward(name):
         moment = real.reset() if after.terminated else after
 
 
-def test_angle_changes_for_peers_take_the_shorter_direction():
+def test_angle_changes_for_compared_methods_take_the_shorter_direction():
     states = States(make("Pendulum-v1").spec())
     change = states.change(np.array([[3.0, 5.0]]), np.array([[-3.0, -5.0]]))
     np.testing.assert_allclose(change, [[2 * np.pi - 6, -10.0]])
@@ -58,7 +58,7 @@ def test_each_real_step_of_a_repeated_control_counts():
     assert real.steps == 14
 
 
-def test_a_peer_run_ends_at_its_step_budget_or_time_limit():
+def test_a_comparison_run_ends_at_its_step_budget_or_time_limit():
     real = real_of("Pendulum-v1", budget=3)
     real.reset()
     for _ in range(3):
@@ -80,7 +80,7 @@ def test_a_controller_with_action_repeat_holds_its_action():
     np.testing.assert_allclose(controller.actions([1], shown[:1]), [[0.2]], rtol=1e-6)
 
 
-def test_a_task_without_a_reward_formula_for_peers_is_refused():
+def test_a_task_without_a_reward_formula_for_compared_methods_is_refused():
     spec = make("MountainCar-v0").spec()
     with pytest.raises(NotApplicable, match="has to know the reward"):
         told(spec)

@@ -40,7 +40,7 @@ def peers(monkeypatch):
         monkeypatch.setitem(METHODS, name, Method(name, peer, budget=100))
 
 
-def test_a_peer_run_ends_with_the_round_that_reaches_the_target(peers, tmp_path):
+def test_a_comparison_run_ends_with_the_round_that_reaches_the_target(peers, tmp_path):
     cell = PeerCell("cartpole", "balancing", 0, episodes=3)
     points = run_cell(cell, tmp_path)
     assert [(p.round, p.real_steps, p.ended) for p in points] == [(1, 5, ""), (2, 10, REACHED)]
@@ -50,7 +50,7 @@ def test_a_peer_run_ends_with_the_round_that_reaches_the_target(peers, tmp_path)
     assert not PeerCell("cartpole", "balancing", 0, episodes=2).done(tmp_path)  # other settings
 
 
-def test_a_peer_run_with_an_empty_result_file_counts_as_not_run(peers, tmp_path):
+def test_a_comparison_run_with_an_empty_result_file_counts_as_not_run(peers, tmp_path):
     """One such file, as a full disk leaves it, blocked every cell of the study."""
     cell = PeerCell("cartpole", "balancing", 0, episodes=3)
     cell.file(tmp_path).parent.mkdir()
@@ -58,7 +58,7 @@ def test_a_peer_run_with_an_empty_result_file_counts_as_not_run(peers, tmp_path)
     assert (cell.points(tmp_path), cell.occupied(tmp_path), cell.done(tmp_path)) == ([], False, False)
 
 
-def test_a_peer_run_with_changed_method_settings_is_repeated(peers, monkeypatch):
+def test_a_comparison_run_with_changed_method_settings_is_repeated(peers, monkeypatch):
     class Tuned(Balancing):
         def __init__(self, gain: float) -> None:
             self.gain = gain
@@ -70,30 +70,30 @@ def test_a_peer_run_with_changed_method_settings_is_repeated(peers, monkeypatch)
     assert found[0] == found[1] != found[2]
 
 
-def test_a_peer_run_ends_at_its_step_budget_even_within_a_round(peers, tmp_path):
+def test_a_comparison_run_ends_at_its_step_budget_even_within_a_round(peers, tmp_path):
     points = run_cell(PeerCell("cartpole", "balancing", 0, budget=7, episodes=1), tmp_path)
     assert [(p.round, p.real_steps, p.ended) for p in points] == [(1, 5, ""), (2, 7, BUDGET)]
     assert points[0].mean == points[1].mean
 
 
-def test_a_peer_run_out_of_time_reports_it(peers, tmp_path):
+def test_a_comparison_run_that_exceeds_its_time_limit_reports_it(peers, tmp_path):
     (point,) = run_cell(PeerCell("cartpole", "balancing", 0, minutes=-1.0), tmp_path)
     assert (point.ended, point.mean) == (TIME, None)
 
 
-def test_a_peer_that_refuses_a_task_stores_its_reason_and_can_be_run_again(peers, tmp_path):
+def test_a_compared_method_that_refuses_a_task_stores_its_reason_and_can_be_run_again(peers, tmp_path):
     cell = PeerCell("cartpole", "refusing", 0)
     (point,) = run_cell(cell, tmp_path)
     assert point.ended == "NotApplicable: not this one"
     assert not cell.done(tmp_path)
 
 
-def test_the_step_budget_of_peers_is_ten_times_ours_and_at_least_1000():
+def test_the_step_budget_of_compared_methods_is_ten_times_that_of_surrogym_and_at_least_1000():
     method = Method("", Balancing)
     assert [method.real_steps(registry.EVERY_TASK[name]) for name in ("pendulum", "doublependulum")] == [1_000, 2_000]
 
 
-def test_a_user_environment_can_be_a_peer_task_without_a_target():
+def test_a_user_environment_can_be_a_task_for_compared_methods_without_a_target():
     assert task_of("cart:Cart").environment == "cart:Cart"
     with pytest.raises(KeyError):
         task_of("nothing")
@@ -101,7 +101,7 @@ def test_a_user_environment_can_be_a_peer_task_without_a_target():
         task_of("dm-pendulum")  # it has no specification of its own
 
 
-def test_rounds_of_model_free_peers_end_at_fixed_step_counts():
+def test_rounds_of_model_free_methods_end_at_fixed_step_counts():
     assert goals(20_000) == [1_000, 2_000, 5_000, 10_000, 20_000]
     assert goals(700) == [700]
 
@@ -131,7 +131,7 @@ def test_a_controller_with_memory_is_reset_between_evaluations(monkeypatch, tmp_
     assert point.ended == REACHED
 
 
-def test_a_peer_run_uses_one_thread_in_every_library():
+def test_a_comparison_run_uses_one_thread_in_every_library():
     """SciPy's own BLAS loads with the methods. Its second thread would wait by spinning, and the wait would count."""
     code = """
 from surrogym_lab.peers import study

@@ -16,7 +16,7 @@ def imagine(client: httpx.Client, name: str, **body: Any) -> httpx.Response:
     return client.post(f"/v1/surrogates/{name}/imagine", json={"coordinates": [0.3, 0.1], "actions": ACTIONS, **body})
 
 
-def test_the_mean_episode_equals_repeated_single_step_predictions(client: httpx.Client, taught: str):
+def test_an_imagined_mean_episode_equals_repeated_single_step_predictions(client: httpx.Client, taught: str):
     reply = wire.Imagined.model_validate_json(imagine(client, taught).raise_for_status().content)
     assert (len(reply.mean.coordinates), len(reply.mean.reward), reply.draws) == (4, 3, [])
     for step, action in enumerate(ACTIONS):

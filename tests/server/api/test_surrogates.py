@@ -82,7 +82,7 @@ def test_the_surrogate_list_can_be_read_in_pages(client: httpx.Client, taught: s
         assert (refused.status_code, refused.json()["code"]) == (422, "invalid_request")
 
 
-def test_improve_adds_queries_and_raises_the_budget_once_per_key(client: httpx.Client, name: str):
+def test_improve_adds_queries_and_raises_the_budget_once_per_idempotency_key(client: httpx.Client, name: str):
     before = pendulum.teach(client, name, budget=5)
     body = {"queries": 2, "idempotency_key": "once"}
     for _ in range(2):

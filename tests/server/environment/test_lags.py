@@ -106,7 +106,7 @@ def test_a_lagged_coordinate_without_a_source_is_refused(lag, message):
         EnvironmentSpec.model_validate(described(lagged=lag))
 
 
-def test_lagged_coordinates_are_refused_where_queries_set_any_state():
+def test_lagged_coordinates_are_refused_for_environments_with_settable_states():
     with pytest.raises(ValidationError, match=r"has no past, .* expected query 'rollout', got 'step'"):
         EnvironmentSpec.model_validate(described(**LAGS) | {"query": "step"})
 

@@ -71,7 +71,7 @@ def test_visited_states_outside_the_sampling_range_are_never_queried(model, poin
     assert torch.equal(none.weights, torch.full_like(none.weights, 1 / len(none.weights)))
 
 
-def test_visited_states_become_candidates_and_reference_points(model, points, unseen, rng):
+def test_visited_states_become_query_candidates_and_reference_points(model, points, unseen, rng):
     visited = unseen.q[:7]
     made = candidates_of(model, Points(*points), visited, rng)
     assert torch.equal(made.points.q[:60], points[0])

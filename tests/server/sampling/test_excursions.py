@@ -89,7 +89,7 @@ def test_a_confident_design_with_snapshots_is_ready_only_after_an_excursion_roll
     assert advance(DEFINITION, answered, state, request(answered)).verdict == "ready"
 
 
-def test_a_confident_design_without_budget_for_an_excursion_rollout_is_not_ready(samples: Samples):
+def test_a_design_that_cannot_afford_its_excursion_rollout_ends_over_budget(samples: Samples):
     decision = advance(DEFINITION, samples, DesignState(), request(samples, len(samples)))
     assert decision.verdict == "over_budget"
     assert not decision.queries

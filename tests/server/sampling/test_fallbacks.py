@@ -32,7 +32,7 @@ def candidates(points) -> Points:
     return Points(*points)
 
 
-def test_a_model_without_leave_one_out_reports_no_such_errors(plain, candidates):
+def test_a_model_without_leave_one_out_predictions_reports_no_such_errors(plain, candidates):
     assert offers(plain, LeaveOneOut) is None
     judged = confidences_of(plain, candidates, stds(plain, candidates.q, candidates.u), TOLERANCES)
     assert {(j.leave_one_out_error, j.leave_one_out_within_one) for j in judged} == {(None, None)}
@@ -69,7 +69,7 @@ def test_for_models_without_variance_forecast_a_batch_of_queries_is_spread_out(p
     assert float(apart[~torch.eye(4, dtype=torch.bool)].min()) > 1
 
 
-def test_for_a_model_without_joint_covariance_path_information_adds_per_step(plain, candidates):
+def test_without_joint_covariance_the_information_of_a_path_is_summed_over_its_steps(plain, candidates):
     steps = PredictedSteps(*(t.reshape(2, 30, -1) for t in (candidates.q, candidates.u, candidates.q)))
     along = path_outlook(plain, steps, 0)
     weight = torch.ones(2, 30, dtype=torch.float64)
@@ -78,11 +78,11 @@ def test_for_a_model_without_joint_covariance_path_information_adds_per_step(pla
     assert as_if_answered(plain, steps) is plain
 
 
-def test_rollouts_are_planned_for_a_model_without_optional_abilities(plain):
+def test_rollouts_can_be_planned_with_a_model_that_has_only_required_methods(plain):
     aim = Aim([0, 1], TOLERANCES, longest=5)
     rollouts = plan_round(plain, aim, 8, [Query.rollout([[0.0]] * 3)], np.random.default_rng(0))
     assert sum(query.steps for query in rollouts) == 8
 
 
-def test_a_model_without_reward_jumps_has_no_uncertain_boundary(plain, candidates):
+def test_a_model_without_reward_jumps_has_no_uncertain_reward_boundary(plain, candidates):
     assert float(edge_in_doubt(plain, candidates.q, candidates.q).max()) == 0

@@ -272,7 +272,7 @@ def test_initial_steps_lost_to_early_termination_are_asked_in_one_round(
     assert sum(ask(pending=pending)) == 4, "two are missing, which is less than a usual round"
 
 
-def test_a_latin_hypercube_rollout_design_asks_its_whole_budget_as_random_rollouts():
+def test_with_acquisition_latin_hypercube_random_rollouts_use_the_whole_budget():
     spec = only_resets(pendulum(), design={"acquisition": "latin_hypercube"})
     assert sum(query.steps for query in initial_queries(definition_from_spec(spec), 30)) == 30
     assert sum(query.steps for query in initial_queries(definition_from_spec(SPEC), 30)) == 12

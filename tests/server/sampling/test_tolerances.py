@@ -28,7 +28,7 @@ def frozen(samples, before=None):
     return frozen_tolerances(DEFINITION, samples, before or DefaultTolerances())
 
 
-def test_a_tolerance_without_rewards_is_recomputed_at_the_first_reward():
+def test_a_reward_tolerance_frozen_without_rewards_is_recomputed_at_the_first_reward():
     first = frozen(NOTHING_MET)
     assert first.values[-1] < 1e-100
     second = frozen(PAID, first)
@@ -66,7 +66,7 @@ def test_the_tolerance_of_increments_of_rounding_size_has_a_lower_limit():
     assert min(tolerance[:2]) == pytest.approx(TOLERANCE * FLOOR / 3**0.5)
 
 
-def test_raw_tolerances_are_one_for_any_samples():
+def test_with_setting_raw_every_tolerance_is_one_for_any_samples():
     raw = definition_from_spec(plane().model_copy(update={"design": Design(tolerance="raw")}))
     first = frozen_tolerances(raw, NOTHING_MET, DefaultTolerances())
     assert frozen_tolerances(raw, PAID, first).values == (1.0, 1.0, 1.0)

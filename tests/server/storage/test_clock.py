@@ -64,7 +64,9 @@ def test_a_live_sampler_keeps_its_lease_although_the_clock_was_set_back(
     assert added.duplicates == 0
 
 
-def test_leases_of_plausible_length_are_not_shortened(storage: Storage, make: Callable[..., str]) -> None:
+def test_the_sweep_of_expired_leases_does_not_shorten_leases_of_plausible_length(
+    storage: Storage, make: Callable[..., str]
+) -> None:
     name = make(queries=1)
     [leased] = storage.queries.claim(name, "alive", 1, LONG)
     for _ in range(5):

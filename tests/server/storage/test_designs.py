@@ -234,7 +234,7 @@ def test_a_fit_is_due_although_some_queries_were_set_aside(
     assert storage.designs.due() == [due]
 
 
-def test_improve_raises_the_budget_and_reaches_the_next_fit_once_per_key(
+def test_improve_raises_the_budget_and_reaches_the_next_fit_once_per_idempotency_key(
     storage: Storage, due: str, design: Callable[..., NewDesign]
 ) -> None:
     storage.surrogates.change(due, budget=4)

@@ -127,7 +127,7 @@ def test_no_fit_is_due_before_a_log_in_parts_is_complete(storage: Storage, make:
     assert storage.designs.due() == [name]
 
 
-def test_sending_a_complete_log_again_makes_no_fit_due(
+def test_sending_a_complete_log_again_triggers_no_new_fit(
     storage: Storage, make: Make, by_hand: Sample, design: Callable[..., NewDesign]
 ) -> None:
     name = make(queries=0)

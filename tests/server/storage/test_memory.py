@@ -15,7 +15,7 @@ from surrogym_server.storage.sql import memory
 from surrogym_server.storage.sql.rows import append_event, hold
 
 
-def test_visited_states_are_stored_by_checkpoint_and_the_latest_is_known(
+def test_visited_states_are_found_by_policy_checkpoint_or_as_the_latest(
     storage: Storage, make: Callable[..., str]
 ) -> None:
     name = make()
@@ -61,7 +61,7 @@ def test_visited_states_are_stored_with_their_design_round(
     assert (found.round, found.states.shape) == (1, (0, 2))
 
 
-def test_saved_sessions_are_returned_once(storage: Storage) -> None:
+def test_saved_sessions_are_deleted_from_storage_when_they_are_taken(storage: Storage) -> None:
     storage.sessions.save([])
     storage.sessions.save([SavedSession("s", "p", b"old"), SavedSession("t", "p", b"\0\xff")])
     storage.sessions.save([SavedSession("s", "p", b"new")])

@@ -147,7 +147,7 @@ def test_a_late_sample_is_stored_once_and_answers_the_pending_query(
     assert storage.ledger.read(name) == LedgerRecord(initial=1), "it is resolved now"
 
 
-def test_a_sample_after_lease_expiry_is_late_even_before_the_sweep(
+def test_a_sample_after_lease_expiry_is_late_even_before_the_lease_is_swept(
     storage: Storage, make: Callable[..., str], answer: Callable[..., NewSample], until: Wait
 ) -> None:
     name = make(queries=1)
@@ -177,7 +177,7 @@ def test_a_late_sample_does_not_end_the_lease_of_the_next_sampler(
     ]
 
 
-def test_the_sweep_leaves_a_query_answered_by_a_late_sample(
+def test_the_sweep_of_expired_leases_does_not_requeue_a_query_answered_late(
     storage: Storage, make: Callable[..., str], answer: Callable[..., NewSample], until: Wait
 ) -> None:
     name = make(queries=1)

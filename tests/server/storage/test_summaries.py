@@ -60,7 +60,7 @@ def judged(confidence_index: float) -> NewModel:
     return NewModel(3, "abc", {"outputs": [], "confidence_index": confidence_index}, {}, 0.5, b"model")
 
 
-def test_a_summary_equals_the_surrogates_own_fields(storage: Storage, worked: list[str]) -> None:
+def test_the_listed_summary_of_a_surrogate_equals_its_full_record(storage: Storage, worked: list[str]) -> None:
     summaries = storage.surrogates.summaries()
     assert [summary.name for summary in summaries] == worked
     for summary in summaries:

@@ -22,7 +22,9 @@ from surrogym_server.storage.sql.tables import metadata, surrogates
 NAME = "pendulum"
 
 
-def test_a_new_surrogate_is_collecting_with_its_initial_queries(storage: Storage, make: Callable[..., str]) -> None:
+def test_a_new_surrogate_is_in_phase_collecting_with_its_initial_queries(
+    storage: Storage, make: Callable[..., str]
+) -> None:
     name = make(queries=3)
     record = storage.surrogates.get(name)
     assert (record.phase, record.paused, record.round, record.error) == ("collecting", False, 0, None)

@@ -112,7 +112,7 @@ def test_a_pathwise_function_does_not_depend_on_the_number_of_environments(model
     np.testing.assert_allclose(few, many[:2], rtol=1e-9)
 
 
-def test_pathwise_functions_stay_the_same_beside_those_of_a_larger_model(model, better, started):
+def test_pathwise_functions_are_unchanged_if_other_environments_use_a_larger_model(model, better, started):
     """A newer model has more points: its lanes' functions are longer, the others' still the same."""
     settings, lanes = started(model, 4, variant="pathwise")
     old, reached = moved(model, settings, lanes, 2.0, -6.0)

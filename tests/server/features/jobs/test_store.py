@@ -84,7 +84,7 @@ def test_a_progress_report_renews_the_lease_of_a_job(jobs: Jobs, make: Make) -> 
     assert jobs.list(name)[0].curve == []
 
 
-def test_a_job_accepts_one_result(jobs: Jobs, make: Make) -> None:
+def test_a_job_accepts_only_its_first_result(jobs: Jobs, make: Make) -> None:
     name = make()
     jobs.add(name, TRAIN)
     job = claimed(jobs, name)

@@ -76,7 +76,7 @@ def test_another_seed_gives_other_ensemble_members(model):
 
 
 @pytest.mark.parametrize("timing", ["before", "after", "auto"])
-def test_an_ensemble_learns_rewards_of_every_timing(timing):
+def test_an_ensemble_learns_rewards_of_the_state_before_or_after_the_step(timing):
     made = ensemble(pendulum().model_copy(update={"reward": Reward(timing=timing)}), samples=40)
     steps = random_steps(pendulum(), 50, seed=9)
     off = made.transition(steps.q, steps.u).reward - steps.reward

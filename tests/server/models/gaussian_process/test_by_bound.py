@@ -153,7 +153,7 @@ def test_reconditioning_a_sparse_process_keeps_the_number_of_inducing_points():
     assert (again.sparse.points, len(again.y)) == (300, 30)
 
 
-def test_the_model_name_sparse_gaussian_process_is_short_for_its_settings():
+def test_the_model_name_sparse_gaussian_process_is_an_alias_for_its_settings():
     chosen = [definition_from_spec(designed(pendulum(), name)).learning.model for name in SHORT_NAMES]
     learners = [learner_of(choice) for choice in chosen]
     assert learners[0] == learners[1] == GaussianProcesses(inducing=300)

@@ -74,7 +74,7 @@ def test_the_selected_history_length_equals_the_dead_time_of_the_environment(def
     assert moved.feature_map.history == dead_steps
 
 
-def test_a_reward_of_the_current_state_selects_history_length_zero(model):
+def test_a_reward_that_depends_only_on_the_current_state_gets_history_length_zero(model):
     assert model.reward.feature_map.history == 0
     assert "history 0" in model.description["outputs"][-1]["inputs"]
 

@@ -200,7 +200,7 @@ def spring() -> EnvironmentSpec:
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_a_structure_chosen_on_a_subset_predicts_as_one_chosen_on_all_samples(
+def test_a_model_structure_chosen_on_a_subset_predicts_as_one_chosen_on_all_samples(
     pendulum_definition, seed, monkeypatch: pytest.MonkeyPatch
 ):
     """The same samples by the whole path, and by structure and first hyperparameters of a third of them."""

@@ -117,7 +117,7 @@ def test_an_angle_that_reads_the_next_speed_follows_the_drawn_speed(pendulum_def
 
 
 @pytest.mark.parametrize("timing", ["before", "after"])
-def test_the_reward_reads_the_state_before_or_after_the_step_by_its_timing(pendulum_model, timing):
+def test_the_reward_is_predicted_from_the_state_before_or_after_the_step_by_its_timing(pendulum_model, timing):
     feature_map = replace(pendulum_model.reward.feature_map, after=timing == "after")
     model = replace(pendulum_model, reward=replace(pendulum_model.reward, feature_map=feature_map))
     q, u = torch.tensor([[0.0, 6.0]], dtype=torch.float64), torch.zeros(1, 1, dtype=torch.float64)

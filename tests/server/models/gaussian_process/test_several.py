@@ -41,7 +41,7 @@ def drawn(draws: FunctionDraws, count: int) -> torch.Tensor:
     return draws.draw(torch.randn(count, draws.path_size, generator=generator, dtype=torch.float64))
 
 
-def test_each_row_steps_by_the_hyperparameter_sample_of_its_drawn_function(model, points):
+def test_each_batch_row_steps_with_the_hyperparameter_sample_drawn_for_it(model, points):
     several = model.uncertain_functions
     assert isinstance(several, FunctionsOfSeveral)
     paths = drawn(several, ROWS)
@@ -56,7 +56,7 @@ def test_each_row_steps_by_the_hyperparameter_sample_of_its_drawn_function(model
             torch.testing.assert_close(getattr(moved, name)[at], getattr(one, name), rtol=1e-9, atol=1e-9)
 
 
-def test_compiled_steps_of_drawn_functions_equal_uncompiled_ones(model, points):
+def test_compiled_steps_of_functions_drawn_from_the_posterior_equal_uncompiled_ones(model, points):
     several = model.uncertain_functions
     assert isinstance(several, CompiledSteps)
     steps = several.compiled()
@@ -95,7 +95,7 @@ def test_a_model_samples_its_hyperparameters_once(model):
     assert len(several.models) == MODELS
 
 
-def test_functions_of_a_log_reward_keep_its_small_noise():
+def test_functions_drawn_from_a_log_reward_model_keep_its_small_noise():
     """A hundred times that noise is several per cent of a reward whose logarithm spreads over hundreds."""
 
     def bump(q: torch.Tensor, _: torch.Tensor) -> torch.Tensor:
