@@ -15,7 +15,8 @@ MOST_THREADS = 4
 
 
 class Prior(SimulatorPrior):
-    """A simulator whose model is learned in this process. Arguments and errors are those of ``SimulatorPrior``.
+    """Prior of a design: a simulator whose model is learned in this process. Arguments and errors are those of
+    ``SimulatorPrior``.
 
     Examples:
         >>> prior = surrogym.Prior("textbook:Arm", spec, ["mass=0.5..2", "length"])

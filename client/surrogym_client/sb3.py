@@ -155,7 +155,7 @@ class SurrogateVecEnv(VecEnv):
             return known[name]
         if name in ("observation_space", "action_space", "metadata"):
             return getattr(self, name)
-        raise AttributeError(f"a lane of a surrogate has no attribute {name!r}")
+        raise AttributeError(f"a lane of a surrogate has no attribute {name!r}: set_attr adds one")
 
 
 def _infos(step: LaneStep) -> list[dict[str, Any]]:

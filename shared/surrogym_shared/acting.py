@@ -174,7 +174,7 @@ class Acted(NamedTuple):
 
 @dataclass(frozen=True)
 class Actor:
-    """Policy in an action space.
+    """A policy together with the action space in which it acts.
 
     Raises:
         ValueError: the policy was made for other observations or another action space.

@@ -104,7 +104,7 @@ def _open_zip(zipped: Path | bytes, limit: int) -> Iterator[zipfile.ZipFile]:
             _require_once(archive.namelist())
             size = sum(entry.file_size for entry in archive.infolist())
             if size > limit:
-                raise ValueError(f"expected at most {limit} bytes after decompression, got {size}")
+                raise ValueError(f"zip file: expected at most {limit} bytes after decompression, got {size}")
             yield archive
     except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, zlib.error) as error:
         raise ValueError(f"expected a zip file, got content that can't be read as one: {error}") from error

@@ -26,8 +26,7 @@ class Sampled(Protocol):
         ...
 
     def sample(self, outputs: Array, further: Array, rng: np.random.Generator) -> tuple[Array, Array]:
-        """Draw actions (B, F) in the form that a policy learns from, and return them with their log probabilities
-        (B,)."""
+        """Draw actions (B, F), not yet clipped to bounds, and return them with their log probabilities (B,)."""
         ...
 
     def sent(self, actions: Array) -> NDArray[Any]:

@@ -125,7 +125,7 @@ class PolicyRequest(Frame, frozen=True, tag="policy", kw_only=True):
 
 
 class Step(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """One step of N lanes."""
+    """Result of one step of N lanes, with arrays as raw bytes."""
 
     observation: memoryview
     reward: memoryview

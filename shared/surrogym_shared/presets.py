@@ -61,7 +61,7 @@ class Preset:
     def budget(self, initial: int, coordinates: int, actions: int, by_steps: bool) -> int:
         """Return the default number of real steps of a design, with the ``initial`` ones.
 
-        The paper needed 125 steps in all after 40 initial steps, and 120 after 50.
+        The paper needed 125 steps in all after 40 initial steps, and 120 after 50. Arguments as in ``initial_steps``.
         """
         if self.name == "paper":
             return 3 * initial

@@ -182,7 +182,7 @@ def test_a_reply_to_another_request_is_refused():
         (np.zeros((3, 1)), None, r"action: expected shape \(2, 1\), got \(3, 1\)"),
         (np.zeros((1, 2)), None, r"action: expected shape \(2, 1\), got \(1, 2\)"),
         (np.array([["left"], ["right"]]), None, r"expected an array of numbers, got dtype <U5"),
-        (ACTION, np.ones(3, dtype=bool), r"mask: expected 2 entries, got shape \(3,\)"),
+        (ACTION, np.ones(3, dtype=bool), r"mask: expected shape \(2,\), got \(3,\)"),
     ],
 )
 def test_invalid_values_are_refused_before_binary_encoding(action, mask, message: str):

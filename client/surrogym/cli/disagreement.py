@@ -167,7 +167,7 @@ def missed(promise: Promise | None, result: Evaluation) -> bool:
 
 @dataclass(frozen=True)
 class Imagining:
-    """What is needed to imagine episodes of the evaluated policy: the policy, its card, token and seed."""
+    """Policy, card, token and seed with which episodes of the evaluated policy are imagined."""
 
     load: Callable[[], Predict]
     card: PolicyCard

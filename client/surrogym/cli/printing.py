@@ -25,7 +25,9 @@ def prints_aside() -> Iterator[None]:
         try:
             yield
         except SystemExit as error:
-            raise CommandError(f"the environment ended the program: {sentence(error)}") from error
+            raise CommandError(
+                f"the environment ended the program: {sentence(error)}; remove sys.exit there"
+            ) from error
 
 
 @contextmanager

@@ -71,7 +71,7 @@ def command(
     with service.connect(context) as api:
         view, version = api.surrogate(surrogate), api.policies.get(surrogate, policy.rpartition("@")[2]).version
         if view.fidelity is None:
-            raise CommandError(f"{surrogate!r} has no model yet: there is nothing to compare the log with")
+            raise CommandError(f"{surrogate!r} has no model yet to compare the log with: let a sampler run first")
         watcher, seen = Watcher(api, view, false_alarm_steps), _Seen()
         with (
             on_interrupt(lambda: f"interrupted; no drift in {watcher.compared} real steps"),

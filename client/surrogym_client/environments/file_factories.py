@@ -34,11 +34,11 @@ def open_file(path: str | Path) -> SurrogatePort:
 
 
 def make_env(*, file: str | Path, **options: Any) -> RemoteEnv:
-    """Make an environment from a file, for ``gymnasium.make("surrogym/File-v0", file=...)``. Raises as
-    ``open_file``."""
+    """Make an environment from a surrogate's file, for ``gymnasium.make("surrogym/File-v0", file=...)``. Raises the
+    errors of ``open_file``."""
     return RemoteEnv(open_file(file), **options)
 
 
 def make_vector_env(*, num_envs: int, file: str | Path, **options: Any) -> RemoteVectorEnv:
-    """Make a vector environment from a file, for ``gymnasium.make_vec``. Raises as ``open_file``."""
+    """Make a vector environment from a file, for ``gymnasium.make_vec``. Raises the errors of ``open_file``."""
     return RemoteVectorEnv(open_file(file), num_envs, **options)

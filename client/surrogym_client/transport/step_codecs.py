@@ -178,7 +178,7 @@ class JsonForm:
     def read_policy(self, content: bytes, shape: Shape) -> tuple[int, PolicyRollout]:
         body = _ROLLOUT.decode(content)
         if not body.steps or body.action is None:
-            raise FrameError("expected steps and the policy's action, got a reply without them")
+            raise FrameError("expected a reply with steps and the policy's actions, got one without them")
         log = None if body.log_probability is None else np.array(body.log_probability, dtype=np.float64)
         steps = [_step_result(step, shape) for step in body.steps]
         return body.seq, PolicyRollout.of(steps, np.array(body.action, dtype=np.float64), log)
@@ -209,7 +209,7 @@ def _rows(what: str, raw: Array, expected: tuple[int, ...]) -> Array:
 
 def _mask(mask: Bools | None, shape: Shape, name: str = "mask") -> Bools | None:
     if mask is not None and np.shape(mask) != (shape.lanes,):
-        raise refused_here(Code.INVALID_REQUEST, f"{name}: expected {shape.lanes} entries, got shape {np.shape(mask)}")
+        raise refused_here(Code.INVALID_REQUEST, f"{name}: expected shape ({shape.lanes},), got {np.shape(mask)}")
     return mask
 
 

@@ -100,7 +100,7 @@ class Stream:
         except InvalidStatus as refusal:
             raise _refused(refusal.response) from refusal
         except (OSError, EOFError, InvalidHandshake) as error:
-            raise StreamUnavailable(str(error) or "no answer to the handshake") from error
+            raise StreamUnavailable(str(error) or "the server did not answer the WebSocket handshake") from error
         return self._socket
 
     def _shake_hands(self, connected: socket.socket) -> None:

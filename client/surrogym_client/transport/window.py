@@ -44,7 +44,7 @@ class Window:
             self._bytes -= len(self._sent.popleft().content)
 
     def since(self, seq: int) -> list[Sent] | None:
-        """Return the requests from ``seq`` on; None if the first of them are no longer kept."""
+        """Return the requests from number ``seq`` on; None if the first of these requests are no longer kept."""
         if not self._sent or self._sent[0].seq > seq:
             return None
         return [sent for sent in self._sent if sent.seq >= seq]

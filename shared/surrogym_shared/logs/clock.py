@@ -28,7 +28,7 @@ GAP = 1.5  # from this number of ticks between two times on, rows are missing be
 
 @dataclass(frozen=True)
 class Episodes:
-    """Episodes of n rows.
+    """Division of the n rows of a log into episodes.
 
     Attributes:
         number: number of each row's episode, (n,).

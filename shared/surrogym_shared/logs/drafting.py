@@ -44,7 +44,7 @@ FAR = 8.0  # distance from the median, in widths of the middle half of the data,
 
 @dataclass(frozen=True)
 class Draft:
-    """A drafted specification, with a note for each conclusion."""
+    """A drafted specification, with notes that say what its parts were concluded from."""
 
     spec: EnvironmentSpec
     notes: tuple[str, ...]

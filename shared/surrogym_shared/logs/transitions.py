@@ -165,9 +165,9 @@ def _interval(rows: Rows, follower: dict[int, int], rejected: dict[int, str]) ->
 def _paired(
     rows: Rows, follower: dict[int, int], rejected: dict[int, str], interval: float | None, ticks: Ticks | None
 ) -> dict[int, int]:
-    """Return, for each row that has a next state, the row that contains it.
+    """Return, for each row that has a next state, the index of the row that contains this next state.
 
-    If the log has columns of next states, this is the row itself, otherwise the row that follows at the usual interval.
+    If the log has columns of next states, it is the row itself, otherwise the row that follows at the usual interval.
     """
     if rows.following is not None:
         return {row: row for row in range(len(rows)) if row not in rejected}

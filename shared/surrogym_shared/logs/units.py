@@ -39,7 +39,7 @@ def require_units(q: Floats, spec: EnvironmentSpec, which: str = "") -> None:
         unit = "is the column in another unit? Convert it, or name another column (--map)"
         far = BEYOND * (high - low)
         if first > high + far or last < low - far or last - first > far:
-            raise UnusableLog(f"{half}, its range is {low:.4g} to {high:.4g}: {unit}")
+            raise UnusableLog(f"{half}, the coordinate's range is {low:.4g} to {high:.4g}: {unit}")
         rounding = SLACK * max(high - low, abs(low), abs(high))
         if first > high + rounding or last < low - rounding:
             raise UnusableLog(

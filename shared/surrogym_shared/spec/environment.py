@@ -157,7 +157,7 @@ class EnvironmentSpec(Frozen):
 
     @property
     def unknown_steps(self) -> int:
-        """Number of an episode's first steps that a model does not learn from, because lags are not known yet."""
+        """Number of an episode's first steps that a model does not learn from, as lags (past values) are unknown."""
         return max(c.counted for c in self.coordinates)
 
     @property
@@ -166,7 +166,7 @@ class EnvironmentSpec(Frozen):
         return PRESETS[self.design.preset]
 
     def known(self, coordinates: Sequence[float]) -> bool:
-        """Whether all lags in a state (C,) are known, so that a model can learn from a step that begins there."""
+        """Whether all lags (past values) in a state (C,) are known, so that a model learns from a step from there."""
         return all(q >= c.counted for c, q in zip(self.coordinates, coordinates, strict=True) if c.counted)
 
     @model_validator(mode="after")

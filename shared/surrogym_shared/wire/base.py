@@ -40,13 +40,13 @@ Matrix = Annotated[list[Vector], Field(min_length=1, max_length=MAX_BATCH)]
 
 
 class Request(FailFast):
-    """Base class of what a client sends. Unknown fields are refused; booleans and strings are not accepted as
+    """Base class of a client's requests. Unknown fields are refused; booleans and strings are not accepted as
     numbers."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
 
 
 class Reply(BaseModel):
-    """Base class of what the server sends."""
+    """Base class of the server's replies."""
 
     model_config = ConfigDict(extra="forbid")

@@ -68,7 +68,7 @@ class ImaginedEpisode(Reply):
 
 
 class Imagined(Reply):
-    """Virtual episodes under the same actions."""
+    """Reply with virtual episodes under the requested actions."""
 
     model_version: int = Field(description="version of the model")
     mean: ImaginedEpisode = Field(description="episode along the mean")

@@ -339,7 +339,7 @@ class PolicyDetail(PolicyView):
 
 
 class PushedPolicy(PolicyView):
-    """Reply to a stored policy."""
+    """Reply after a policy was stored."""
 
     created: bool = Field(
         description="whether this request created the version; false: the server had this file already"

@@ -19,7 +19,7 @@ class Health(Reply):
 
 
 class Ready(Reply):
-    """Whether the server can store data."""
+    """Reply that says whether the server can store data."""
 
     status: Literal["ready", "not_ready"] = Field(
         description="``ready``: the tables exist, and a small write was durable"

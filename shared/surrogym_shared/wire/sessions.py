@@ -394,12 +394,12 @@ class RolloutSession(Request):
     def _actions_or_a_policy(self) -> Self:
         if (self.actions is None) == (self.policy is None):
             got = "neither" if self.actions is None else "both"
-            raise ValueError(f"expected either actions or a policy, got {got}")
+            raise ValueError(f"rollout: expected either actions or a policy, got {got}")
         if (self.policy is None) != (self.steps is None):
             came = "a policy without steps" if self.steps is None else "steps with actions"
-            raise ValueError(f"expected steps together with a policy, and not with actions, got {came}")
+            raise ValueError(f"rollout: expected steps together with a policy, and not with actions, got {came}")
         if self.policy is None and (self.noise or self.until is not None):
-            raise ValueError("expected noise and until only together with a policy, got one of them with actions")
+            raise ValueError("rollout: expected noise and until only together with a policy, got one with actions")
         return self
 
 
