@@ -33,7 +33,7 @@ def command(
     """Draft an environment's specification from random steps.
 
     The draft goes to standard output. Its notes say what the steps showed, and ask for what they can't show. The
-    command prints the number of real steps. surrogym register enters them into the ledger, if it gets this file.
+    command prints the number of real steps. surrogym register reports them to the server, if it gets this file.
 
     Example: surrogym describe Swimmer-v5 > env.json
     """

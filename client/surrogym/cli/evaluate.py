@@ -136,7 +136,7 @@ def command(
 ) -> None:
     """Run real episodes with a policy, and report its returns.
 
-    The real steps count in the surrogate's ledger. The server stores the policy and the episodes; if it does not
+    The real steps are reported to the server. It stores the policy and the episodes; if it does not
     answer, they wait beside the policy until surrogym policy push. If the mean return lies outside the promise's
     interval, the command compares the steps with the model and shows the states at which the two disagree. With
     --learn, the model learns from these steps; with --learn-all, from every step.

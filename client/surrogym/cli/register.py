@@ -130,7 +130,7 @@ def command(
     """Register an original environment under a name.
 
     Samplers and trainers use this name. If the environment has no built-in specification, the command first drafts one
-    as surrogym describe does, which takes real steps. The ledger counts them, also those noted in a described file.
+    as surrogym describe does, which takes real steps. The server counts these steps, and those of surrogym describe.
 
     Example: surrogym register Pendulum-v1 --name pendulum --budget 30
     """

@@ -38,7 +38,7 @@ def command(
 
     The report is one HTML file that needs no other file. Its first part is for decisions: cost, real return with and
     without the policy, intervals, the prediction, what was not tested, and next steps. Its second part is for
-    engineers: fidelity, samples, maps, ledger, structure and hyperparameters, and every model.
+    engineers: fidelity, samples, maps, counts of real steps, structure and hyperparameters, and every model.
 
     Example: surrogym report pendulum --out report.html
     """
