@@ -24,7 +24,7 @@ def test_unknown_tasks_and_variants_are_refused_by_the_efficiency_command(lab, o
     assert words in said.err
 
 
-def test_finished_stages_of_a_study_are_not_run_again(lab, tmp_path):
+def test_finished_runs_of_a_study_are_not_run_again(lab, tmp_path):
     row = Row(**{**vars(ROW), "specification": Cell(StudySettings("pendulum")).specification})
     write_rows(tmp_path / "out" / "rows.csv", [row])
     said = lab("efficiency", "--tasks=pendulum", "--seeds=1", "--out=out", "--json")
@@ -33,7 +33,7 @@ def test_finished_stages_of_a_study_are_not_run_again(lab, tmp_path):
     assert [found["mean"] for found in said.json["rows"]] == [-150.0]
 
 
-def test_the_trust_study_runs_the_unseen_tasks(lab, tmp_path):
+def test_the_trust_command_accepts_the_unseen_tasks(lab, tmp_path):
     made = Cell(StudySettings("kinetics", seed=7, pictures=False))
     row = Row(
         **{**vars(ROW), "task": "kinetics", "seed": 7, "budget": made.key[2], "specification": made.specification}

@@ -68,7 +68,7 @@ def test_study_variants_are_compared_in_pairs_with_an_interval():
     assert text.index("| pendulum | no_loop |") < text.index("| pendulum | latin_hypercube |")
 
 
-def test_the_study_table_describes_variants_without_closed_loop():
+def test_the_study_table_names_what_two_compared_variants_differ_in():
     """A budget of 14 is all the design's, one of 60 leaves queries for three rounds."""
     asked = [*DEFAULT, *[replace(row, arm="no_loop") for row in DEFAULT]]
     assert line(report(asked), "pendulum", "an early stop", "default, no_loop")

@@ -137,7 +137,7 @@ def test_watch_distinguishes_a_log_of_another_machine_from_drift(watch: Watch, t
     assert ["another machine" in one.out for one in said] == [True, False]
 
 
-def test_watch_follow_reads_a_growing_log_until_drift_is_found(
+def test_watch_with_follow_reads_a_growing_log_until_drift_is_found(
     watch: Watch, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ):
     """Lines come in pieces, and a half-written line is no row yet."""
@@ -184,7 +184,9 @@ def test_watch_reads_a_log_from_standard_input(watch: Watch, monkeypatch: pytest
     assert "got none" in said.err
 
 
-def test_watch_follow_refuses_a_log_that_became_shorter(watch: Watch, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+def test_watch_with_follow_refuses_a_log_that_became_shorter(
+    watch: Watch, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+):
     monkeypatch.setattr("surrogym_trainer.watching.logs.LOOK_SECONDS", 0.0)
     log = write(tmp_path / "log.csv", lines(200, seed=7))
     threading.Timer(1.0, lambda: write(log, lines(20, seed=7))).start()

@@ -24,7 +24,7 @@ pytestmark = needs_compiler
 PERIOD, ACTIONS = 0.05, ("action_0", "action_1")
 
 
-def test_a_controller_fmu_gives_the_reference_actions_and_the_fallback_on_faults(tmp_path: Path):
+def test_a_controller_fmu_gives_the_reference_actions_and_the_fallback_action_on_faults(tmp_path: Path):
     history = plant(changes=2, actions=2, largest={"angle": 0.5, "slide": 0.2}, at_start={"angle": 0.3})
     controller = controller_of(network(tmp_path, history, (8,)))
     (path,) = deploy(controller, "fmu", tmp_path / "out")

@@ -83,7 +83,7 @@ def test_a_linear_policy_and_a_network_of_arrays_become_controllers(tmp_path: Pa
         ([600.0, 4.9, 1.9], 0.1, 0),
     ],
 )
-def test_an_invalid_measurement_makes_the_controller_return_its_fallback(tmp_path: Path, read, age, status):
+def test_an_invalid_measurement_makes_the_controller_return_its_fallback_action(tmp_path: Path, read, age, status):
     controller = controller_of(network(tmp_path, plant()), choices=Choices(fallback=(0.5, 1.5)))
     decided = decide(controller, begin(controller), np.array([read]), age)
     assert decided.status == status

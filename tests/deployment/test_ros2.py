@@ -85,7 +85,7 @@ inline void spin(std::shared_ptr<Node>) {
 
 @NEEDS_C
 @pytest.mark.skipif(shutil.which("g++") is None, reason="g++ is not on this machine")
-def test_the_ros2_node_publishes_the_controllers_status_and_fallback(tmp_path: Path):
+def test_the_ros2_node_publishes_the_controllers_status_and_fallback_action(tmp_path: Path):
     for name, content in STUBS.items():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(content)

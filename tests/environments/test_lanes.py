@@ -43,7 +43,7 @@ def test_a_lost_session_truncates_the_episode_and_reset_starts_a_new_one(port: E
     assert LOST not in env.step(ZERO[0])[-1]
 
 
-def test_after_a_lost_session_mode_next_step_returns_the_new_start_one_step_later(port: ExactPendulum):
+def test_after_a_lost_session_autoreset_mode_next_step_returns_the_new_start_one_step_later(port: ExactPendulum):
     envs = vector(port, AutoresetMode.NEXT_STEP)
     last, *_ = envs.step(ZERO)
     port.lose()
@@ -81,7 +81,7 @@ def test_a_lost_session_does_not_end_an_already_ended_episode_again(port: ExactP
     assert not np.array_equal(following[over], start_of_new_session(port)[over])
 
 
-def test_after_a_lost_session_mode_same_step_returns_the_last_observation_as_final(port: ExactPendulum):
+def test_after_a_lost_session_autoreset_mode_same_step_returns_the_last_observation_as_final(port: ExactPendulum):
     envs = vector(port, AutoresetMode.SAME_STEP)
     last, *_ = envs.step(ZERO)
     port.lose()

@@ -80,7 +80,7 @@ def test_no_action_can_drive_the_guarded_cart_beyond_its_declared_limit() -> Non
         assert not past(SPEC, np.array([step.next_coordinates for step in steps])).any()
 
 
-def test_a_step_replaced_by_the_fallback_records_the_action_applied() -> None:
+def test_a_step_replaced_by_the_safety_fallback_records_the_action_applied() -> None:
     guarded = keeping_limits(answering(PatientCart()))
     assert isinstance(guarded, GuardedRollouts)
     steps = pushed(guarded, 30)
@@ -91,7 +91,9 @@ def test_a_step_replaced_by_the_fallback_records_the_action_applied() -> None:
         assert np.asarray(step.action)[0] == pytest.approx(np.clip(-0.5 * x - 1.6 * v, -1, 1))
 
 
-def test_if_no_action_arrives_for_a_period_the_fallback_stops_the_cart(cart: GuardedRollouts, diary: Path) -> None:
+def test_if_no_action_arrives_for_a_period_the_safety_fallback_stops_the_cart(
+    cart: GuardedRollouts, diary: Path
+) -> None:
     pushed(cart, 3)
     until(lambda: len(states(diary)) > 3 and abs(states(diary)[-1, 2]) < 0.1)
     with pytest.raises(StepFailed, match="no action came"):
@@ -100,7 +102,7 @@ def test_if_no_action_arrives_for_a_period_the_fallback_stops_the_cart(cart: Gua
     assert np.asarray(cart.act(RIGHT).action)[0] == 1.0
 
 
-def test_a_simulator_waits_for_actions_instead_of_using_the_fallback(diary: Path) -> None:
+def test_a_simulator_waits_for_actions_instead_of_using_the_safety_fallback(diary: Path) -> None:
     simulator = keeping_limits(answering(PatientCart()))
     assert isinstance(simulator, GuardedRollouts)
     pushed(simulator, 3)
@@ -109,7 +111,9 @@ def test_a_simulator_waits_for_actions_instead_of_using_the_fallback(diary: Path
     simulator.act(RIGHT)
 
 
-def test_the_fallback_stops_the_machine_before_the_environment_closes(cart: GuardedRollouts, diary: Path) -> None:
+def test_the_safety_fallback_stops_the_machine_before_the_environment_closes(
+    cart: GuardedRollouts, diary: Path
+) -> None:
     pushed(cart, 3)
     cart.close()
     lines = diary.read_text().splitlines()
@@ -119,7 +123,7 @@ def test_the_fallback_stops_the_machine_before_the_environment_closes(cart: Guar
 
 
 @pytest.mark.parametrize("ends", ["kill", "term", "close"])
-def test_the_fallback_stops_the_machine_if_the_sampler_ends_or_is_killed(
+def test_the_safety_fallback_stops_the_machine_if_the_sampler_ends_or_is_killed(
     tmp_path: Path, diary: Path, ends: str
 ) -> None:
     program = tmp_path / "program.py"
@@ -166,7 +170,7 @@ def test_setting_a_state_within_the_margin_of_a_limit_is_refused() -> None:
         environment.step_from(np.array([0.95, 0.0]), RIGHT)
 
 
-def test_an_episode_step_reports_if_the_fallback_replaced_its_action() -> None:
+def test_an_episode_step_reports_if_the_safety_fallback_replaced_its_action() -> None:
     episode = open_episode("cart:Cart", None, PatientCart)
     episode.reset(0)
     moments = [episode.step(RIGHT) for _ in range(30)]

@@ -174,14 +174,14 @@ def test_the_report_shows_evaluations_from_other_start_ranges(modelled: Known):
         (-250.0, -260.0, -240.0, "worse"),
     ],
 )
-def test_the_report_calls_returns_different_only_beyond_both_intervals(
+def test_the_report_calls_returns_different_only_beyond_both_confidence_intervals(
     mean: float, low: float, high: float, verdict: str
 ):
     promise = wire.PolicyPromise(median=-151.9, low=-169.8, high=-134.0)
     assert outcome(promise, evaluation(mean=mean, mean_interval=wire.Interval(low=low, high=high))).verdict == verdict
 
 
-def test_the_report_states_no_difference_between_controllers_within_the_interval(modelled: Known):
+def test_the_report_states_no_difference_between_controllers_within_the_confidence_interval(modelled: Known):
     returns = [-140.0, -139.0] * 50
     other = without(episodes=100, returns=returns)
     real = evaluation(returns=[-139.0, -140.0] * 50)

@@ -68,7 +68,7 @@ def test_a_declared_limit_on_an_angle_is_refused_and_on_its_sine_accepted() -> N
     assert spec_with(coordinates=coordinates, limits=Limits(keep=(sine,), fallback=STILL).model_dump()).limits
 
 
-def test_a_discrete_fallback_must_be_a_valid_action_number() -> None:
+def test_a_discrete_safety_fallback_must_be_a_valid_action_number() -> None:
     discrete = DiscreteAction(n=3).model_dump()
     for fallback, accepted in ((Term.constant(1.0), True), (Term.constant(0.5), False), (BRAKE, False)):
         limits = Limits(keep=(limit(),), fallback=(fallback,)).model_dump()
@@ -86,7 +86,7 @@ def test_the_remaining_distance_to_a_limit_is_that_to_the_nearer_bound() -> None
     assert nearest(SPEC, q[1]) == (RAIL, pytest.approx(0.2))
 
 
-def test_the_fallback_acts_within_the_margin_of_a_limit_and_one_step_before() -> None:
+def test_the_safety_fallback_acts_within_the_margin_of_a_limit_and_one_step_before() -> None:
     far, near = np.array([[0.0, 0.0]]), np.array([[0.65, 0.0]])
     assert falls_back(SPEC, near, near).all()
     assert not falls_back(SPEC, far, far).any()
@@ -95,7 +95,7 @@ def test_the_fallback_acts_within_the_margin_of_a_limit_and_one_step_before() ->
     assert not falls_back(SPEC, moving, far).any(), "it moves away"
 
 
-def test_the_fallback_action_is_clipped_to_the_action_bounds() -> None:
+def test_the_safety_fallback_action_is_clipped_to_the_action_bounds() -> None:
     np.testing.assert_allclose(fallback_action(SPEC, np.array([0.1, 0.1])), [-0.21])
     np.testing.assert_allclose(fallback_action(SPEC, np.array([0.0, 3.0])), [-1.0])
 

@@ -10,7 +10,7 @@ from surrogym_shared.logs.text import LONGEST_NAME, MOST_COLUMNS, table_of_text
 from surrogym_shared.logs.writing import spreadsheet_cell
 
 
-def test_one_long_cell_of_a_text_log_does_not_enlarge_its_whole_column() -> None:
+def test_one_long_cell_of_a_text_log_does_not_enlarge_its_column_in_memory() -> None:
     table = table_of_text("x,note\n" + "1,short\n" * 1_000 + f"2,{'long' * 10_000}\n", "the log")
     assert sum(column.nbytes for column in table.columns.values()) == 2 * 8 * len(table)
     assert numbers("x", table.columns["x"])[0].sum() == 1_002

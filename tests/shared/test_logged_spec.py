@@ -27,5 +27,5 @@ def test_a_contradicting_specification_of_a_log_is_refused(changes: dict, says: 
         spec(**changes)
 
 
-def test_a_budget_of_0_takes_any_number_of_initial_queries():
+def test_a_specification_with_budget_0_accepts_any_number_of_initial_queries():
     assert spec(design={"budget": 0, "initial": 5}).design.budget == 0

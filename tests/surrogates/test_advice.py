@@ -124,7 +124,7 @@ def test_the_status_sentence_states_the_range_where_an_output_is_uncertain(low, 
     assert said == f"ready but for r where theta is {words} (confidence 0.98 of 0.999)"
 
 
-def test_with_established_noise_a_larger_error_counts_as_certain() -> None:
+def test_with_detected_noise_a_larger_error_still_counts_as_certain() -> None:
     assert verdict(view(output("x", 1.0, error=0.06, noise=0.05), output("r", 0.9))).startswith("ready but for r")
 
 

@@ -85,7 +85,9 @@ class Audited(AuditedTraining):
     _chosen = TrainSettings()  # type: ignore[assignment]
 
 
-def test_the_policy_of_every_training_after_an_audit_is_a_candidate(port, tmp_path: Path, monkeypatch) -> None:
+def test_the_policy_of_each_training_after_an_audit_is_a_candidate_for_the_result(
+    port, tmp_path: Path, monkeypatch
+) -> None:
     path, later = tmp_path / "policy.zip", iter([b"to the middle", b"slowly to the middle"])
     monkeypatch.setattr(audited, "train", lambda *_: trained(path, next(later), 100))
     training = Audited(None, "line", port, path, TrainSettings())  # type: ignore[arg-type]

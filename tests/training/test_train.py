@@ -320,7 +320,7 @@ def test_a_training_with_an_absurd_number_of_threads_is_refused(threads: Any):
         TrainSettings(threads=threads)
 
 
-def test_the_default_search_loads_neither_torch_nor_stable_baselines():
+def test_the_default_policy_search_imports_neither_torch_nor_stable_baselines3():
     """They take some three seconds of a core to import, at the start of every training."""
     program = """
 import sys

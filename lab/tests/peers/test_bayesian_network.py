@@ -120,7 +120,7 @@ def test_the_bayesian_network_policy_stays_within_its_action_limits():
     assert np.abs(policy.control(np.random.default_rng(0).uniform(-3, 3, (100, 2)))).max() <= 1
 
 
-def test_each_round_is_one_episode_and_its_policy_is_not_changed_later():
+def test_each_bayesian_network_round_is_one_episode_and_leaves_earlier_policies_unchanged():
     spec = make(SWING_UP).spec()
     real = Real(spec, lambda: open_episode(SWING_UP, spec, lambda: make(SWING_UP)), 0, 90, Clock(600.0))
     found = []

@@ -48,7 +48,7 @@ def test_the_comparison_table_counts_seeds_that_reached_the_target_and_failures(
     assert "| -225.0 |" in line
 
 
-def test_the_method_comparison_table_names_unfinished_cells():
+def test_the_comparison_table_names_methods_and_seeds_not_finished():
     points = [Point("pendulum", "sac", 0, 1, 1_000, mean=-900.0)]
     assert "not reached by 1,000; 1 not finished" in table(points)
     assert unfinished([("pendulum", "sac", 0), ("pendulum", "sac", 1)], points) == ["pendulum sac (seeds 0, 1)"]

@@ -58,7 +58,7 @@ def test_planned_rollouts_end_before_a_declared_limit() -> None:
     assert limited.max() < 0.5
 
 
-def test_a_planned_rollout_ends_where_the_fallback_would_act_or_sooner_if_uncertain() -> None:
+def test_a_planned_rollout_ends_where_the_safety_fallback_would_act_or_sooner_if_uncertain() -> None:
     """Four steps lead to 0.36, from where another one would reach the margin, which begins at 0.4."""
     assert allowed_pushes(WALL, 0.0) == 4
     assert allowed_pushes(None, 0.0) == 20

@@ -64,7 +64,7 @@ def test_the_noise_estimate_pools_the_deviations_of_repeated_steps(model: Claims
     assert repeats(model, samples(model, again=0)).degrees == 0
 
 
-def test_noise_is_established_only_after_enough_repeated_steps(model: ClaimsNoise):
+def test_noise_counts_as_detected_only_after_enough_repeated_steps(model: ClaimsNoise):
     assert established_noise(model, samples(model, again=ENOUGH - 1, noise=0.2), TOLERANCES).tolist() == [0, 0, 0]
     assert established_noise(model, samples(model, again=8, noise=0.2), TOLERANCES).tolist() == [0.2, 0, 0]
 
@@ -78,7 +78,7 @@ def repeated(model: ClaimsNoise, noise: float, seed: int) -> tuple[float, int]:
 
 
 @pytest.mark.parametrize("claimed", [0.2, 0.015])
-def test_negligible_noise_is_rarely_established(model: ClaimsNoise, claimed: float):
+def test_negligible_noise_is_rarely_detected(model: ClaimsNoise, claimed: float):
     """The model claims misfit of 20 tolerances as noise, or three times the noise that there is."""
     tests, designs = sum(stage >= ENOUGH for stage in STAGES), 100
     claims = replace(model, noise=(claimed, 0.0, 0.0))
@@ -87,7 +87,7 @@ def test_negligible_noise_is_rarely_established(model: ClaimsNoise, claimed: flo
 
 
 @pytest.mark.parametrize(("noise", "share"), [(0.04, 0.95), (0.02, 0.85)])
-def test_noise_above_the_tolerance_is_established_with_few_repeats(model: ClaimsNoise, noise: float, share: float):
+def test_noise_above_the_tolerance_is_detected_with_few_repeats(model: ClaimsNoise, noise: float, share: float):
     claims = replace(model, noise=(noise, 0.0, 0.0))
     found = [repeated(claims, noise, seed) for seed in range(50)]
     assert sum(established > 0 for established, _ in found) >= share * len(found)
@@ -104,7 +104,7 @@ def test_the_models_noise_estimate_is_capped_by_the_repeated_steps(model: Claims
     assert found == pytest.approx(0.6, rel=0.3)
 
 
-def test_more_repeats_are_asked_only_if_the_first_repeat_differs(model: ClaimsNoise):
+def test_further_repeats_of_a_step_are_queried_only_if_the_first_repeat_differs(model: ClaimsNoise):
     first = to_repeat(model, samples(model, again=0), TOLERANCES)
     assert first is not None
     assert len(first) == 1
@@ -121,7 +121,7 @@ def test_noise_below_the_tolerance_is_not_tested_by_repeats(model: ClaimsNoise):
     assert established_noise(quiet, samples(model, again=9, noise=0.005), TOLERANCES).tolist() == [0, 0, 0]
 
 
-def test_no_repeats_are_asked_for_a_model_that_learns_no_noise(model: ClaimsNoise):
+def test_no_repeated_steps_are_queried_for_a_model_that_learns_no_noise(model: ClaimsNoise):
     plain = exact_pendulum()
     assert to_repeat(plain, samples(model, again=0), TOLERANCES) is None
     assert established_noise(plain, samples(model, again=9, noise=0.2), TOLERANCES).tolist() == [0, 0, 0]

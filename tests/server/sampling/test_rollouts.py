@@ -150,7 +150,7 @@ def test_path_steps_outside_the_sampling_range_or_after_termination_add_no_infor
         torch.testing.assert_close(gain[2:], gain[1].expand(2))
 
 
-def test_path_steps_with_uncertain_states_count_less(model: GaussianProcessModel, aim: Aim):
+def test_steps_of_a_predicted_path_with_uncertain_states_add_less_information(model: GaussianProcessModel, aim: Aim):
     paths = predict_paths(model, start_points(model.definition, 3, rng()), torch.ones(3, 4, 1, dtype=torch.float64))
     known, lost = (replace(paths, drift=torch.full_like(paths.drift, d)) for d in (0.0, 20.0))
     assert bool((path_values(model, aim, lost) < 0.01 * path_values(model, aim, known)).all())
@@ -255,7 +255,7 @@ def test_a_rollout_design_counts_its_budget_in_real_steps(swinging: EnvironmentD
     assert ask(budget=len(begun)) == []
 
 
-def test_initial_steps_lost_to_early_termination_are_asked_in_one_round(
+def test_initial_steps_lost_to_early_termination_are_queried_again_in_one_round(
     swinging: EnvironmentDefinition, begun: Samples
 ):
     """Each round had a quarter of the samples, so that many small rounds followed, each with a fit."""

@@ -461,7 +461,7 @@ def test_improve_uses_the_latest_visited_states_unless_a_checkpoint_is_named(ans
         ("unsure", 0, "unsure"),
     ],
 )
-def test_the_phase_after_a_fit_follows_from_verdict_and_queries(
+def test_the_phase_of_a_surrogate_after_a_fit_follows_from_verdict_and_queries(
     answered: Storage, designer, runner: Runner, verdict: str, queries: int, phase: str
 ):
     fit_all(designer)

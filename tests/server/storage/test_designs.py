@@ -64,7 +64,7 @@ def test_only_one_server_at_a_time_gets_the_fit_lease(storage: Storage, due: str
     assert storage.designs.renew(lease, 2 * LONG).expires > lease.expires
 
 
-def test_the_fit_lease_of_a_dead_server_passes_to_another(
+def test_the_fit_lease_of_a_dead_server_passes_to_another_server(
     storage: Storage, due: str, design: Callable[..., NewDesign], until: Wait
 ) -> None:
     dead = begun(storage, due, SHORT)
@@ -258,7 +258,9 @@ def test_improve_does_not_raise_a_budget_that_is_large_enough(storage: Storage, 
     assert (granted.record.budget, granted.raised) == (30, 0)
 
 
-def test_improve_without_the_right_to_raise_the_budget_gets_only_its_rest(storage: Storage, due: str) -> None:
+def test_improve_without_the_right_to_raise_the_budget_gets_at_most_the_remaining_steps(
+    storage: Storage, due: str
+) -> None:
     """The budget is the owner's: steps taken, queries open or set aside, and what was promised before all count."""
     storage.queries.enqueue(due, steps(np.zeros((2, 2)), np.zeros((2, 1))))
     for _ in range(MAX_ATTEMPTS):

@@ -77,7 +77,7 @@ def test_a_lease_answered_twice_in_one_batch_stores_one_sample(
     assert added.duplicates == 1
 
 
-def test_repeating_samples_with_a_key_is_harmless_and_changed_ones_conflict(
+def test_samples_repeated_under_one_idempotency_key_are_stored_once_and_changed_ones_refused(
     storage: Storage, make: Callable[..., str], by_hand: Callable[..., NewSample]
 ) -> None:
     name = make(queries=0)
@@ -246,7 +246,7 @@ def test_a_page_of_samples_starts_after_the_given_id(
     assert storage.samples.page(name, ids[-1], 3) == []
 
 
-def test_evaluation_steps_are_counted_once_per_key_and_separately_from_samples(
+def test_evaluation_steps_are_counted_once_per_idempotency_key_and_apart_from_samples(
     storage: Storage, make: Callable[..., str]
 ) -> None:
     name = make()

@@ -19,7 +19,7 @@ def at_visited(lanes) -> np.ndarray:
     return np.array([tuple(row) in STATES for row in lanes.q.tolist()])
 
 
-def test_the_share_start_visited_of_episodes_starts_at_sampled_states(pendulum_model: ExactModel, started):
+def test_the_share_of_episodes_given_by_start_visited_starts_at_sampled_states(pendulum_model: ExactModel, started):
     _, lanes = started(pendulum_model, 2_000, start_visited=0.5, visited=VISITED)
     assert at_visited(lanes).mean() == pytest.approx(0.5, abs=0.05)
     assert {tuple(row) for row in lanes.q[at_visited(lanes)].tolist()} == STATES, "each of them"

@@ -118,7 +118,7 @@ def test_a_policy_alias_points_to_one_version_and_is_deleted_with_it(stored: Sto
         stored.policies.put_alias(name, "production", 2)
 
 
-def test_an_evaluation_is_stored_once_per_key_and_the_oldest_is_dropped(
+def test_an_evaluation_is_stored_once_per_idempotency_key_and_the_oldest_is_dropped(
     stored: Stored, make: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     name = make()
