@@ -163,7 +163,7 @@ class EnvironmentDefinition:
     snapshots: bool = False  # whether such a query may begin at a saved state
     starts: tuple[tuple[float, ...], ...] = ()  # states at which episodes start; if empty, by their distributions
     outside_reward: float | None = None  # for each step that an episode misses after it left the sampling range
-    limits: LimitsDefinition | None = None  # limits that the original environment keeps
+    limits: LimitsDefinition | None = None  # limits of the specification, or None
     device: torch.device = CPU  # device of its tensors, and of the states and actions that it is given
 
     def on(self, device: torch.device) -> EnvironmentDefinition:
@@ -306,13 +306,14 @@ class EnvironmentDefinition:
         return self._termination(q).any(-1)
 
     def falls_back(self, q: Tensor, q_next: Tensor) -> Tensor:
-        """Whether the fallback of the limits acts at q_next (..., C), which followed q (..., C): (...) bool."""
+        """Return where the fallback action of the limits would take over after steps from q (..., C) to q_next (..., C),
+        (...) bool; false everywhere without limits."""
         if self.limits is None:
             return torch.zeros(q_next.shape[:-1], dtype=torch.bool, device=q_next.device)
         return self._limits.falls_back(q, q_next)
 
     def room(self, q: Tensor) -> Tensor:
-        """Distance from states q (..., C) to the nearer end of each limit, (..., L); negative beyond it."""
+        """Return the distance of states q (..., C) to the nearer end of each limit, (..., L); negative beyond it."""
         return self._limits.room(q)
 
     @cached

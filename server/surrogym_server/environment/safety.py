@@ -1,4 +1,4 @@
-"""Limits that the original environment keeps, as ``surrogym_shared.limits`` computes them, on tensors."""
+"""Limits within which the original environment has to stay: the rules of ``surrogym_shared.limits``, on tensors."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from surrogym_server.tensors import CPU, to_device
 
 @dataclass(frozen=True)
 class LimitDefinition:
-    """Range [low, high] of a term; within ``margin`` of an end the fallback acts."""
+    """One limit: the range [low, high] of a term. Within ``margin`` of an end, the fallback action takes over."""
 
     term: TermDefinition
     low: float
@@ -24,7 +24,7 @@ class LimitDefinition:
 
 @dataclass(frozen=True)
 class LimitsDefinition:
-    """L limits, and the share of episodes that may leave one."""
+    """L limits, and the share ``probability`` of episodes that may leave one of them."""
 
     keep: tuple[LimitDefinition, ...]
     probability: float
@@ -32,12 +32,12 @@ class LimitsDefinition:
 
 @dataclass(frozen=True)
 class Limits:
-    """L limits, compiled."""
+    """L limits in the form in which they are computed for many states at once."""
 
     terms: TermSet
-    low: Tensor  # (L,)
-    high: Tensor  # (L,)
-    margin: Tensor  # (L,)
+    low: Tensor  # (L,) lower end of each limit
+    high: Tensor  # (L,) upper end of each limit
+    margin: Tensor  # (L,) margin of each limit, in the unit of its term
 
     @classmethod
     def of(cls, declared: LimitsDefinition, coordinates: int, device: torch.device = CPU) -> Limits:
@@ -48,12 +48,12 @@ class Limits:
         return to_device(cls(terms, low, high, margin), device)
 
     def room(self, q: Tensor) -> Tensor:
-        """Distance from states q (..., C) to the nearer end of each limit, (..., L); negative beyond it."""
+        """Return the distance of states q (..., C) to the nearer end of each limit, (..., L); negative beyond it."""
         value = self.terms(q)
         return torch.minimum(value - self.low, self.high - value)
 
     def falls_back(self, q: Tensor, q_next: Tensor) -> Tensor:
-        """Whether the room of a limit is below its margin at q_next (..., C), or would be after one more step with the
-        change from q (..., C) to q_next: (...) bool."""
+        """Return whether the distance to a limit is below its margin at q_next (..., C), or would be after one more step
+        with the same change as from q (..., C) to q_next: (...) bool."""
         now = self.room(q_next)
         return (torch.minimum(now, 2 * now - self.room(q)) < self.margin).any(-1)

@@ -208,10 +208,10 @@ def predict_paths(model: DynamicsModel, starts: Tensor, actions: Tensor) -> Path
 
 
 def _may_leave_limits(definition: EnvironmentDefinition, q: Tensor, q_next: Tensor, variance: Tensor) -> Tensor:
-    """Whether (b,) paths that step from q (b, C) to q_next (b, C) approach a limit: the fallback would act, or the
-    limit may be left with more than the allowed probability.
+    """Return which of b paths, with a step from q (b, C) to q_next (b, C), come too close to a limit, (b,) bool: the
+    fallback action would take over, or they leave the limit with more than the allowed probability.
 
-    ``variance`` (b, M) of the moving coordinates is that accumulated along the path.
+    ``variance`` (b, M) is the predictive variance of the moving coordinates, summed along each path.
     """
     if definition.limits is None or definition.moves_observation:
         return definition.falls_back(q, q_next)

@@ -34,7 +34,7 @@ Ints = NDArray[np.int64]
 MODELS = 64  # number of models whose observation tables are cached
 ANYWHERE = np.zeros((0, 0))  # passed as the ends of the sampling range where these are not needed
 NO_LANES = np.zeros(0, dtype=np.int64)
-NO_FALLBACK = np.zeros(0, dtype=np.bool_)
+NO_FALLBACK = np.zeros(0, dtype=np.bool_)  # passed if there are no limits
 
 
 @dataclass(frozen=True)
@@ -146,7 +146,8 @@ def _rows(moving: Chosen, values: NDArray[Any]) -> NDArray[Any]:
 
 
 def _fallen(definition: EnvironmentDefinition, moving: Chosen, lanes: LaneState, moved: ArrayTransition) -> Bools:
-    """Which moving lanes (K,) come to where the fallback of the limits acts; (0,) if there are no limits."""
+    """Return which moving lanes come to states in which the fallback action of the limits would take over, (K,); (0,)
+    if there are no limits."""
     if definition.limits is None:
         return NO_FALLBACK
     fallen: Bools = definition.falls_back(lanes.take(moving).q, torch.from_numpy(moved.q_next)).numpy()
