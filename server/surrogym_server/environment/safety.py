@@ -53,7 +53,7 @@ class Limits:
         return torch.minimum(value - self.low, self.high - value)
 
     def falls_back(self, q: Tensor, q_next: Tensor) -> Tensor:
-        """Return whether the distance to a limit is below its margin at q_next (..., C), or would be after one more step
-        with the same change as from q (..., C) to q_next: (...) bool."""
+        """Return whether the distance to a limit is below its margin at q_next (..., C), or would be so after one more
+        step with the same change as from q (..., C) to q_next: (...) bool."""
         now = self.room(q_next)
         return (torch.minimum(now, 2 * now - self.room(q)) < self.margin).any(-1)
