@@ -306,7 +306,7 @@ class EnvironmentDefinition:
         return self._termination(q).any(-1)
 
     def falls_back(self, q: Tensor, q_next: Tensor) -> Tensor:
-        """Return after which steps from q (..., C) to q_next (..., C) the fallback action of the limits would take over,
+        """Return after which steps from q (..., C) to q_next (..., C) the fallback action of the limits acts,
         (...) bool; false everywhere without limits."""
         if self.limits is None:
             return torch.zeros(q_next.shape[:-1], dtype=torch.bool, device=q_next.device)
