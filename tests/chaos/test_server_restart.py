@@ -58,7 +58,7 @@ def await_rollout(url: str) -> None:
             assert time.monotonic() < deadline
 
 
-def test_environments_step_on_unchanged_across_a_clean_server_restart(restarting: RestartingServer):
+def test_environments_continue_with_unchanged_steps_across_a_clean_server_restart(restarting: RestartingServer):
     touched, undisturbed = vec_env(restarting), vec_env(restarting)
     expected = [undisturbed.reset(), *(undisturbed.step(action) for action in actions(10))]
     undisturbed.close()

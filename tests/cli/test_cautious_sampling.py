@@ -63,7 +63,7 @@ def test_approval_without_a_terminal_is_refused(on_server: Any, cart: str) -> No
     assert "expected a terminal" in said.err
 
 
-def test_status_shows_how_the_real_steps_kept_each_limit(on_server: Any, cart: str) -> None:
+def test_the_status_command_shows_how_the_real_steps_kept_each_limit(on_server: Any, cart: str) -> None:
     assert "limit rail" not in on_server("status", cart).out
     assert on_server("sample", cart, *CART, "--max-queries", "2").code == 0
     shown = on_server("status", cart).out

@@ -46,7 +46,7 @@ def pendulum(on_server, name):
     return name
 
 
-def test_register_prints_the_next_command(on_server, name):
+def test_the_register_command_prints_the_next_command(on_server, name):
     said = on_server("register", "CartPole-v1", "--name", name)
     assert said.code == 0
     assert said.out == (
@@ -55,7 +55,7 @@ def test_register_prints_the_next_command(on_server, name):
     )
 
 
-def test_register_from_a_file_prints_the_next_command_with_its_environment(on_server, name, tmp_path):
+def test_registering_from_a_file_prints_the_next_command_with_its_environment(on_server, name, tmp_path):
     own = original.make("Pendulum-v1").spec().model_copy(update={"environment": "own_line:Env-v0"})
     (tmp_path / "env.json").write_text(own.model_dump_json())
     said = on_server("register", name, str(tmp_path / "env.json"))
@@ -101,7 +101,7 @@ def test_print_spec_needs_no_server_and_register_accepts_its_output(surrogym, on
     assert registered.json["spec"]["action"]["bins"] == [3]
 
 
-def test_status_lists_all_surrogates_or_shows_one(on_server, pendulum):
+def test_the_status_command_lists_all_surrogates_or_shows_one(on_server, pendulum):
     everything = on_server("status", "--json").json
     assert pendulum in [s["name"] for s in everything["surrogates"]]
     assert f"{pendulum}" in on_server("status").out
@@ -143,7 +143,7 @@ def test_exporting_a_surrogate_without_a_model_is_refused(on_server, pendulum):
     assert "has no model yet" in said.err
 
 
-def test_train_without_a_model_recommends_sampling_or_waiting(on_server, pendulum):
+def test_training_without_a_model_recommends_sampling_or_waiting(on_server, pendulum):
     """It told a person to start a sampler while one was running."""
     missing = f"error: '{pendulum}' has no model yet, its phase is "
     said = on_server("train", pendulum, "--quiet")
@@ -175,7 +175,9 @@ def test_the_error_of_train_without_a_model_recommends_a_command(on_server, pend
     assert f"run surrogym sample {pendulum}" in said.err
 
 
-def test_sample_refuses_a_user_defined_environment_class_unless_given_with_env(on_server, name, tmp_path, monkeypatch):
+def test_the_sample_command_refuses_a_user_defined_environment_class_unless_given_with_env(
+    on_server, name, tmp_path, monkeypatch
+):
     """The server's word is never enough to import a module."""
     (tmp_path / "own_line.py").write_text(OWN)
     monkeypatch.syspath_prepend(str(tmp_path))
@@ -193,7 +195,7 @@ def test_sample_refuses_a_user_defined_environment_class_unless_given_with_env(o
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_sample_train_and_evaluate_work_in_sequence_on_the_command_line(on_server, server_process, pendulum, tmp_path):
+def test_the_commands_sample_train_and_evaluate_work_in_sequence(on_server, server_process, pendulum, tmp_path):
     assert on_server("sample", pendulum, "--until-done", "--time-limit", "300", "--quiet").code == 0
     session = ("--variant", "pathwise", "--trust", "9", "--process-noise", "--start-box", "0.25")
     options = ("--steps", "2000", "--num-envs", "4", "--seed", "3", *session)
@@ -258,7 +260,7 @@ def test_evaluating_a_policy_with_binned_actions_sends_the_decoded_actions(surro
         assert set(diary.read_text().splitlines()) == {"open", "reset 10000", "step -0.5", "close"}
 
 
-def test_evaluate_reports_that_all_episodes_were_equal(surrogym, monkeypatch, tmp_path):
+def test_the_evaluate_command_reports_that_all_episodes_were_equal(surrogym, monkeypatch, tmp_path):
     """A hundred equal episodes of a deterministic plant looked like a hundred that agree."""
     (tmp_path / "policy.zip").write_bytes(stored({}))
     (tmp_path / "policy.json").write_text(PolicyCard().model_dump_json())

@@ -22,7 +22,7 @@ def described(surrogym, tmp_path: Path) -> Path:
     return file
 
 
-def test_describe_prints_the_specification_on_stdout_and_explanations_on_stderr(surrogym) -> None:
+def test_the_describe_command_prints_the_specification_on_stdout_and_explanations_on_stderr(surrogym) -> None:
     said = surrogym("describe", "Swimmer-v5", "--steps", "60")
     assert said.json["specification"]["environment"] == "Swimmer-v5"
     assert f"Swimmer-v5: described by {said.json['real_steps']} real steps and" in said.err
@@ -85,7 +85,9 @@ def test_registering_a_file_without_a_specification_is_refused(surrogym, tmp_pat
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes have no names here")
-def test_register_reads_a_described_environment_from_a_pipe(on_server, described: Path, tmp_path: Path, name) -> None:
+def test_the_register_command_reads_a_described_environment_from_a_pipe(
+    on_server, described: Path, tmp_path: Path, name
+) -> None:
     """The file was read three times: ``surrogym register NAME <(surrogym describe ENV)`` ended in a traceback."""
     pipe = tmp_path / "pipe"
     os.mkfifo(pipe)
@@ -104,7 +106,7 @@ def test_registering_a_too_deeply_nested_file_is_refused(surrogym, tmp_path: Pat
     assert (said.code, "deep.json is not a specification: " in said.err) == (1, True), said.err
 
 
-def test_register_with_two_names_or_two_files_is_refused(surrogym, described: Path) -> None:
+def test_registering_with_two_names_or_two_files_is_refused(surrogym, described: Path) -> None:
     said = surrogym("register", "a", str(described), "--name", "b", "--print-spec")
     assert "expected one name, got 'a' and --name 'b'" in said.err
     said = surrogym("register", "a", str(described), "--spec", str(described), "--print-spec")

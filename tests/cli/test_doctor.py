@@ -38,7 +38,7 @@ def found(said) -> dict[str, dict[str, str | None]]:
     return {finding["name"]: finding for finding in said.json["findings"]}
 
 
-def test_doctor_reports_no_problem_if_everything_is_in_place(on_server):
+def test_the_doctor_command_reports_no_problem_if_everything_is_in_place(on_server):
     said = on_server("doctor", "--env", "Pendulum-v1")
     assert said.code == 0, said.out
     assert set(lines(said)) == EVERYTHING
@@ -49,7 +49,7 @@ def test_doctor_reports_no_problem_if_everything_is_in_place(on_server):
     assert on_server("doctor", "--quiet").out == ""
 
 
-def test_doctor_without_a_server_reports_it_and_recommends_serve(surrogym):
+def test_the_doctor_command_without_a_server_reports_it_and_recommends_serve(surrogym):
     said = surrogym("doctor", "--server", "http://127.0.0.1:9", "--json")
     assert said.code == 1
     assert said.json["problems"] == 1
@@ -57,7 +57,7 @@ def test_doctor_without_a_server_reports_it_and_recommends_serve(surrogym):
     assert "surrogym serve" in found(said)["server"]["way_out"]
 
 
-def test_doctor_reports_a_server_with_another_protocol_version(surrogym):
+def test_the_doctor_command_reports_a_server_with_another_protocol_version(surrogym):
     newer = wire.Health(version="9", protocol=wire.PROTOCOL + 1)
     with scripted_server(reply(newer.model_dump_json())) as server:
         said = surrogym("doctor", "--server", server.url)
@@ -73,7 +73,7 @@ def test_doctor_reports_a_server_with_another_protocol_version(surrogym):
         (reply('{"status": "ready", "storage": "ok"}'), problem(Code.UNAUTHENTICATED), "token", "SURROGYM_TOKEN"),
     ],
 )
-def test_doctor_continues_its_checks_after_a_problem(surrogym, monkeypatch, ready, access, broken, way_out):
+def test_the_doctor_command_continues_its_checks_after_a_problem(surrogym, monkeypatch, ready, access, broken, way_out):
     monkeypatch.setattr("surrogym.cli.options.QUICK", 0.0)
     alive = reply(wire.Health(version="0.1.0").model_dump_json())
     with scripted_server(alive, ready, access, alive) as server:
@@ -83,7 +83,7 @@ def test_doctor_continues_its_checks_after_a_problem(surrogym, monkeypatch, read
     assert way_out in lines(said)[broken][1]
 
 
-def test_doctor_reports_the_role_of_the_token(surrogym):
+def test_the_doctor_command_reports_the_role_of_the_token(surrogym):
     alive = reply(wire.Health(version="0.1.0").model_dump_json())
     access = reply(wire.Access(role="sample", tokens=True).model_dump_json())
     with scripted_server(alive, reply('{"status": "ready", "storage": "ok"}'), access, alive) as server:
@@ -91,7 +91,7 @@ def test_doctor_reports_the_role_of_the_token(surrogym):
     assert lines(said)["token"] == ("ok", "role sample")
 
 
-def test_doctor_reports_an_environment_that_cannot_be_created_or_stepped(on_server, tmp_path):
+def test_the_doctor_command_reports_an_environment_that_cannot_be_created_or_stepped(on_server, tmp_path):
     (tmp_path / "broken.py").write_text(BROKEN)
     said = on_server("doctor", "--env", "broken:Pendulum", "--quiet")
     assert said.code == 1
@@ -101,13 +101,13 @@ def test_doctor_reports_an_environment_that_cannot_be_created_or_stepped(on_serv
     assert "Nowhere-v1 can't be made: Environment `Nowhere` doesn't exist" in lines(missing)["environment"][1]
 
 
-def test_doctor_names_a_missing_optional_dependency(on_server, monkeypatch):
+def test_the_doctor_command_names_a_missing_optional_dependency(on_server, monkeypatch):
     monkeypatch.setitem(EXTRAS, "rare", ("no_such_module",))
     _, _, lacking = lines(on_server("doctor"))["packages"][1].partition("not installed: ")
     assert "surrogym[rare]" in lacking
 
 
-def test_doctor_ends_an_environment_program_that_hangs(surrogym, tmp_path):
+def test_the_doctor_command_ends_an_environment_program_that_hangs(surrogym, tmp_path):
     plant = program(tmp_path, NOTES_ITSELF, HANGS, UNTERMINABLE)
     said = surrogym(
         "doctor", "--server", "http://127.0.0.1:9", "--env", f"exec:{plant}", "--step-limit", "0.5", "--json"
@@ -134,7 +134,7 @@ gymnasium.register("Failing-v0", entry_point=Failing)
 """
 
 
-def test_doctor_reports_an_environment_that_fails_to_describe_itself_once(surrogym, tmp_path, monkeypatch):
+def test_the_doctor_command_reports_a_failure_to_describe_the_environment_only_once(surrogym, tmp_path, monkeypatch):
     (tmp_path / "failing_env.py").write_text(FAILING)
     monkeypatch.syspath_prepend(tmp_path)
     said = surrogym("doctor", "--server", "http://127.0.0.1:9", "--env", "failing_env:Failing-v0", "--json")

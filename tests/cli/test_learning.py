@@ -41,7 +41,7 @@ def diary(tmp_path, monkeypatch):
         yield file
 
 
-def test_evaluate_with_wait_but_without_learn_is_refused():
+def test_evaluating_with_wait_but_without_learn_is_refused():
     """It was ignored, and a person took the model of before for the one that had learned."""
     with pytest.raises(CommandError, match="expected --wait together with --learn"):
         Differences(wait=5.0).check(EvaluationSettings())
@@ -50,7 +50,7 @@ def test_evaluate_with_wait_but_without_learn_is_refused():
 
 
 @pytest.mark.parametrize("option", [("--learn-all",), ("--learn", "3")])
-def test_evaluate_with_learn_refuses_an_unknown_surrogate_before_the_first_real_step(on_server, policy, diary, option):
+def test_evaluating_with_learn_refuses_an_unknown_surrogate_before_any_real_step(on_server, policy, diary, option):
     """All real steps were taken, went nowhere, and the exit status was 0."""
     said = on_server("evaluate", policy, *MACHINE, *option, "--surrogate", "nosuch")
     assert (said.code, "'nosuch'" in said.err) == (1, True), said.err
@@ -58,7 +58,7 @@ def test_evaluate_with_learn_refuses_an_unknown_surrogate_before_the_first_real_
     assert "reset" not in diary.read_text()
 
 
-def test_evaluate_with_learn_reports_an_unreachable_server_before_the_first_real_step(surrogym, policy, diary):
+def test_evaluating_with_learn_reports_an_unreachable_server_before_any_real_step(surrogym, policy, diary):
     """Without --learn-all, it does not stop an evaluation."""
     nowhere = ("--server", "http://127.0.0.1:9")
     said = surrogym("evaluate", policy, *MACHINE, *nowhere, "--learn-all")
@@ -68,14 +68,14 @@ def test_evaluate_with_learn_reports_an_unreachable_server_before_the_first_real
     assert "step" in diary.read_text()
 
 
-def test_evaluate_with_learn_all_without_a_surrogate_is_refused(surrogym, policy, diary, tmp_path):
+def test_evaluating_with_learn_all_without_a_surrogate_is_refused(surrogym, policy, diary, tmp_path):
     (tmp_path / "policy.json").write_text(PolicyCard(spec=Machine.spec(None)).model_dump_json())
     said = surrogym("evaluate", policy, *MACHINE, "--learn-all")
     assert (said.code, "expected --surrogate with --learn-all, got none" in said.err) == (1, True), said.err
     assert "step" not in diary.read_text()
 
 
-def test_evaluate_with_learn_refuses_a_surrogate_of_another_system_before_the_first_real_step(
+def test_evaluating_with_learn_refuses_a_surrogate_of_another_system_before_any_real_step(
     on_server, policy, diary, name
 ):
     """All real steps were taken, and not added: their coordinates were others."""
@@ -85,7 +85,9 @@ def test_evaluate_with_learn_refuses_a_surrogate_of_another_system_before_the_fi
     assert set(diary.read_text().split()) == {"open", "close"}
 
 
-def test_evaluate_with_learn_is_refused_for_a_surrogate_without_a_model(on_server, server_process, policy, diary, name):
+def test_evaluating_with_learn_is_refused_for_a_surrogate_without_a_model(
+    on_server, server_process, policy, diary, name
+):
     """--learn was ignored without a word."""
     with Api(server_process.url) as api:
         api.create_surrogate(name, Machine.spec(None))
@@ -94,7 +96,7 @@ def test_evaluate_with_learn_is_refused_for_a_surrogate_without_a_model(on_serve
     assert "step" not in diary.read_text()
 
 
-def test_evaluate_with_learn_all_adds_every_step_to_a_surrogate_without_a_model(
+def test_evaluating_with_learn_all_adds_every_step_to_a_surrogate_without_a_model(
     on_server, server_process, policy, diary, name
 ):
     """--learn-all was ignored without a word until there was a model to compare with."""

@@ -34,7 +34,7 @@ def line(server_process):
         (("--on-ray", "2", "--runtime-env", "env.yaml"), "--runtime-env: expected names with values in env.yaml"),
     ],
 )
-def test_sample_on_ray_refuses_incompatible_options_in_one_sentence(options, words, on_server, line, tmp_path):
+def test_sampling_on_ray_refuses_incompatible_options_in_one_sentence(options, words, on_server, line, tmp_path):
     (tmp_path / "env.yaml").write_text("- nothing\n")
     said = on_server("sample", line, "--env", "support.moody:Line", *options)
     assert (said.code, said.out) == (1, "")
@@ -42,7 +42,7 @@ def test_sample_on_ray_refuses_incompatible_options_in_one_sentence(options, wor
     assert "Traceback" not in said.err
 
 
-def test_sample_on_ray_without_ray_tells_how_to_install_it(on_server, line, monkeypatch):
+def test_sampling_on_ray_without_ray_tells_how_to_install_it(on_server, line, monkeypatch):
     monkeypatch.setattr("surrogym_client.runtime.ray_cluster.find_spec", lambda _: None)
     said = on_server("sample", line, "--env", "support.moody:Line", "--on-ray", "2")
     assert (said.code, said.out) == (1, "")

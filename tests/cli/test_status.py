@@ -32,7 +32,7 @@ def looks(monkeypatch):
     return press_after
 
 
-def test_status_with_quiet_prints_name_and_phase(on_server, name):
+def test_the_status_command_with_quiet_prints_name_and_phase(on_server, name):
     on_server("register", "Pendulum-v1", "--name", name)
     assert on_server("status", name, "--quiet").out == f"{name} collecting\n"
     assert f"{name} collecting" in on_server("status", "--quiet").out.splitlines()
@@ -47,7 +47,7 @@ def test_the_status_list_shows_used_budget_and_pending_queries(on_server, server
     assert (summary["budget"], summary["target"], summary["queries"]["pending"]) == (8, 0.999, 4)
 
 
-def test_status_of_a_design_with_failed_queries_recommends_resume(on_server, server_process, name):
+def test_the_status_of_a_design_with_failed_queries_recommends_resume(on_server, server_process, name):
     on_server("register", "Pendulum-v1", "--name", name, "--budget", "8", "--initial", "4")
     with Api(server_process.url) as api:
         while api.surrogate(name).phase != "failed":
@@ -62,7 +62,7 @@ def test_status_of_a_design_with_failed_queries_recommends_resume(on_server, ser
     assert "collecting" in on_server("change", name, "--resume").out
 
 
-def test_status_with_watch_prints_only_changes_and_ends_cleanly(on_server, server_process, name, looks):
+def test_the_status_command_with_watch_prints_only_changes_and_ends_cleanly(on_server, server_process, name, looks):
     """Not on a terminal: as lines."""
     on_server("register", "Pendulum-v1", "--name", name)
     looks(5)
@@ -76,7 +76,7 @@ def test_status_with_watch_prints_only_changes_and_ends_cleanly(on_server, serve
     assert on_server("status", name, "--watch", "--quiet").out == f"{name} paused\n"
 
 
-def test_status_with_watch_reports_a_lost_server_and_tries_again(surrogym, looks, monkeypatch):
+def test_the_status_command_with_watch_reports_a_lost_server_and_tries_again(surrogym, looks, monkeypatch):
     monkeypatch.setattr("surrogym.cli.options.QUICK", 0.0)
     looks(3)
     with scripted_server(EMPTY, lost_reply, EMPTY) as server:
@@ -87,12 +87,12 @@ def test_status_with_watch_reports_a_lost_server_and_tries_again(surrogym, looks
     assert found.startswith("no surrogates yet")
 
 
-def test_status_with_watch_of_an_unknown_surrogate_ends_at_once(on_server):
+def test_the_status_command_with_watch_of_an_unknown_surrogate_ends_at_once(on_server):
     said = on_server("status", "nobody", "--watch")
     assert (said.code, said.out) == (1, "")
 
 
-def test_status_shows_how_well_new_samples_were_predicted(on_server, server_process, name):
+def test_the_status_command_shows_how_well_new_samples_were_predicted(on_server, server_process, name):
     with Api(server_process.url) as api:
         teach(api, name, pendulum(), queries=8, initial=5)
     lines = on_server("status", name).out.splitlines()
@@ -106,7 +106,7 @@ def test_status_shows_how_well_new_samples_were_predicted(on_server, server_proc
     assert max(output["prequential"]["predictions"] for output in scored) == seen["ledger"]["adaptive"] > 0
 
 
-def test_status_with_watch_fits_a_narrow_terminal_and_ends_with_ctrl_c(pendulum_server):
+def test_the_status_command_with_watch_fits_a_narrow_terminal_and_ends_with_ctrl_c(pendulum_server):
     with on_terminal("status", "pendulum", "--watch", "--server", pendulum_server.url, width=60) as terminal:
         terminal.await_text("leave-one-out")
         assert terminal.interrupt() == 0

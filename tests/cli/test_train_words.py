@@ -95,7 +95,9 @@ def test_the_command_recommended_after_an_interrupted_training_keeps_its_closed_
 
 
 @pytest.mark.parametrize("sessions", [0, 1, 2])
-def test_train_warns_if_another_session_of_the_surrogate_is_open(sessions: int, monkeypatch, capsys) -> None:
+def test_the_train_command_warns_if_another_session_of_the_surrogate_is_open(
+    sessions: int, monkeypatch, capsys
+) -> None:
     known = {"name": "rig", "model_version": 1, "phase": "ready", "paused": False, "spec": pendulum()}
     view = SimpleNamespace(**known, sessions=sessions)
     monkeypatch.setattr(train, "awaited_surrogate", lambda *_, **__: view)

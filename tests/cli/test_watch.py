@@ -61,7 +61,7 @@ def test_watching_the_log_of_an_unchanged_plant_keeps_the_policy_trusted(
     ],
     ids=["other units", "another period", "no reward", "one row"],
 )
-def test_watch_refuses_an_unusable_log_and_changes_nothing(
+def test_the_watch_command_refuses_an_unusable_log_and_changes_nothing(
     watch: Watch, policy: Callable[[], Any], tmp_path: Path, spoiled: Callable[[list[str]], list[str]], named: list[str]
 ):
     before = policy()
@@ -76,7 +76,7 @@ def test_watch_refuses_an_unusable_log_and_changes_nothing(
     assert list(tmp_path.iterdir()) == [log]
 
 
-def test_watch_reports_and_skips_gaps_and_unordered_rows(watch: Watch, tmp_path: Path):
+def test_the_watch_command_reports_and_skips_gaps_and_unordered_rows(watch: Watch, tmp_path: Path):
     rows = lines(400, seed=4)
     rows[200], rows[300] = rows[300], _with(rows[300], 1, lambda _: float("nan"))
     said = watch(write(tmp_path / "log.csv", [*rows[:100], *rows[110:]]), "--json")
@@ -106,7 +106,7 @@ def test_drift_found_by_watch_makes_the_policy_untrusted_and_is_shown_everywhere
         assert "drift: level is" in text
 
 
-def test_watch_shows_drift_although_the_server_is_unreachable(
+def test_the_watch_command_shows_drift_although_the_server_is_unreachable(
     watch: Watch, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ):
     def gone(*_: object) -> None:
@@ -119,7 +119,7 @@ def test_watch_shows_drift_although_the_server_is_unreachable(
     assert "the server is gone" in said.err
 
 
-def test_watch_rejects_rows_after_a_change_of_unit_instead_of_reporting_drift(
+def test_the_watch_command_rejects_rows_after_a_change_of_unit_instead_of_reporting_drift(
     watch: Watch, policy: Callable[[], Any], tmp_path: Path
 ):
     before, rows = policy(), lines(300, seed=9)
@@ -131,13 +131,13 @@ def test_watch_rejects_rows_after_a_change_of_unit_instead_of_reporting_drift(
     assert policy() == before
 
 
-def test_watch_distinguishes_a_log_of_another_machine_from_drift(watch: Watch, tmp_path: Path):
+def test_the_watch_command_distinguishes_a_log_of_another_machine_from_drift(watch: Watch, tmp_path: Path):
     said = [watch(write(tmp_path / "log.csv", lines(300, seed=5, worn_from=at))) for at in (0, 200)]
     assert [one.code for one in said] == [1, 1]
     assert ["another machine" in one.out for one in said] == [True, False]
 
 
-def test_watch_with_follow_reads_a_growing_log_until_drift_is_found(
+def test_the_watch_command_with_follow_reads_a_growing_log_until_drift_is_found(
     watch: Watch, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ):
     """Lines come in pieces, and a half-written line is no row yet."""
@@ -166,7 +166,9 @@ def test_watch_with_follow_reads_a_growing_log_until_drift_is_found(
     assert followed.json["drift"] == at_once.json["drift"]
 
 
-def test_watch_reads_a_log_from_standard_input(watch: Watch, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+def test_the_watch_command_reads_a_log_from_standard_input(
+    watch: Watch, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+):
     """The last line may lack its end."""
     log = write(tmp_path / "log.csv", lines(300, seed=6, worn_from=150))
     log.write_text(log.read_text(encoding="utf-8").rstrip("\n"), encoding="utf-8")
@@ -184,7 +186,7 @@ def test_watch_reads_a_log_from_standard_input(watch: Watch, monkeypatch: pytest
     assert "got none" in said.err
 
 
-def test_watch_with_follow_refuses_a_log_that_became_shorter(
+def test_the_watch_command_with_follow_refuses_a_log_that_became_shorter(
     watch: Watch, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ):
     monkeypatch.setattr("surrogym_trainer.watching.logs.LOOK_SECONDS", 0.0)
@@ -196,7 +198,9 @@ def test_watch_with_follow_refuses_a_log_that_became_shorter(
 
 
 @pytest.mark.parametrize(("name", "which"), [("nobody", "1"), ("", "staging"), ("", "7")])
-def test_watch_names_an_unknown_surrogate_or_policy(on_server: Watch, tank: str, tmp_path: Path, name: str, which: str):
+def test_the_watch_command_names_an_unknown_surrogate_or_policy(
+    on_server: Watch, tank: str, tmp_path: Path, name: str, which: str
+):
     log = write(tmp_path / "log.csv", lines(50, seed=8))
     said = on_server("watch", name or tank, str(log), "--policy", which)
     assert said.code == 1

@@ -67,7 +67,7 @@ def test_the_dashboard_shows_a_surrogate_without_browser_errors(
     assert complaints == []
 
 
-def test_the_dashboards_content_security_policy_blocks_foreign_content(url: str):
+def test_the_dashboards_content_security_policy_blocks_other_origins_and_inline_code(url: str):
     reply = httpx.get(url)
     policy = reply.headers["content-security-policy"]
     assert "default-src 'none'" in policy

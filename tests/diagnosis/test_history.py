@@ -104,7 +104,7 @@ def test_the_declared_lags_of_a_specification_are_counted():
     assert declared(with_history(SPEC, changes=3, actions=2, largest={"angle": 1.0}, at_start={"angle": 1.0})) == (3, 2)
 
 
-def test_doctor_recommends_the_history_to_declare():
+def test_the_doctor_command_recommends_the_history_to_declare():
     words, way_out = said(Joint)
     assert "depends on 1 earlier changes and 2 earlier actions" in words
     assert "this took 60 real steps" in words
@@ -121,7 +121,7 @@ def test_doctor_recommends_the_history_to_declare():
         (Short, "episodes this short don't tell", "give --history more steps"),
     ],
 )
-def test_doctor_tells_why_no_history_needs_to_be_declared(factory, words, way_out):
+def test_the_doctor_command_tells_why_no_history_needs_to_be_declared(factory, words, way_out):
     found = said(factory)
     assert words in found[0]
     assert found[1] == way_out

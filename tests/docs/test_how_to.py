@@ -104,7 +104,7 @@ def test_the_how_to_program_for_a_design_with_snapshots_runs(tmp_path: Path) -> 
     assert (int(steps) <= 100, phase) == (True, "ready")
 
 
-def test_the_how_to_program_for_an_own_environment_runs(server: ServerProcess, tmp_path: Path) -> None:
+def test_the_how_to_program_for_a_user_defined_environment_runs(server: ServerProcess, tmp_path: Path) -> None:
     (program,) = programs("own-environment.md")
     (tmp_path / "rail.py").write_text(program, encoding="utf-8")
     common = ["--server", server.url, "--json", "--quiet"]

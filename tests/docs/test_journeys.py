@@ -158,7 +158,7 @@ def test_every_documentation_page_with_commands_is_run_by_a_test() -> None:
     assert found == {*PAGES, *ALL_PAGES, *OTHERWISE}
 
 
-def test_the_own_environment_of_the_tutorial_has_less_than_thirty_lines() -> None:
+def test_the_user_defined_environment_of_the_tutorial_has_less_than_thirty_lines() -> None:
     text = (ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8")
     (own,) = [content for kind, content in steps(text) if kind == "file" and content.startswith("cart.py\n")]
     assert len([line for line in own.splitlines()[1:] if line]) < OWN_LINES

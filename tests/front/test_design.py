@@ -249,7 +249,7 @@ def test_an_invalid_improve_request_changes_nothing(steps: Any, visited: Any, sa
     assert (design._extra, design._visited) == before
 
 
-def test_improve_adds_queries_near_visited_states_within_the_budget():
+def test_the_method_improve_adds_queries_near_visited_states_within_the_budget():
     design = surrogym.Design(pendulum(), budget=20)
     before = len(run(design))
     design.improve(2, np.zeros((50, 2)))

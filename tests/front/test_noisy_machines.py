@@ -33,7 +33,7 @@ def noise_of(design: Design) -> list[float]:
     return [output["noise"] / span for output, span in zip(outputs[:-1], spans, strict=True)]
 
 
-def test_a_design_of_a_noise_free_environment_becomes_ready_without_noise():
+def test_a_design_of_a_noise_free_environment_becomes_ready_and_reports_no_noise():
     design = designed("cart", noise=0.0, seed=0, budget=30)
     assert design.phase == "ready"
     assert noise_of(design) == [0, 0]

@@ -97,7 +97,7 @@ def test_comment_lines_in_a_log_are_skipped_and_counted(tmp_path: Path):
         ("state_x,action,reward\n".encode("utf-16")[:-1], "UTF-16 .* the file may be cut off"),
     ],
 )
-def test_a_log_of_a_foreign_format_is_refused_with_the_format_named(tmp_path: Path, content: bytes, says: str):
+def test_a_log_in_an_unsupported_format_is_refused_with_the_format_named(tmp_path: Path, content: bytes, says: str):
     if "HDF5" in says:
         pytest.importorskip("h5py")
     with pytest.raises(UnusableLog, match=says):

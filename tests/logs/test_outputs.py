@@ -95,7 +95,9 @@ def damaged(tmp_path: Path) -> Path:
     return reactor.log(runs=3, length=20).at(4, "temperature", "nan").write(tmp_path / "log.csv")
 
 
-def test_rejected_log_rows_never_replace_a_foreign_file(damaged: Path, capsys: pytest.CaptureFixture[str]):
+def test_the_file_of_rejected_log_rows_never_replaces_an_unrelated_file(
+    damaged: Path, capsys: pytest.CaptureFixture[str]
+):
     """The default name was taken from the log's, so nobody had named the file that was lost."""
     other = damaged.with_name("log.rejected.csv")
     other.write_text(FOREIGN)
@@ -111,14 +113,14 @@ def test_rejected_log_rows_never_replace_a_foreign_file(damaged: Path, capsys: p
     assert keep_rejected(damaged, log) == other, "and is one of rejected rows then"
 
 
-def test_a_foreign_file_with_the_rejected_rows_name_does_not_hinder_a_valid_log(folder: Path):
+def test_an_unrelated_file_with_the_rejected_rows_name_does_not_hinder_a_valid_log(folder: Path):
     other = folder / "log.rejected.csv"
     other.write_text(FOREIGN)
     assert import_log(folder / "log.csv").rejected_file is None
     assert other.read_text() == FOREIGN
 
 
-def test_a_log_without_usable_rows_beside_a_foreign_file_reports_both(damaged: Path):
+def test_a_log_without_usable_rows_beside_an_unrelated_file_reports_both_problems(damaged: Path):
     lines = damaged.read_text().splitlines()
     damaged.write_text("\n".join([lines[0], lines[5]]))
     damaged.with_name("log.rejected.csv").write_text(FOREIGN)

@@ -63,7 +63,7 @@ def test_a_design_can_sample_a_described_environment() -> None:
 
 
 @installed("mujoco")
-def test_describe_drops_the_swimmers_position_and_finds_its_angle() -> None:
+def test_the_function_describe_drops_the_swimmers_position_and_finds_its_angle() -> None:
     found = describe("Swimmer-v5", STEPS)
     assert "slider1" not in kinds(found)
     assert kinds(found)["free_body_rot"] == "angle"
@@ -72,7 +72,7 @@ def test_describe_drops_the_swimmers_position_and_finds_its_angle() -> None:
 
 
 @installed("mujoco")
-def test_describe_keeps_the_cheetahs_height_and_drops_its_position() -> None:
+def test_the_function_describe_keeps_the_cheetahs_height_and_drops_its_position() -> None:
     found = kinds(describe("HalfCheetah-v5", STEPS))
     assert "rootx" not in found
     assert found["rootz"] == "linear"
@@ -108,7 +108,7 @@ def test_describing_an_environment_that_terminates_declares_a_learned_terminatio
     assert any(line.startswith("termination:") for line in found.asked)
 
 
-def test_describe_finds_angles_and_observes_them_by_cosine_and_sine() -> None:
+def test_the_function_describe_finds_angles_and_observes_them_by_cosine_and_sine() -> None:
     """Both tasks show single precision, whose rounding errors are no part of a term."""
     found = describe("Acrobot-v1", STEPS)
     assert kinds(found) == {"state0": "angle", "state1": "angle", "state2": "linear", "state3": "linear"}
@@ -138,7 +138,9 @@ class Wheel(gymnasium.Env):
         return np.array([place, np.cos(angle), np.sin(angle), speed])
 
 
-def test_describe_does_not_take_an_irrelevant_position_for_an_angle(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_function_describe_does_not_take_an_irrelevant_position_for_an_angle(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setitem(gymnasium.registry, "Wheel-v0", gymnasium.envs.registration.EnvSpec("Wheel-v0", Wheel))
     assert kinds(describe("Wheel-v0", STEPS)) == {"state0": "linear", "state1": "angle", "state2": "linear"}
     assert set(kinds(describe("CartPole-v1", STEPS)).values()) == {"linear"}
@@ -167,7 +169,7 @@ class Remembering(Wheel):
         return np.array([*self.state, 0.0])
 
 
-def test_describe_does_not_take_a_memoryless_variable_for_an_angle(listed) -> None:
+def test_the_function_describe_does_not_take_a_memoryless_variable_for_an_angle(listed) -> None:
     """Without whole turns, its next value is the same after any shift."""
     assert set(kinds(describe(listed(Remembering), STEPS)).values()) == {"linear"}
 
@@ -233,7 +235,7 @@ def test_a_read_only_or_nested_state_attribute_is_not_used_as_state() -> None:
 
 
 @installed("pcgym")
-def test_describe_declares_a_setpoint_as_constant_over_its_whole_range() -> None:
+def test_the_function_describe_declares_a_setpoint_as_constant_over_its_whole_range() -> None:
     spec = describe("pcgym:cstr", STEPS).spec
     setpoint = spec.coordinates[2]
     assert (setpoint.name, setpoint.kind, limits(setpoint.sampling)) == ("Ca_setpoint", "constant", (0.8, 0.9))
@@ -246,7 +248,7 @@ def test_described_start_setpoints_are_those_of_the_schedule() -> None:
     assert any(line.startswith("start of Ca_setpoint: a schedule sets it") for line in found.asked)
 
 
-def test_describe_counts_every_real_step(registered: Register) -> None:
+def test_the_function_describe_counts_every_real_step(registered: Register) -> None:
     name = registered("Spiral-v0")
     taken: list[int] = []
     made = gymnasium.registry[name].entry_point()
@@ -256,18 +258,18 @@ def test_describe_counts_every_real_step(registered: Register) -> None:
     assert describe(name, 50).steps == len(taken) > 50
 
 
-def test_describe_declares_an_environment_with_hidden_memory_reset_only(registered: Register) -> None:
+def test_the_function_describe_declares_an_environment_with_hidden_memory_reset_only(registered: Register) -> None:
     found = describe(registered("Worn-v0", wear=0.01), 60)
     assert found.spec.query == "rollout"
     assert any("has memory that can't be set" in line for line in found.found)
 
 
-def test_describe_uses_the_observation_if_the_state_is_unreadable(registered: Register) -> None:
+def test_the_function_describe_uses_the_observation_if_the_state_is_unreadable(registered: Register) -> None:
     found = describe(registered("Hidden-v0", attribute="_hidden"), 60)
     assert (found.spec.query, found.spec.coordinate_names) == ("rollout", ("o0", "o1"))
 
 
-def test_describe_warns_about_a_reward_that_random_steps_rarely_change(registered: Register) -> None:
+def test_the_function_describe_warns_about_a_reward_that_random_steps_rarely_change(registered: Register) -> None:
     def step(self, action):
         shown, _, *rest = Spiral.step(self, action)
         return shown, float(np.abs(shown).sum() < 0.1), *rest
@@ -285,7 +287,7 @@ def test_the_description_file_contains_findings_and_specification(registered: Re
     assert EnvironmentSpec.model_validate_json(json.dumps(read["specification"])) == found.spec
 
 
-def test_describe_replaces_a_too_long_observation_by_the_coordinates(registered: Register) -> None:
+def test_the_function_describe_replaces_a_too_long_observation_by_the_coordinates(registered: Register) -> None:
     """It was refused after all real steps: a specification has at most 64 entries."""
     weights = np.random.default_rng(0).normal(size=(200, 2))
     space = {"_get_obs": lambda self: weights @ self.state}
@@ -317,14 +319,14 @@ class Counting(gymnasium.Env):
 
 
 @pytest.mark.parametrize("terminates", [True, False])
-def test_describe_takes_a_common_episode_length_as_time_limit(listed, terminates: bool) -> None:
+def test_the_function_describe_takes_a_common_episode_length_as_time_limit(listed, terminates: bool) -> None:
     found = describe(listed(partial(Counting, 20, terminates)), STEPS)
     assert found.spec.time_limit == 20
     assert found.spec.termination == ()
     assert any("exactly 20 steps" in line for line in found.asked)
 
 
-def test_describe_finds_no_time_limit_in_episodes_of_different_lengths(listed) -> None:
+def test_the_function_describe_finds_no_time_limit_in_episodes_of_different_lengths(listed) -> None:
     found = describe(listed(partial(Counting, None, True)), STEPS)
     assert found.spec.time_limit == 200
     assert found.spec.termination == "learned"

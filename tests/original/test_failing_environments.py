@@ -109,14 +109,14 @@ def test_a_failure_between_steps_of_describe_reports_the_real_steps(registered: 
     assert int(str(failed.value).split()[3]) > STEPS
 
 
-def test_describe_returns_its_result_although_the_environment_fails_to_close(registered: Register) -> None:
+def test_the_function_describe_returns_its_result_although_the_environment_fails_to_close(registered: Register) -> None:
     """Its real steps were taken, and nobody could use them."""
     found = describe(registered("Fails-v0", space={"close": lambda _: sys.exit(4)}), STEPS)
     assert found.found[-1].startswith("Fails-v0 could not be closed: SystemExit: 4 (test_failing")
     assert found.steps >= STEPS
 
 
-def test_describe_refuses_nan_start_states_before_any_real_step(registered: Register) -> None:
+def test_the_function_describe_refuses_nan_start_states_before_any_real_step(registered: Register) -> None:
     """Nor do they raise a warning of NumPy, which is an error here."""
     resets = iter(range(1_000))
 
@@ -151,12 +151,12 @@ def test_a_reward_array_of_one_entry_is_accepted(registered: Register) -> None:
 
 
 @pytest.mark.parametrize("reward", [float("inf"), float("nan")])
-def test_describe_refuses_rewards_that_are_not_finite_numbers(registered: Register, reward: float) -> None:
+def test_the_function_describe_refuses_rewards_that_are_not_finite_numbers(registered: Register, reward: float) -> None:
     with pytest.raises(UnknownEnvironment, match="Fails-v0 paid infinite rewards or NaN"):
         describe(registered("Fails-v0", space={"step": paying(reward)}), STEPS)
 
 
-def test_describe_leaves_out_a_variable_that_moves_only_by_rounding(registered: Register) -> None:
+def test_the_function_describe_leaves_out_a_variable_that_moves_only_by_rounding(registered: Register) -> None:
     def reset(self, *, seed=None, options=None):
         Spiral.reset(self, seed=seed)
         self.state[1] = 300.0
@@ -186,14 +186,16 @@ def test_the_error_for_a_name_that_cannot_be_described_lists_the_valid_forms(nam
 
 
 @pytest.mark.parametrize("space", [Box(1, 1, (1,)), Box(-1e30, 1e30, (1,), np.float64), Discrete(1)])
-def test_describe_refuses_unsupported_action_spaces_in_one_line(registered: Register, space: Space) -> None:
+def test_the_function_describe_refuses_unsupported_action_spaces_in_one_line(
+    registered: Register, space: Space
+) -> None:
     with pytest.raises(UnknownEnvironment, match=r"\AFails-v0 can't be specified: .+\Z") as refused:
         open_simulator(registered("Fails-v0", space={"action_space": space}))
     assert "\n" not in str(refused.value)
 
 
 @pytest.mark.parametrize("size", [0, 65, 500])
-def test_describe_refuses_an_action_with_none_or_too_many_entries_with_a_remedy(
+def test_the_function_describe_refuses_an_action_with_none_or_too_many_entries_with_a_remedy(
     registered: Register, size: int
 ) -> None:
     """The words were Python's: Tuple should have at least 1 item after validation, not 0."""
@@ -226,7 +228,7 @@ def sized(size):
         (5_000, "Fails-v0 has 5000 variables that move: expected at most 64"),
     ],
 )
-def test_describe_refuses_an_empty_or_too_large_state_before_any_real_step(
+def test_the_function_describe_refuses_an_empty_or_too_large_state_before_any_real_step(
     registered: Register, size: int, message: str
 ) -> None:
     """An empty one was refused in words of Python, and a large one after 400 real steps."""

@@ -81,7 +81,7 @@ def test_the_sampling_period_of_a_user_defined_environment_class_is_checked(
         original.make("fast_plant:Fast")
 
 
-def test_describe_declares_the_sampling_period_of_the_environment() -> None:
+def test_the_function_describe_declares_the_sampling_period_of_the_environment() -> None:
     assert describe("Pendulum-v1", 40).spec.sampling_period == 0.05
 
 

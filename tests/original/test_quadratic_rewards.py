@@ -99,7 +99,7 @@ def test_a_few_deviating_rewards_do_not_yet_exclude_a_quadratic_form():
     assert quadratic_reward(spec(), paid, paid) is None, "but every step of the decision counts"
 
 
-def test_describe_declares_the_quadratic_reward_of_an_environment(registered: Register):
+def test_the_function_describe_declares_the_quadratic_reward_of_an_environment(registered: Register):
     found = describe(registered("Spiral-v0"), steps=60)
     assert isinstance(found.spec.reward, DeclaredReward)
     assert any("quadratic" in line for line in found.found)
@@ -107,7 +107,7 @@ def test_describe_declares_the_quadratic_reward_of_an_environment(registered: Re
     assert found.steps > 60, "the steps of the check are counted"
 
 
-def test_describe_leaves_a_non_quadratic_reward_to_be_learned(registered: Register):
+def test_the_function_describe_leaves_a_non_quadratic_reward_to_be_learned(registered: Register):
     def step(self: Spiral, action: np.ndarray):
         shown, _, ended, cut, info = Spiral.step(self, action)
         return shown, float(np.exp(-(shown[0] ** 2))), ended, cut, info
@@ -116,7 +116,7 @@ def test_describe_leaves_a_non_quadratic_reward_to_be_learned(registered: Regist
 
 
 @installed("pcgym")
-def test_describe_finds_the_setpoint_reward_of_the_stirred_tank():
+def test_the_function_describe_finds_the_setpoint_reward_of_the_stirred_tank():
     found = describe("pcgym:cstr")
     [term] = found.spec.reward.terms
     assert (term.shape, term.weight) == ("square", pytest.approx(-1))

@@ -73,7 +73,7 @@ def test_a_mujoco_task_repeats_its_steps_after_restoring_a_snapshot():
     plant.close()
 
 
-def test_an_own_class_returns_its_coordinates_after_restoring_a_snapshot():
+def test_a_user_defined_class_returns_its_coordinates_after_restoring_a_snapshot():
     rail = answering(SavedRail())
     assert isinstance(rail, FromReset)
     start = rail.begin(0)
@@ -95,7 +95,7 @@ def test_an_environment_program_can_restore_its_snapshot():
 
 
 @pytest.mark.parametrize("snapshot", [b"", b"nonsense", original.make("CartPole-v1").save()])
-def test_restoring_a_foreign_snapshot_is_refused(snapshot):
+def test_restoring_bytes_that_are_no_snapshot_of_the_task_is_refused(snapshot):
     plant = original.make("Pendulum-v1", access="snapshot")
     with pytest.raises(StepFailed, match="expected a snapshot of"):
         plant.restore(snapshot)

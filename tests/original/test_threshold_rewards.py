@@ -165,7 +165,7 @@ def test_two_boundary_points_do_not_determine_an_ellipsoidal_reward():
     assert [term.shape for term in regions(spec(), (cos,), edge, q)] == ["one"]
 
 
-def test_describe_declares_a_bonus_reward_near_a_goal(registered: Register):
+def test_the_function_describe_declares_a_bonus_reward_near_a_goal(registered: Register):
     def step(self: Spiral, action: np.ndarray):
         shown, _, ended, cut, info = Spiral.step(self, action)
         return shown, float(np.hypot(*self.state) < 0.3), ended, cut, info
@@ -187,7 +187,7 @@ def test_describe_declares_a_bonus_reward_near_a_goal(registered: Register):
         ("ball_in_cup-catch", 1, "one"),
     ],
 )
-def test_describe_finds_the_two_valued_rewards_of_dm_control_tasks(task: str, seed: int, shape: str):
+def test_the_function_describe_finds_the_two_valued_rewards_of_dm_control_tasks(task: str, seed: int, shape: str):
     found = describe(f"dm_control:{task}", seed=seed)
     assert isinstance(found.spec.reward, DeclaredReward)
     [term] = found.spec.reward.terms

@@ -103,13 +103,15 @@ def test_a_plugin_cannot_take_the_name_of_a_built_in_policy_search():
 
 
 @pytest.mark.usefixtures("installed")
-def test_doctor_names_policy_search_plugins_that_cannot_be_used():
+def test_the_doctor_command_names_policy_search_plugins_that_cannot_be_used():
     problems = [finding for finding in installation() if finding.way_out]
     assert [finding.name for finding in problems] == ["plug-in"] * 3
     assert "package 'package_of_no_search', entry point no_search = " in " ".join(f.said for f in problems)
 
 
-def test_doctor_names_broken_server_plugins_in_one_line_each(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_the_doctor_command_names_broken_server_plugins_in_one_line_each(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     (tmp_path / "talkative.py").write_text("raise RuntimeError('one line\\nand another')\n")
     (tmp_path / "leaving.py").write_text("import sys\nsys.exit(3)\n")
     broken(tmp_path, "talkative", "talkative:Missing", "acquisitions")

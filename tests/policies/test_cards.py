@@ -10,7 +10,7 @@ from surrogym_trainer.policies.card import PolicyCard, UnusablePolicy, require_c
 
 
 @pytest.mark.parametrize("content", ["{}", '{"model": "cstr"}', "[1, 2]", "3", "level, valve", ""])
-def test_writing_a_policy_description_never_replaces_a_foreign_file(content: str, tmp_path: Path) -> None:
+def test_writing_a_policy_description_never_replaces_an_unrelated_file(content: str, tmp_path: Path) -> None:
     other = tmp_path / "tank.json"
     other.write_text(content)
     with pytest.raises(UnusablePolicy, match=r"tank\.json, which is not a card: choose another name"):

@@ -147,7 +147,7 @@ def test_a_map_in_the_report_equals_the_servers_predictions(known: Both, pendulu
     assert cut.log_index[0, -1] == pytest.approx(max(corner.log_uncertainty_index[0]))
 
 
-def test_the_report_escapes_html_in_foreign_text(known: Both) -> None:
+def test_the_report_escapes_html_in_names_errors_and_descriptions(known: Both) -> None:
     hostile = "</td><script>alert(1)</script>"
     model = known[0].models[0].model_copy(update={"description": {"outputs": [{"name": hostile, hostile: [hostile]}]}})
     view = known[0].view.model_copy(update={"error": hostile, "environment": hostile})

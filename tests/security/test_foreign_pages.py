@@ -103,7 +103,9 @@ def changing(openapi: dict[str, Any]) -> list[tuple[str, str]]:
     ]
 
 
-def test_every_state_changing_route_refuses_requests_from_a_foreign_web_page(server: ServerProcess, foreign_page: Page):
+def test_every_state_changing_route_refuses_requests_from_a_page_of_another_origin(
+    server: ServerProcess, foreign_page: Page
+):
     with httpx.Client(base_url=server.url, timeout=60) as client:
         client.post(PATH, json={"name": "pendulum", "spec": pendulum.spec()}).raise_for_status()
         routes = changing(client.get("/openapi.json").json())
@@ -121,7 +123,7 @@ def test_every_state_changing_route_refuses_requests_from_a_foreign_web_page(ser
     assert sum(posted.values()) >= 4 * len(routes), "each was sent, and refused"
 
 
-def test_a_foreign_web_page_cannot_open_a_stream(server: ServerProcess, foreign_page: Page):
+def test_a_web_page_of_another_origin_cannot_open_a_stream(server: ServerProcess, foreign_page: Page):
     url = server.url.replace("http", "ws", 1)
     assert foreign_page.evaluate(STREAM, [f"{url}/v1/sessions/none/stream"]) == "refused"
     assert until(lambda: "/v1/sessions/none/stream -> 403" in server.log), "its line may come after the refusal"

@@ -7,7 +7,7 @@ import pytest
 from surrogym_shared.terminal import give, say
 
 
-def test_foreign_text_can_not_control_the_terminal(capsys: pytest.CaptureFixture[str]):
+def test_control_characters_in_printed_text_are_escaped_on_the_terminal(capsys: pytest.CaptureFixture[str]):
     """Names, notes and errors come from files and servers: a title set, a screen cleared, a line forged."""
     say("\x1b]0;title\x07\x1b[2J\rok: forged\x9b1m")
     give({}, lambda: "a\x1b[31m\tb\nc", as_json=False)

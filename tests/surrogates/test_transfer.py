@@ -78,7 +78,7 @@ def test_an_imported_surrogate_steps_the_same_and_keeps_its_ledger(
             import_surrogate(api, read, name)
 
 
-def test_importing_a_surrogate_with_a_foreign_model_is_refused_and_stores_nothing(
+def test_importing_a_surrogate_file_with_a_model_of_another_system_stores_nothing(
     pendulum_server: ServerProcess, file: Path, name: str
 ) -> None:
     read = SurrogateFile.load(file)

@@ -99,7 +99,7 @@ def test_an_error_reply_is_raised_at_once_as_its_own_exception():
 
 
 @pytest.mark.parametrize("status", [200, 302, 307, 404])
-def test_a_reply_from_a_foreign_http_server_is_refused(status: int):
+def test_a_reply_from_an_http_server_other_than_surrogym_is_refused(status: int):
     """A login page or a redirect must not be exported as samples."""
     with (
         scripted_server(reply("<html>", status, "text/html")) as server,

@@ -20,7 +20,7 @@ def test_every_error_code_has_its_own_client_exception():
     assert set(errors.BY_CODE) == set(Code)
 
 
-def test_every_client_refusal_exception_stands_for_an_error_code():
+def test_every_client_exception_for_a_server_refusal_has_an_error_code():
     without_code = {errors.ProblemError, errors.NotThere, errors.SessionLost, errors.Conflict, errors.Refused}
     assert set(leaves(errors.ProblemError)) - without_code == set(errors.BY_CODE.values())
 

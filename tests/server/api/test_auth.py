@@ -174,5 +174,5 @@ def test_the_dashboards_content_security_policy_forbids_other_origins(guarded: h
         ("127.0.0.1.evil.example:8000", 403),
     ],
 )
-def test_a_foreign_host_name_in_the_host_header_is_refused(client: httpx.Client, host: str, status: int):
+def test_an_unexpected_host_name_in_the_host_header_is_refused(client: httpx.Client, host: str, status: int):
     assert client.get("/v1/surrogates", headers={"host": host}).status_code == status

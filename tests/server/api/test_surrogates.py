@@ -82,7 +82,7 @@ def test_the_surrogate_list_can_be_read_in_pages(client: httpx.Client, taught: s
         assert (refused.status_code, refused.json()["code"]) == (422, "invalid_request")
 
 
-def test_improve_adds_queries_and_raises_the_budget_once_per_idempotency_key(client: httpx.Client, name: str):
+def test_a_repeated_improve_request_adds_queries_and_raises_the_budget_once(client: httpx.Client, name: str):
     before = pendulum.teach(client, name, budget=5)
     body = {"queries": 2, "idempotency_key": "once"}
     for _ in range(2):
@@ -92,7 +92,7 @@ def test_improve_adds_queries_and_raises_the_budget_once_per_idempotency_key(cli
     assert (before["samples"], after["samples"], after["budget"]) == (5, 7, 7)
 
 
-def test_improve_accepts_the_states_that_a_policy_visited(client: httpx.Client, name: str):
+def test_an_improve_request_accepts_the_states_that_a_policy_visited(client: httpx.Client, name: str):
     pendulum.teach(client, name, budget=5)
     opened = client.post(f"/v1/surrogates/{name}/sessions", json={"num_envs": 4, "occupancy": True}).json()
     for what, body in (("reset", {}), ("step", {"action": [[0.0]] * 4})):

@@ -26,12 +26,12 @@ PATIENCE = 60.0
 WITHOUT_CUDA = pytest.mark.skipif(torch.cuda.is_available(), reason="torch has CUDA here")
 
 
-def test_serve_refuses_a_database_in_use_in_one_sentence(server_process: Any, tmp_path: Path):
+def test_the_serve_command_refuses_a_database_in_use_in_one_sentence(server_process: Any, tmp_path: Path):
     database = str(server_process.folder / "surrogym.db")
     assert "surrogym.db" in refusal(tmp_path, "--port", "0", "--database", database)
 
 
-def test_serve_refuses_a_port_in_use_in_one_sentence(server_process: Any, tmp_path: Path):
+def test_the_serve_command_refuses_a_port_in_use_in_one_sentence(server_process: Any, tmp_path: Path):
     port = server_process.url.rpartition(":")[2]
     assert f"port {port}" in refusal(tmp_path, "--port", port, "--database", str(tmp_path / "other.db"))
 
@@ -50,7 +50,7 @@ def test_serve_refuses_a_port_in_use_in_one_sentence(server_process: Any, tmp_pa
         pytest.param([], {"SURROGYM_DEVICE": "cuda"}, "setting device: expected cpu, got cuda", marks=WITHOUT_CUDA),
     ],
 )
-def test_serve_refuses_invalid_settings_at_start(
+def test_the_serve_command_refuses_invalid_settings_at_start(
     tmp_path: Path, options: list[str], environment: dict[str, str], said: str
 ):
     assert said in refusal(tmp_path, *options, **environment)
@@ -148,7 +148,7 @@ def test_a_killed_server_leaves_no_fitting_process_behind(tmp_path: Path):
         time.sleep(0.05)
 
 
-def test_serve_prints_its_address_as_json_and_ends_with_its_parent_process(tmp_path: Path):
+def test_the_serve_command_prints_its_address_as_json_and_ends_with_its_parent_process(tmp_path: Path):
     ready = tmp_path / "ready"
     options = ["--port", "0", "--database", str(tmp_path / "p.db"), "--ready-file", str(ready), "--json"]
     options.append("--exit-with-parent")

@@ -110,7 +110,7 @@ def test_a_restored_session_continues_bit_for_bit(
     np.testing.assert_array_equal(back.visited.states, session.visited.states)
 
 
-def test_a_saved_session_with_a_flipped_bit_is_refused_or_comes_back_the_same(
+def test_a_saved_session_with_a_flipped_bit_is_refused_or_restored_unchanged(
     opened: Open, definition: EnvironmentDefinition
 ):
     session, _ = reset_session(opened(), 11, None, 1)

@@ -45,7 +45,7 @@ def test_a_log_of_a_part_of_the_range_replaces_only_initial_queries_there(defini
     assert 0 < found.sum() < QUERIES / 2
 
 
-def test_logged_angles_cover_queries_across_the_wrap_at_pi(definition: EnvironmentDefinition):
+def test_a_logged_angle_near_minus_pi_replaces_initial_queries_near_pi(definition: EnvironmentDefinition):
     q, u = np.array([[3.1, 0.0], [0.0, 0.0]]), np.zeros((2, 1))
     assert covered(definition, q, u, np.array([[-3.1, 0.0]]), np.zeros((1, 1))).tolist() == [True, False]
 

@@ -433,7 +433,7 @@ def test_the_designer_starts_a_due_fit_by_itself(answered: Storage, designer):
     asyncio.run(run())
 
 
-def test_improve_uses_the_latest_visited_states_unless_a_checkpoint_is_named(answered: Storage, designer):
+def test_an_improve_request_uses_the_latest_visited_states_unless_a_checkpoint_is_named(answered: Storage, designer):
     async def run() -> None:
         def improve(name: str, queries: int, checkpoint: str | None, key: str | None) -> SurrogateRecord:
             return made.improve(name, queries, checkpoint, key, raise_budget=True).record

@@ -45,7 +45,7 @@ def test_a_wait_for_a_notice_ends_at_its_timeout():
     asyncio.run(run())
 
 
-def test_a_wait_woken_and_cancelled_at_once_raises_cancelled():
+def test_a_listener_woken_and_cancelled_at_the_same_time_raises_cancelled():
     async def run() -> None:
         notices = Notices()
         with notices.listen("a") as listener:

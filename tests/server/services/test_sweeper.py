@@ -43,7 +43,7 @@ def test_a_failed_sweep_of_expired_leases_is_followed_by_the_next(storage: Stora
     assert asyncio.run(asyncio.wait_for(run(), 10)) == 3
 
 
-def test_the_sweeper_wakes_listeners_of_a_change_whose_notice_was_lost(storage: Storage):
+def test_the_periodic_sweep_wakes_listeners_of_a_change_whose_notice_was_lost(storage: Storage):
     async def run() -> None:
         notices = Notices()
         models = ModelCache(lambda *_: pytest.fail("nothing is in use"), storage.models.newest)

@@ -234,7 +234,7 @@ def test_a_fit_is_due_although_some_queries_were_set_aside(
     assert storage.designs.due() == [due]
 
 
-def test_improve_raises_the_budget_and_reaches_the_next_fit_once_per_idempotency_key(
+def test_a_repeated_improve_request_raises_the_budget_and_reaches_the_next_fit_once(
     storage: Storage, due: str, design: Callable[..., NewDesign]
 ) -> None:
     storage.surrogates.change(due, budget=4)
@@ -253,14 +253,12 @@ def test_improve_raises_the_budget_and_reaches_the_next_fit_once_per_idempotency
     assert storage.surrogates.get(due).extra_queries == 2, "asked for after the fit began"
 
 
-def test_improve_does_not_raise_a_budget_that_is_large_enough(storage: Storage, due: str) -> None:
+def test_an_improve_request_does_not_raise_a_budget_that_is_large_enough(storage: Storage, due: str) -> None:
     granted = storage.designs.improve(due, 5, raise_budget=True)
     assert (granted.record.budget, granted.raised) == (30, 0)
 
 
-def test_improve_without_the_right_to_raise_the_budget_gets_at_most_the_remaining_steps(
-    storage: Storage, due: str
-) -> None:
+def test_an_improve_request_without_budget_rights_gets_at_most_the_remaining_steps(storage: Storage, due: str) -> None:
     """The budget is the owner's: steps taken, queries open or set aside, and what was promised before all count."""
     storage.queries.enqueue(due, steps(np.zeros((2, 2)), np.zeros((2, 1))))
     for _ in range(MAX_ATTEMPTS):

@@ -127,7 +127,7 @@ def test_a_model_file_whose_transition_reads_the_next_state_is_refused(pendulum_
         from_bytes(pendulum_definition, rewritten(data, header))
 
 
-def test_a_foreign_safetensors_file_is_refused(pendulum_definition):
+def test_a_safetensors_file_that_is_not_a_model_file_is_refused(pendulum_definition):
     for metadata in (None, {"surrogym": "not json"}, {"surrogym": "[]"}, {"other": "{}"}):
         with pytest.raises(InvalidInput):
             from_bytes(pendulum_definition, save({"a": torch.zeros(1)}, metadata))

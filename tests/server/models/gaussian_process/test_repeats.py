@@ -67,7 +67,7 @@ def points() -> tuple[Tensor, Tensor]:
     return test.q, test.u
 
 
-def test_tanks_with_equal_dynamics_share_samples(model):
+def test_outputs_of_tanks_with_equal_dynamics_are_learned_from_shared_samples(model):
     assert [set(output.shared) for output in model.transitions] == [
         set(),
         {"third", "fourth"},
@@ -93,24 +93,24 @@ def test_errors_of_a_model_with_shared_samples_are_within_its_deviations(model):
     assert float(within[:, 1:].double().mean()) > 0.85
 
 
-def test_a_tank_with_different_dynamics_shares_no_samples():
+def test_the_output_of_a_tank_with_different_dynamics_shares_no_samples():
     model = gaussian_processes(ROW, steps(SAMPLES, 0, narrow=0.25))
     assert model.transitions[3].shared == ()
     assert model.transitions[1].shared == ("third",)
 
 
-def test_with_preset_paper_outputs_share_no_samples():
+def test_with_preset_paper_no_samples_are_shared_between_outputs():
     paper = definition_from_spec(spec({"preset": "paper"}))
     assert not any(output.shared for output in gaussian_processes(paper, steps(SAMPLES, 0)).outputs)
 
 
-def test_with_many_samples_outputs_share_no_samples(model):
+def test_with_many_samples_no_samples_are_shared_between_outputs(model):
     """With many samples each tank is known without the others."""
     known = gaussian_processes(ROW, steps(100, 0))
     assert not any(output.shared for output in known.outputs)
 
 
-def test_the_number_of_shared_samples_is_limited(monkeypatch):
+def test_the_number_of_samples_an_output_takes_from_others_is_limited(monkeypatch):
     monkeypatch.setattr(repeats, "MOST", 40)
     model = gaussian_processes(ROW, steps(SAMPLES, 0))
     assert max(len(output.posterior.y) for output in model.transitions) == 40
@@ -133,6 +133,6 @@ def test_sample_sharing_survives_storage(model, points):
 
 
 @pytest.mark.parametrize("shared", [("fifth",), ("reward",)])
-def test_a_stored_model_that_shares_samples_with_a_non_transition_is_refused(model, shared):
+def test_a_stored_model_that_shares_samples_with_an_output_other_than_a_transition_is_refused(model, shared):
     with pytest.raises(InvalidInput, match="share samples"):
         require_output(ROW, replace(model.transitions[1], shared=shared))
