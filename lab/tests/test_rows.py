@@ -92,7 +92,7 @@ def test_a_binary_or_empty_result_file_is_refused(tmp_path, content, words):
         read_rows(tmp_path / "rows.csv")
 
 
-def test_when_merging_later_rows_win_unless_they_are_errors():
+def test_when_merging_results_later_rows_replace_earlier_ones_unless_they_are_errors():
     better, bad, other = replace(ROW, mean=-140.0), replace(ROW, mean=None, error="died"), replace(ROW, seed=1)
     assert merge([ROW], [better, other]) == [better, other]
     assert merge([ROW], [bad]) == [ROW]

@@ -20,7 +20,7 @@ def cart(on_server: Any, name: str) -> str:
     return name
 
 
-def test_a_dry_run_draws_waiting_queries_and_takes_none(on_server: Any, cart: str) -> None:
+def test_sampling_with_dry_run_shows_the_pending_queries_and_takes_no_real_step(on_server: Any, cart: str) -> None:
     shown = on_server("sample", cart, *CART, "--dry-run")
     assert "(initial): 1 step from a reset" in shown.out
     assert "action 0" in shown.out
@@ -28,7 +28,7 @@ def test_a_dry_run_draws_waiting_queries_and_takes_none(on_server: Any, cart: st
     assert json.loads(on_server("status", cart, "--json").out)["ledger"]["total"] == 0
 
 
-def test_a_query_that_a_person_does_not_approve_takes_no_real_step(
+def test_a_query_the_user_does_not_approve_takes_no_real_step(
     on_server: Any, cart: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[Query] = []
@@ -46,7 +46,7 @@ def test_a_query_that_a_person_does_not_approve_takes_no_real_step(
     assert "1 refused by the environment" in on_server("status", cart).out
 
 
-def test_a_person_sees_the_query_before_the_question(
+def test_sampling_with_approve_shows_each_query_before_asking_for_approval(
     monkeypatch: pytest.MonkeyPatch, on_server: Any, cart: str
 ) -> None:
     questions: list[str] = []
@@ -57,7 +57,7 @@ def test_a_person_sees_the_query_before_the_question(
     assert "(initial): 1 step from a reset" in said.err
 
 
-def test_approval_without_a_terminal_is_refused(on_server: Any, cart: str) -> None:
+def test_sampling_with_approve_is_refused_without_a_terminal(on_server: Any, cart: str) -> None:
     said = on_server("sample", cart, *CART, "--approve")
     assert said.code != 0
     assert "expected a terminal" in said.err

@@ -78,7 +78,7 @@ def test_a_server_named_only_in_a_policy_file_is_not_contacted(surrogym, tmp_pat
     assert not options or "--json" not in options or ended.json["steps"] == 200
 
 
-def test_a_server_given_with_server_gets_the_real_steps_and_the_token(surrogym, tmp_path, monkeypatch):
+def test_a_server_given_by_option_server_receives_the_real_steps_and_the_token(surrogym, tmp_path, monkeypatch):
     monkeypatch.setenv("SURROGYM_TOKEN", SECRET)
     with scripted_server(problem(Code.FORBIDDEN)) as noted, scripted_server(problem(Code.FORBIDDEN)) as given:
         network(tmp_path, surrogate="pendulum", server=noted.url)
@@ -116,7 +116,7 @@ def test_a_policy_description_can_only_shorten_the_environments_time_limit(surro
     assert bool(said) == ("time limit" in ended.err)
 
 
-def test_a_specification_given_with_spec_can_lengthen_the_time_limit(surrogym, tmp_path):
+def test_a_specification_given_by_option_spec_can_lengthen_the_time_limit(surrogym, tmp_path):
     longer = pendulum().model_copy(update={"time_limit": 300})
     network(tmp_path)
     (tmp_path / "spec.json").write_text(longer.model_dump_json())

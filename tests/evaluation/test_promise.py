@@ -9,7 +9,7 @@ from surrogym_trainer.evaluation.promise import EVALUATION_STARTS, FUNCTIONS, ST
 Z = 1.6449  # of a standard normal's 95 % quantile
 
 
-def test_if_returns_vary_only_by_start_the_promised_interval_is_that_of_a_mean():
+def test_if_returns_vary_only_by_start_the_promised_interval_equals_that_of_a_mean():
     returns = np.repeat(np.random.default_rng(0).normal(-100, 20, (400, 1)), 32, axis=1)
     promise = interval(returns, floor=-100.0)
     spread = 20 * np.sqrt(1 / EVALUATION_STARTS + 1 / returns.size)

@@ -107,7 +107,7 @@ def test_a_systematic_error_without_effect_on_the_return_keeps_the_promised_retu
     assert harmless.widened(PROMISE) is PROMISE
 
 
-def test_a_possible_costly_systematic_error_asks_more_steps_and_widens_the_promised_interval():
+def test_a_possible_costly_systematic_error_requires_more_steps_and_widens_the_promised_interval():
     possible = consequence(0, shift=0.9, cost=-150.0, steps=8)
     assert possible.shifted.evidence < 20
     assert possible.undecided

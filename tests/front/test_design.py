@@ -334,7 +334,7 @@ def test_a_stable_baselines3_policy_trains_on_an_in_process_design(done: surrogy
     assert surrogym.make_sb3(tmp_path / "it.surrogate", 2, time_limit=5).reset().shape == (2, 3)
 
 
-def test_a_design_of_a_reset_only_environment_asks_rollouts():
+def test_a_design_for_a_reset_only_environment_queries_rollouts_instead_of_steps():
     spec = cartpole().model_copy(update={"query": "rollout", "max_rollout": 10})
     spec = spec.model_copy(update={"design": spec.design.model_copy(update={"initial": 10})})
     design = surrogym.Design(spec, budget=10)

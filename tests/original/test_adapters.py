@@ -94,7 +94,7 @@ def test_the_error_for_a_missing_simulator_package_names_its_extra(name: str, pa
 
 
 @installed("pcgym")
-def test_after_a_reset_the_setpoint_is_that_of_the_first_reward() -> None:
+def test_after_a_reset_the_setpoint_coordinate_is_the_one_the_first_reward_uses() -> None:
     """Neither opens, resets nor steps with a warning, which would be an error here."""
     tank = open_simulator("pcgym:cstr")
     setpoint = tank.reset(0)[2]

@@ -31,7 +31,7 @@ def after(untrained: Returns, *checks: Returns, earned: float = BEST, saved: Ret
 @pytest.mark.parametrize(
     ("successes", "learned"), [(6, False), (22, True), (64, True)], ids=["a few more", "a third", "all"]
 )
-def test_a_network_counts_as_learned_if_a_quarter_of_its_episodes_earn_more(successes: int, learned: bool):
+def test_a_network_counts_as_trained_if_a_quarter_of_its_episodes_earn_more_than_before(successes: int, learned: bool):
     assert after(UNTRAINED, episodes(successes)).learned is learned
 
 
@@ -40,7 +40,7 @@ def test_a_network_whose_mean_return_did_not_rise_has_not_learned():
 
 
 @pytest.mark.parametrize(("successes", "learned"), [(58, True), (20, False)], ids=["most starts", "no other start"])
-def test_if_the_untrained_policy_often_succeeds_the_mean_decides_about_learning(successes: int, learned: bool):
+def test_if_the_untrained_policy_often_succeeds_learning_is_judged_by_the_mean_return(successes: int, learned: bool):
     assert after(episodes(20, 1.0), episodes(successes, 1.0), earned=1.0).learned is learned
 
 

@@ -22,7 +22,7 @@ def test_the_training_progress_never_falls_when_the_training_is_extended():
     assert shares[-1] == pytest.approx(1.0)
 
 
-def test_the_progress_of_a_training_without_extension_is_its_share_of_steps():
+def test_the_progress_of_a_training_without_extension_is_its_share_of_steps_done():
     course = Course()
     assert [course.share(steps, 400) for steps in (100, 200, 400)] == [0.25, 0.5, 1.0]
 

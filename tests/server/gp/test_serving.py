@@ -31,7 +31,7 @@ def at(rng) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("tolerance", [0.0, 1.0], ids=["differences", "products"])
-def test_each_served_output_equals_its_own_posterior(outputs, at, monkeypatch, device, tolerance):
+def test_each_served_output_equals_the_posterior_of_its_own_process(outputs, at, monkeypatch, device, tolerance):
     monkeypatch.setattr(serving, "MEAN_TOLERANCE", tolerance)
     monkeypatch.setattr(serving, "VARIANCE_TOLERANCE", tolerance)
     compiled = Serving.of(to_device(tuple(outputs), device), COLUMNS, WIDTH, device)

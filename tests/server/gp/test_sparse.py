@@ -145,7 +145,9 @@ def test_the_hardest_points_are_isolated_or_have_large_residuals(drawn: tuple[Hy
     assert {7, 250} <= set(found)
 
 
-def test_leave_one_out_errors_of_a_sparse_process_are_over_all_points(drawn: tuple[Hyperparameters, Tensor, Tensor]):
+def test_leave_one_out_errors_of_a_sparse_process_are_computed_for_all_points(
+    drawn: tuple[Hyperparameters, Tensor, Tensor],
+):
     exact, through = condition(*drawn).left_out, condition_sparse(*drawn).left_out
     assert through.error == pytest.approx(exact.error, rel=1e-3)
     assert through.within_one == pytest.approx(exact.within_one, abs=0.01)

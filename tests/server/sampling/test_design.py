@@ -202,7 +202,7 @@ def test_preset_paper_can_use_tolerances_relative_to_the_output_deviation():
     assert defaults_of(default, samples) == (1.0,) * 3
 
 
-def test_a_latin_hypercube_design_asks_its_whole_budget_as_initial_queries():
+def test_a_latin_hypercube_design_spends_its_whole_budget_on_initial_queries():
     definition = definition_from_spec(designed(acquisition="latin_hypercube"))
     assert len(initial_queries(definition, 17)) == 17
 

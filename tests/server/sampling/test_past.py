@@ -110,7 +110,7 @@ def single_steps() -> Samples:
 
 
 @pytest.mark.parametrize(("budget", "longer"), [(60, False), (40, True)])
-def test_after_half_its_budget_a_single_step_design_asks_longer_rollouts(budget: int, longer: bool) -> None:
+def test_after_half_its_budget_a_design_of_single_steps_queries_longer_rollouts(budget: int, longer: bool) -> None:
     taken = single_steps()
     lacking = pairs_lacking(DEFINITION, taken)
     assert lacking > 0

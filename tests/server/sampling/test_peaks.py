@@ -69,7 +69,7 @@ def test_the_search_for_a_reward_peak_ends_once_it_was_reached():
     assert looked_for(met) is None
 
 
-def test_no_peak_is_searched_for_a_smooth_reward():
+def test_the_design_searches_no_reward_peak_if_the_reward_is_smooth():
     assert looked_for(drifting(lambda q, _: -q.square().sum(-1), 12)) is None
 
 
@@ -85,7 +85,7 @@ def test_if_all_rewards_are_zero_the_point_farthest_from_the_samples_is_queried(
     assert float(torch.cdist(found.q, samples.q).min()) == pytest.approx(float(nearest.max()))
 
 
-def test_no_peak_is_searched_for_a_constant_nonzero_reward():
+def test_the_design_searches_no_reward_peak_if_every_reward_is_the_same_nonzero_value():
     assert looked_for(constant(-1.0)) is None
 
 

@@ -150,7 +150,9 @@ def test_new_samples_are_scored_by_the_previous_model_and_scores_are_stored(
     assert len(answered.surrogates.get(NAME).state["predictions"]) == len(stored)
 
 
-def test_a_budget_lowered_after_improve_limits_its_extra_queries(answered: Storage, designer, runner: Runner):
+def test_a_budget_lowered_after_an_improve_request_limits_its_extra_queries(
+    answered: Storage, designer, runner: Runner
+):
     """What was promised within the old budget is not asked beyond the new one."""
     answered.designs.improve(NAME, 2)
     answered.surrogates.change(NAME, budget=pendulum.INITIAL + 1)

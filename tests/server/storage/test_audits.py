@@ -41,7 +41,7 @@ def test_audit_queries_beyond_their_total_limit_are_refused(storage: Storage, ma
     storage.queries.enqueue(name, FOUR)
 
 
-def test_the_reward_range_is_that_of_all_samples(
+def test_the_reward_range_of_a_surrogate_covers_all_its_samples(
     storage: Storage, make: Make, by_hand: Callable[..., NewSample]
 ) -> None:
     name = make(queries=0)

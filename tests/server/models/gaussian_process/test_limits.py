@@ -74,7 +74,7 @@ def test_a_second_limit_that_no_sample_reaches_does_not_change_the_accuracy():
     assert error(TWO_SIDED, samples, test) == pytest.approx(error(RELIEVED, samples, test), rel=0.1)
 
 
-def test_an_output_driven_by_a_limited_speed_reads_the_next_speed():
+def test_an_output_driven_by_a_limited_speed_has_the_next_speed_as_input():
     found = steps(60, False, 5)
     follows = replace(found, q_next=torch.stack([found.q[:, 0] + 0.3 * found.q_next[:, 1], found.q_next[:, 1]], 1))
     output = gaussian_processes(TWO_SIDED, follows).transitions[0]

@@ -100,7 +100,7 @@ def test_a_model_predicts_the_posteriors_of_its_processes(pendulum_model):
         torch.testing.assert_close(std, expected, rtol=1e-3, atol=1e-4 * output.scale)
 
 
-def test_an_angle_that_reads_the_next_speed_follows_the_drawn_speed(pendulum_definition, half_saturated):
+def test_an_angle_predicted_from_the_next_speed_uses_the_drawn_next_speed(pendulum_definition, half_saturated):
     """Where speeds were cut the lead alone tells how far the angle goes."""
     model = learn(pendulum_definition, half_saturated).model
     angle, speed = model.transitions
