@@ -81,7 +81,7 @@ class Shape:
 
 
 class Frame(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True, tag_field="op"):
-    """Base class of all frames."""
+    """Base class of all frames: msgpack maps that name their operation in ``op``."""
 
 
 class ResetRequest(Frame, frozen=True, tag="reset"):

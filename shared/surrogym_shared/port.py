@@ -162,7 +162,7 @@ class SurrogatePort(Protocol):
 
 @runtime_checkable
 class PolicyPort(SurrogatePort, Protocol):
-    """A surrogate that also runs a policy on the server's side, so that a rollout of many steps is one request.
+    """A surrogate that can also run a policy itself, so that a rollout of many steps is one request.
 
     Law: the result equals stepping all lanes one by one with the actions of ``surrogym_shared.acting.Actor``, bit for
     bit if both run the same NumPy on the same kind of processor.

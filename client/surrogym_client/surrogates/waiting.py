@@ -95,7 +95,7 @@ def wait_for_design(
     *,
     after_round: int = 0,
 ) -> SurrogateView:
-    """Wait until the design is ready or over its budget, and return the surrogate.
+    """Wait until the design has ended, because it is ready or can't continue, and return the surrogate.
 
     Args:
         api: the server; it may be unreachable for a while.

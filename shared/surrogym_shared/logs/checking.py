@@ -72,7 +72,8 @@ class ReadLog:
 
 
 def check_log(table: Table, roles: Roles, spec: EnvironmentSpec) -> ReadLog:
-    """Check the rows of a log against a specification. The log of an evaluation is trusted, and only parsed.
+    """Check the rows of a log against a specification. Limits, choices, units and ends are not checked in the log of an
+    evaluation, because the environment itself wrote it.
 
     Raises:
         UnusableLog: the columns don't fit the specification, or are in other units.

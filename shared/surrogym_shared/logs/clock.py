@@ -74,8 +74,10 @@ def episodes_of(rows: Rows) -> Episodes:
 
 
 def _names(rows: Rows, names: Ints, notes: list[str]) -> Ints:
-    """Return the number of each row's episode (n,), by its name. A name that returns after other names gets a new
-    number."""
+    """Return the number of each row's episode (n,), by its name.
+
+    A name that returns after other names gets a new number, unless a clock orders the rows, or episodes alternate.
+    """
     changes = np.zeros(len(rows), dtype=np.bool_)
     changes[1:] = names[1:] != names[:-1]
     stretch = np.cumsum(changes, dtype=np.int64)

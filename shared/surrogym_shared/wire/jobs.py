@@ -135,7 +135,7 @@ class ClaimJob(Request):
 
 
 class LeasedJob(Reply):
-    """A job that a worker has claimed."""
+    """A job that a worker has claimed, with its lease."""
 
     id: int = Field(description="id of the job")
     attempt: int = Field(description="1 for the first lease of this job")
@@ -160,7 +160,7 @@ class JobPoint(Request):
 
 
 class JobState(Request):
-    """Progress of a job."""
+    """Progress of a job, as its worker reports it."""
 
     stage: JobStage = Field(description="stage that the job is in")
     share: Share = Field(default=0.0, description="share of this stage that is done, between 0 and 1")
