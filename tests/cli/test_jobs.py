@@ -31,7 +31,7 @@ def test_the_jobs_command_lists_shows_and_cancels_a_job(on_server, api):
     assert on_server("jobs", "pendulum", "--json").json["jobs"][0]["status"] == "cancelled"
 
 
-def test_the_jobs_command_reports_missing_workers_and_unknown_jobs(on_server, api, name):
+def test_the_jobs_command_reports_a_missing_worker_and_an_unknown_job(on_server, api, name):
     assert on_server("register", "Pendulum-v1", "--name", name).code == 0
     assert f"no worker is connected; to start one: surrogym work {name}" in on_server("jobs", name).out
     ended = on_server("jobs", name, "--cancel")

@@ -65,7 +65,9 @@ def test_a_reference_policy_of_another_environment_is_refused(surrogym, policy, 
 
 
 @pytest.mark.parametrize("card", [None, Machine.spec(None)], ids=["no card", "its own card"])
-def test_a_fitting_policy_and_one_without_description_are_evaluated(surrogym, policy, diary, card) -> None:
+def test_a_policy_that_fits_the_environment_and_one_without_description_are_evaluated(
+    surrogym, policy, diary, card
+) -> None:
     policy(card)
     said = surrogym("evaluate", "policy.zip", *MACHINE)
     assert said.code == 0, said.err

@@ -170,7 +170,7 @@ def test_a_real_step_with_the_largest_accepted_values_can_be_fitted():
 
 
 @pytest.mark.parametrize("spec", [small(), pendulum()])
-def test_a_query_of_another_design_is_refused(spec: surrogym.EnvironmentSpec):
+def test_answering_a_query_of_another_design_is_refused(spec: surrogym.EnvironmentSpec):
     """Also one that is equal: the other design's machine may be another, and its query would stay open."""
     design, other = surrogym.Design(small()), surrogym.Design(spec)
     mine, theirs = design.ask(), other.ask()

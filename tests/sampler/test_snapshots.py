@@ -209,7 +209,7 @@ def test_a_snapshot_folder_never_exceeds_its_size_limit(tmp_path):
     assert 400 < sum(sizes) <= 2_000
 
 
-def test_of_the_two_nearest_snapshots_the_older_is_dropped():
+def test_in_a_full_snapshot_folder_the_older_of_the_two_nearest_states_is_dropped():
     assert least_useful(np.array([[0.0], [1.0], [1.1], [5.0]]), keep=3) == 1
     assert least_useful(np.array([[0.0], [1.0], [1.1], [5.0]]), keep=1) == 2
 

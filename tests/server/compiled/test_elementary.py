@@ -18,21 +18,21 @@ from surrogym_server.environment.definition import wrap
 ULPS = 4 * np.finfo(np.float64).eps
 
 
-def test_exponential_is_exact_to_the_last_digits():
+def test_the_compiled_exponential_is_exact_to_the_last_digits():
     x = np.concatenate([np.linspace(-700, 700, 20_001), np.geomspace(1e-300, 1, 100), [0.0, -0.0]])
     result = x.copy()
     njit(elementary.exponential.py_func)(result)
     np.testing.assert_allclose(result, np.exp(x), rtol=ULPS)
 
 
-def test_exponential_of_a_very_negative_number_is_zero():
+def test_the_compiled_exponential_of_a_very_negative_number_is_zero():
     x = np.array([-745.0, -1e9, -np.inf])
     njit(elementary.exponential.py_func)(x)
     assert (abs(x) < 1e-300).all()
 
 
 @pytest.mark.parametrize("largest", [1.0, 1e3, 9e4, 1e8])
-def test_sine_and_cosine_are_exact_for_small_and_large_angles(largest: float):
+def test_the_compiled_sine_and_cosine_are_exact_for_small_and_large_angles(largest: float):
     x = np.concatenate([np.linspace(-largest, largest, 20_001), np.arange(-40, 40) * math.pi / 4])
     sine, cosine = np.empty_like(x), np.empty_like(x)
     njit(elementary.sine_and_cosine.py_func)(x, sine, cosine)
@@ -40,7 +40,7 @@ def test_sine_and_cosine_are_exact_for_small_and_large_angles(largest: float):
     np.testing.assert_allclose(cosine, np.cos(x), rtol=0, atol=ULPS)
 
 
-def test_sine_of_nan_is_nan():
+def test_the_compiled_sine_of_nan_is_nan():
     x, sine, cosine = np.array([np.nan, 1.0]), np.empty(2), np.empty(2)
     njit(elementary.sine_and_cosine.py_func)(x, sine, cosine)
     assert np.isnan(sine[0])

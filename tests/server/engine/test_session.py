@@ -61,7 +61,7 @@ def test_environments_of_two_model_versions_can_end_in_the_same_step(opened: Ope
     np.testing.assert_array_equal(after.versions, [2, 2, 2, 2])
 
 
-def test_a_masked_reset_moves_only_those_environments_to_the_latest_model(opened: Open):
+def test_a_masked_reset_moves_only_the_masked_environments_to_the_latest_model(opened: Open):
     session, _ = reset_session(opened(), None, None, 1)
     session, result = reset_session(session, None, np.array([True, False, False, True]), 2)
     np.testing.assert_array_equal(result.model_version, [2, 1, 1, 2])

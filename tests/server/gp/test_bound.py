@@ -195,7 +195,7 @@ def test_a_sparse_fit_keeps_relevant_inputs():
     assert fewer_inputs(x, y, fitted(x, y, 60), FitOptions(), 60, torch.ones(2, dtype=torch.bool), -1.0) is None
 
 
-def test_a_sparse_odd_process_keeps_an_input_whose_sign_it_mirrors():
+def test_a_sparse_fit_of_an_odd_function_keeps_an_input_that_changes_sign():
     """Of a function that is zero everywhere else nothing would be left."""
     x, _ = points(600, 2, seed=7)
     y = 0.01 * torch.from_numpy(np.random.default_rng(0).normal(size=600))
