@@ -79,7 +79,7 @@ def read_arrays(
 
     Raises:
         OSError: the file can't be read.
-        ValueError: as ``read_entries`` and ``require``, or an array contradicts the size in its header.
+        ValueError: raised by ``read_entries`` or ``require``, or an array contradicts the size in its header.
     """
     with _open_zip(npz, limit) as archive:
         entries = {entry.filename.removesuffix(ARRAY): entry for entry in archive.infolist()}

@@ -25,7 +25,7 @@ def opener_for_policy(
 
     Raises:
         PolicyMisfit: the policy was trained for another specification than ``given``.
-        UnknownEnvironment: there is no such environment. The message also names the policy's environment, if another.
+        UnknownEnvironment: there is no such environment. The message also names the environment of the policy.
     """
     from surrogym_sampler.original.errors import UnknownEnvironment
     from surrogym_sampler.original.fitting import check_policy, meant_in_words

@@ -81,7 +81,7 @@ class SnapshotOptions:
 
 @dataclass(frozen=True)
 class CautionOptions:
-    """What a person sees of a query before it is taken."""
+    """Options for showing queries to a person before they are taken."""
 
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Print and draw the queries that wait for a sampler, and take none.")
@@ -95,7 +95,7 @@ class CautionOptions:
     ] = False
 
     def require_fit(self, cluster: RayOptions, output: Output) -> None:
-        """Raise ``CommandError`` if nobody can be asked for approval."""
+        """Raise ``CommandError`` if ``--approve`` is given, but the command can't ask a person on a terminal."""
         from surrogym.cli.errors import CommandError
 
         if self.approve and (cluster.on_ray is not None or output.quiet or not sys.stdin.isatty()):
@@ -185,7 +185,7 @@ def _show_queries(api: Api, view: SurrogateView, output: Output) -> None:
 
 
 def approved(spec: EnvironmentSpec, query: Query) -> bool:
-    """Ask whether a query may be taken, after it was printed and drawn."""
+    """Print and draw a query on the terminal, and return whether the person there agrees that it is taken."""
     from surrogym_sampler.queries.words import words_of_query
     from surrogym_shared.terminal import say
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 MIN_DESIGN = 20
-ROUNDS = 3  # most rounds of the closed loop (train a policy, then query where it goes) while the design is not ready
+ROUNDS = 3  # most rounds of the closed loop (train a policy, then query at states that it visits)
 
 
 @dataclass(frozen=True)

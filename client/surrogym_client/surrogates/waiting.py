@@ -75,7 +75,7 @@ def wait_for_surrogate(api: Api, name: str, seconds: float) -> SurrogateView:
     """Wait until the surrogate is registered, and return it.
 
     Raises:
-        UnknownSurrogate: it was not registered within ``seconds``.
+        UnknownSurrogate: the surrogate was not registered within ``seconds``.
     """
     deadline = time.monotonic() + seconds
     while True:

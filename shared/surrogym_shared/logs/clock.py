@@ -120,7 +120,7 @@ def repeated(rows: Rows, episodes: Episodes, faults: Mapping[int, str], *, coars
 
     Args:
         rows: rows of the log.
-        episodes: their episodes.
+        episodes: division of the rows into episodes.
         faults: rows that are already rejected.
         coarse: whether several rows may have the same time; then only copies of the whole log are found.
     """

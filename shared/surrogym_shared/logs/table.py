@@ -45,7 +45,7 @@ class Table:
         ignored: reason for each array of the file that is not a column, by its name.
         discrete: whether the file declares the action as discrete; None if it does not say.
         limits: limits of action entries that the file declares, by the entry's name.
-        remarks: what the report on the log says about the form of the file.
+        remarks: sentences about the form of the file, for the report on the log.
         evaluated: whether the steps come from an evaluation in the surrogate's own environment, so that their units and
             ends are not in doubt.
     """

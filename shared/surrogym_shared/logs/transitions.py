@@ -33,7 +33,7 @@ class Transitions:
         lost_ends: number of rows that end their episode in a terminal state, and give no step, because their next state
             is not known.
         began: time of the first step; None without a column of times.
-        notes: what was concluded about the order of the rows, from the clock and the names of episodes.
+        notes: conclusions about the order of the rows, from the clock and the names of episodes.
     """
 
     row: Ints
