@@ -13,13 +13,14 @@ import numpy as np
 import pytest
 
 from support.compilers import NEEDS_C, SANITIZED, Compiled, called_by_name, calls, compile_c, recursive, run
-from support.controllers import LEARNERS, learner, network, plant
+from support.controllers import LEARNERS, learner, limited, network, plant
 from surrogym_sampler.original.actions import decode_actions
 from surrogym_sampler.original.lags import begun, followed
+from surrogym_sampler.original.limits.guard import Guard
 from surrogym_shared.spec import DiscreteAction, MultiDiscreteAction
 from surrogym_shared.terms import observe as declared
 from surrogym_trainer.deployment.c import write, write_arduino
-from surrogym_trainer.deployment.controller import Choices, Controller, NotDeployable
+from surrogym_trainer.deployment.controller import LIMITED, Choices, Controller, NotDeployable
 from surrogym_trainer.deployment.reading import controller_of
 from surrogym_trainer.deployment.reference import begin, decide
 from surrogym_trainer.deployment.targets import deploy
@@ -32,6 +33,7 @@ ALLOWED = {"sin", "cos", "exp", "fmod", "memcpy", "memset"}
 PLANTS = {
     "history": (plant(**HISTORY), (64, 64), None),
     "linear": (plant(), 0, None),
+    "limits": (limited(plant(**HISTORY)), (16,), None),
     "choices": (plant(MultiDiscreteAction(nvec=(2, 5)), actions=1), (16,), (1.0, 3.0)),
 }
 
@@ -113,6 +115,37 @@ def test_a_c_controller_gives_the_reference_actions_for_random_measurements(
     assert len(set(chosen)) >= 4, "a policy that always does the same shows nothing"
     # in float the two best choices may be equal up to rounding, and an angle may lie at half a turn
     assert np.mean(close) >= (0.98 if single else 1.0)
+
+
+def test_test_vectors_and_random_measurements_reach_the_limits_of_a_controller(tmp_path: Path):
+    controller = made(tmp_path, "limits")
+    assert sum(vector.status == LIMITED for vector in vectors_of(controller)) >= 3
+    assert "ARM_LIMITED = 16" in header(controller, tmp_path)
+    assert "LIMITED" not in header(made(tmp_path, "history"), tmp_path)
+
+
+def test_a_controller_with_limits_decides_as_the_guard_of_an_evaluation(tmp_path: Path):
+    spec = limited(plant(**HISTORY))
+    controller, guard, rng = controller_of(network(tmp_path, spec, (16,))), Guard(spec), np.random.default_rng(0)
+    memory, fell = begin(controller), []
+    low, high = np.array([-2.0, -1.0, 0.0]), np.array([2.0, 2.0, 1.0])
+    reads = rng.uniform(low, high, (400, 3))
+    for step, read in enumerate(reads):
+        memory, (action,), (status,) = decide(controller, memory, read[None])
+        coordinates = memory.coordinates[0]
+        guard.begin(coordinates) if step == 0 else guard.reached(coordinates)
+        chosen, fallen = guard.choose(action)
+        assert fallen == (status == LIMITED)
+        np.testing.assert_allclose(chosen, action, rtol=1e-12)
+        fell.append(fallen)
+    assert 20 < sum(fell) < 380
+
+
+def header(controller: Controller, folder: Path) -> str:
+    shutil.rmtree(folder / "header", ignore_errors=True)
+    (folder / "header").mkdir()
+    write(controller, folder / "header")
+    return (folder / "header" / "arm_controller.h").read_text()
 
 
 def test_a_c_controller_with_lagged_inputs_equals_its_policy_in_closed_loop(tmp_path: Path):

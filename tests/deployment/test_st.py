@@ -10,7 +10,7 @@ import pytest
 
 pytest.importorskip("blark")
 
-from support.controllers import network, plant
+from support.controllers import limited, network, plant
 from support.structured_text import FunctionBlock
 from surrogym_shared.spec import MultiDiscreteAction
 from surrogym_trainer.deployment.controller import Choices, Controller, NotDeployable
@@ -45,6 +45,14 @@ def decided(controller: Controller, real: str) -> list[float]:
 def test_the_structured_text_controller_equals_the_reference_for_lags_limits_and_faults(tmp_path: Path):
     controller = controller_of(network(tmp_path, plant(**PAST), (3,)))
     assert max(decided(controller, "LREAL")) <= 1e-6
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("real", ["LREAL", "REAL"])
+def test_the_structured_text_controller_keeps_limits_as_the_reference_does(tmp_path: Path, real: str):
+    controller = controller_of(network(tmp_path, limited(plant(**PAST)), (3,)))
+    assert max(decided(controller, real)) <= (1e-6 if real == "LREAL" else 1e-4)
+    assert "status := 16" in source_of(controller, real, "arm")
 
 
 @pytest.mark.slow

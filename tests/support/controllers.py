@@ -18,6 +18,8 @@ from surrogym_shared.spec import (
     Coordinate,
     DiscreteAction,
     EnvironmentSpec,
+    Limit,
+    Limits,
     MultiDiscreteAction,
     ObservationEntry,
     Term,
@@ -65,6 +67,19 @@ def plant(action: Any = TORQUES, **history: Any) -> EnvironmentSpec:
         query="rollout",
     )
     return with_history(spec, **history) if history else spec
+
+
+def limited(spec: EnvironmentSpec) -> EnvironmentSpec:
+    """The same plant, whose slide and a mixed term must keep limits."""
+    mixed = (Term.linear(slide=1.0, target=1.0) + Term.sin(angle=0.5)).clipped(-3.0, 5.0)
+    limits = Limits(
+        keep=(
+            Limit(name="slide", term=Term.linear(slide=1.0), low=-0.9, high=1.9, margin=0.3),
+            Limit(name="mixed", term=mixed, low=-2.5, margin=0.2),
+        ),
+        fallback=(Term.linear(slide=-2.0).clipped(-1.5, None), Term.constant(1.0) + Term.cos(angle=1.0)),
+    )
+    return EnvironmentSpec.model_validate({**spec.model_dump(), "limits": limits.model_dump()})
 
 
 def network(folder: Path, spec: EnvironmentSpec, units: Any = (64, 64), gain: float = 1.0, **card: Any) -> Path:

@@ -23,6 +23,7 @@ Array = NDArray[np.float64]
 Activation = Literal["none", "tanh", "relu"]
 
 NOT_FINITE, OUT_OF_RANGE, LATE, NO_ACTION = 1, 2, 4, 8  # bits of a status; 0 means that the action is the policy's
+LIMITED = 16  # status of a step in which the fallback of the specification's limits acts
 PERIODS = 2  # default timeout in sampling periods, because the duration of a period varies
 LARGEST = 1e37  # largest number in a controller, so that sums of a few still fit in a C float
 SHORTEST = 1e-6  # smallest period or timeout in seconds
@@ -138,6 +139,31 @@ class Decision:
     reach: Array  # (F,) half of a continuous action's range; empty for a discrete action
 
 
+@dataclass(frozen=True)
+class KeptLimit:
+    """A limit of the specification: the range [low, high] of a term of the coordinates, infinite without an end.
+
+    Attributes:
+        term: the term; its name is the limit's.
+        low, high: ends of the range.
+        margin: distance from an end within which the fallback acts.
+    """
+
+    term: Observed
+    low: float
+    high: float
+    margin: float
+
+
+@dataclass(frozen=True)
+class Guard:
+    """Limits that the controller keeps: ``fallback`` (F terms) acts in the place of the policy shortly before one would
+    be left, as ``surrogym_shared.limits.falls_back`` defines it."""
+
+    limits: tuple[KeptLimit, ...]
+    fallback: tuple[Observed, ...]
+
+
 @dataclass(frozen=True, eq=False)
 class Controller:
     """A policy with everything around it: one call per sampling period, from R measurements to F action entries.
@@ -161,6 +187,7 @@ class Controller:
         timeout: largest age of a measurement in seconds; infinite without one.
         period: seconds between decisions; None if it is not declared.
         digests: SHA-256 of policy and specification and, if the card has it, the hash of the model's samples.
+        guard: the limits that it keeps; None without limits.
     """
 
     name: str
@@ -175,6 +202,7 @@ class Controller:
     timeout: float
     period: float | None
     digests: dict[str, str]
+    guard: Guard | None = None
 
     @property
     def counts(self) -> tuple[int, ...]:
@@ -244,6 +272,7 @@ def controller_from(
         timeout=_timeout(period, choices.timeout),
         period=period,
         digests=digests,
+        guard=_guard(spec, low, high),
     )
     _require_in_float("a specification", [number for number in _numbers(made) if np.isfinite(number)])
     return made
@@ -260,6 +289,15 @@ def _numbers(controller: Controller) -> Iterator[float]:
     for part in (part for entry in controller.observation for part in entry.parts):
         yield from (part.coefficient, *(weight for _, weight in part.weights))
     yield from (*controller.low, *controller.high, *controller.fallback)
+    for limit in controller.guard.limits if controller.guard else ():
+        yield from (limit.low, limit.high, limit.margin, *_constants(limit.term))
+    for term in controller.guard.fallback if controller.guard else ():
+        yield from _constants(term)
+
+
+def _constants(term: Observed) -> Iterator[float]:
+    for part in term.parts:
+        yield from (part.coefficient, *(weight for _, weight in part.weights))
 
 
 def _require_small(decision: Decision) -> None:
@@ -346,12 +384,43 @@ def _remembered(spec: EnvironmentSpec, place: int, coordinate: Coordinate, lag: 
     )
 
 
-def _observed(spec: EnvironmentSpec, index: int) -> Observed:
-    entry, names = spec.observation[index], spec.coordinate_names
-    parts = tuple(
-        Part(p.function, p.coefficient, tuple((names.index(n), w) for n, w in p.weights.items()))
-        for p in entry.term.parts
+def _guard(spec: EnvironmentSpec, low: Array, high: Array) -> Guard | None:
+    """Return the limits of a specification with its fallback, clipped to actions from low (F,) to high (F,)."""
+    if spec.limits is None:
+        return None
+    limits = (
+        KeptLimit(
+            _computed(spec, limit.name, limit.term, *_ends(limit.term.low, limit.term.high)),
+            *_ends(limit.low, limit.high),
+            limit.margin,
+        )
+        for limit in spec.limits.keep
     )
+    fallback = []
+    for entry, (term, least, most) in enumerate(zip(spec.limits.fallback, low, high, strict=True)):
+        begin, end = np.clip(_ends(term.low, term.high), least, most)
+        fallback.append(_computed(spec, f"fallback {entry}", term, float(begin), float(end)))
+    return Guard(tuple(limits), tuple(fallback))
+
+
+def _computed(spec: EnvironmentSpec, name: str, term: Term, low: float, high: float) -> Observed:
+    """Return a term of the coordinates, clipped to [low, high], as the controller computes it."""
+    return Observed(name, "", _parts(spec, term), low, high, -np.inf, np.inf)
+
+
+def _ends(low: float | None, high: float | None) -> tuple[float, float]:
+    return -np.inf if low is None else low, np.inf if high is None else high
+
+
+def _parts(spec: EnvironmentSpec, term: Term) -> tuple[Part, ...]:
+    names = spec.coordinate_names
+    return tuple(
+        Part(p.function, p.coefficient, tuple((names.index(n), w) for n, w in p.weights.items())) for p in term.parts
+    )
+
+
+def _observed(spec: EnvironmentSpec, index: int) -> Observed:
+    entry, parts = spec.observation[index], _parts(spec, spec.observation[index].term)
     limited = [(-np.inf if a is None else a, np.inf if b is None else b) for a, b in _clips(entry.term, entry)]
     return Observed(entry.name, _unit(spec, entry.term), parts, *limited[0], *limited[1])
 

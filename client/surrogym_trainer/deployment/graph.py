@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surrogym_trainer.deployment.c.files import prefix_of
-from surrogym_trainer.deployment.controller import Array, Controller, Observed, Remembered
+from surrogym_trainer.deployment.controller import Array, Controller, Guard, Observed, Remembered
 from surrogym_trainer.deployment.reference import begin, decide, observe
 from surrogym_trainer.deployment.running import Running
 from surrogym_trainer.policies.onnx_files import INPUT, OUTPUT
@@ -65,9 +65,24 @@ def description(controller: Controller) -> dict[str, Any]:
         "reading": "a reading outside of sensor is a fault, and the action is the fallback; an angle is wrapped to "
         "[-pi, pi); another measurement is clipped to low and high; lags follow from earlier steps",
         "scaling": "inside: give observations in their units; actions come in theirs, within low and high",
+        **({} if controller.guard is None else _limits(controller.guard, names)),
         "sampling_period": controller.period,
         "timeout": _finite(controller.timeout),
         "sha256": controller.digests,
+    }
+
+
+def _limits(guard: Guard, names: tuple[str, ...]) -> dict[str, Any]:
+    """Return the limits, which the network does not keep by itself, as a JSON object."""
+    return {
+        "limits": [
+            {"name": limit.term.name, "is": _term(limit.term, names), "margin": limit.margin}
+            | {"low": _finite(limit.low), "high": _finite(limit.high)}
+            for limit in guard.limits
+        ],
+        "fallback": [_term(term, names) for term in guard.fallback],
+        "keeping": "not inside: apply the fallback if the distance to an end of a limit is below its margin, now or "
+        "after one more step with the same change",
     }
 
 

@@ -13,12 +13,15 @@ from numpy.typing import NDArray
 
 from surrogym_trainer.deployment.controller import (
     LATE,
+    LIMITED,
     NO_ACTION,
     NOT_FINITE,
     OUT_OF_RANGE,
     Array,
     Controller,
     Decision,
+    Guard,
+    KeptLimit,
     Observed,
 )
 
@@ -67,8 +70,29 @@ def decide(controller: Controller, memory: Memory, measurements: Array, age: Arr
     action, wrong = act(controller, observe(controller, coordinates))
     status = np.where((status == 0) & wrong, NO_ACTION, status)
     action = np.where((status == 0)[:, None], action, controller.fallback)
+    measured: Bools = (status & ~NO_ACTION) == 0
+    if controller.guard is not None:
+        acts = measured & _falls_back(controller.guard, memory, coordinates)
+        safe = np.stack([_entry(term, coordinates) for term in controller.guard.fallback], axis=1)
+        action, status = np.where(acts[:, None], safe, action), np.where(acts, LIMITED, status)
     remembered = action.astype(np.float32).astype(np.float64)
-    return Decided(Memory(coordinates, remembered, np.ones_like(wrong), (status & ~NO_ACTION) == 0), action, status)
+    return Decided(Memory(coordinates, remembered, np.ones_like(wrong), measured), action, status)
+
+
+def _falls_back(guard: Guard, memory: Memory, coordinates: Array) -> Bools:
+    """Whether (N,) the fallback of the limits acts at coordinates (N, C)."""
+    acts = np.zeros(len(coordinates), dtype=np.bool_)
+    known = memory.acted & memory.measured
+    for limit in guard.limits:
+        now, before = (_room(limit, q) for q in (coordinates, memory.coordinates))
+        acts |= np.minimum(now, np.where(known, 2 * now - before, now)) < limit.margin
+    return acts
+
+
+def _room(limit: KeptLimit, coordinates: Array) -> Array:
+    """Distance (N,) from coordinates (N, C) to the nearer end of a limit."""
+    value = _entry(limit.term, coordinates)
+    return np.minimum(value - limit.low, limit.high - value)
 
 
 def judged(controller: Controller, read: Array, age: Array) -> Ints:

@@ -14,7 +14,7 @@ import numpy as np
 from surrogym_sampler.original.actions import decode_actions
 from surrogym_sampler.original.episode import Episode, Moment
 from surrogym_sampler.original.protocol import LONGEST_EPISODE
-from surrogym_trainer.deployment.controller import Array, Controller
+from surrogym_trainer.deployment.controller import LIMITED, Array, Controller
 from surrogym_trainer.policies.predict import Predict
 
 NEGLIGIBLE = 1e-6, 1e-4  # largest negligible difference of actions in double and in float, as a share of their range
@@ -111,6 +111,6 @@ class Comparison:
     def _decided(self, moment: Moment, expected: Array) -> Array:
         """Return the controller's action (F,), and record its difference from the policy's."""
         status, action = self._running.step(moment.coordinates[self._places])
-        self._faults += status != 0
+        self._faults += status not in (0, LIMITED)
         self._differences.append(float((np.abs(action - expected) / self._width).max()) if status == 0 else 0.0)
         return action

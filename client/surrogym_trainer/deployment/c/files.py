@@ -83,7 +83,7 @@ def write_sources(controller: Controller, folder: Path, *, single: bool = False)
     flag = f"{prefix.upper()}_FLOAT"
     chosen = {"single": f"#ifndef {flag}\n#define {flag}\n#endif\n" if single else ""}
     chosen["numbers_are"] = "float" if single else f"double, or float with -D{flag}"
-    for ending, parts in (("h", _header(controller) | chosen), ("c", source.parts_of(controller))):
+    for ending, parts in (("h", _header(controller) | chosen), ("c", source.parts_of(controller, prefix))):
         content = _template(f"controller.{ending}").substitute(names, **parts)
         content = re.sub(r"\n{3,}", "\n\n", content)
         (folder / f"{prefix}_controller.{ending}").write_text(content, encoding="utf-8")
@@ -111,10 +111,24 @@ def _header(controller: Controller) -> dict[str, Any]:
         "fallback": ", ".join(f"{a:g}" for a in controller.fallback),
         "numbers": source.stack_of(controller),
         "constants": f"{source.constants_of(controller):,}",
+        **_limits(controller),
         "R": len(controller.measurements),
         "F": len(controller.low),
         "D": len(controller.observation),
         "C": len(controller.coordinates),
+    }
+
+
+def _limits(controller: Controller) -> dict[str, str]:
+    """Return the parts of the header about limits; empty ones without limits."""
+    if controller.guard is None:
+        return {"limited_bit": "", "rooms": "", "keeps": ""}
+    names = ", ".join(source.plain(limit.term.name) for limit in controller.guard.limits)
+    prefix = prefix_of(controller)
+    return {
+        "limited_bit": f",\n    {prefix.upper()}_LIMITED = 16 /* the fallback of the limits acts: no fault */",
+        "rooms": f"    {prefix}_real room[{len(controller.guard.limits)}]; /* distance to each limit */\n",
+        "keeps": f" * Limits that it keeps: {names}. Shortly before one, a fallback of their own acts.\n",
     }
 
 

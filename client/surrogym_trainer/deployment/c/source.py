@@ -77,8 +77,8 @@ def stack_of(controller: Controller) -> int:
     return max(sizes[::2]) + max([*sizes[1::2], 0]) + len(controller.observation) + len(controller.coordinates)
 
 
-def parts_of(controller: Controller) -> dict[str, str]:
-    """Return the parts of the C source, by their names in the template."""
+def parts_of(controller: Controller, prefix: str) -> dict[str, str]:
+    """Return the parts of the C source, by their names in the template. ``prefix``: of all C names."""
     body = {
         "observation": _observation(controller.observation),
         "place": _place(controller),
@@ -88,6 +88,7 @@ def parts_of(controller: Controller) -> dict[str, str]:
         "in_time": _in_time(controller),
         "fallback_lines": _lines(8, (f"action[{i}] = {real(a)};" for i, a in enumerate(controller.fallback))),
     }
+    body |= _guard(controller, prefix)
     used = "".join(body.values())
     helpers = {"wrapped(": WRAPPED, "clipped(": CLIPPED, "squashed(": SQUASHED}
     return {
@@ -95,6 +96,45 @@ def parts_of(controller: Controller) -> dict[str, str]:
         "helpers": "".join(code for call, code in helpers.items() if call in used),
         **body,
     }
+
+
+def _guard(controller: Controller, prefix: str) -> dict[str, str]:
+    """Return the parts of the source that keep limits; empty ones without limits."""
+    guard = controller.guard
+    if guard is None:
+        return {"limited": "", "known": "", "guard": "", "not_limited": "status"}
+    lines = ["const real *q = controller->coordinates;", "real now, soon;", "int acts = 0;"]
+    for i, limit in enumerate(guard.limits):
+        value, ends = _clipped(limit.term), []
+        if math.isfinite(limit.low):
+            ends.append(f"({value}) - {real(limit.low)}")
+        if math.isfinite(limit.high):
+            ends.append(f"{real(limit.high)} - ({value})")
+        lines.append(f"now = {ends[0]}; /* {plain(limit.term.name)} */")
+        if len(ends) > 1:
+            lines += [f"soon = {ends[1]};", "now = soon < now ? soon : now;"]
+        lines += [
+            f"soon = known ? now + now - controller->room[{i}] : now;",
+            f"acts |= (soon < now ? soon : now) < {real(limit.margin)};",
+            f"controller->room[{i}] = now;",
+        ]
+    lines += ["if (acts) {", *(f"    action[{i}] = {_clipped(term)};" for i, term in enumerate(guard.fallback)), "}"]
+    body = _lines(4, [*lines, "return acts;"])
+    limited = f"{prefix.upper()}_LIMITED"
+    return {
+        "limited": "\n/* Whether the fallback of the limits acts. Then action is the fallback's. */\n"
+        f"static int limited({prefix}_controller *controller, int known, real *action)\n{{\n{body}\n}}\n",
+        "known": "    const int known = controller->acted && controller->measured;\n",
+        "guard": f"        if (limited(controller, known, action))\n            status = {limited};\n",
+        "not_limited": f"status & ~{limited}",
+    }
+
+
+def _clipped(term: Observed) -> str:
+    value = " + ".join(_part(part) for part in term.parts)
+    if math.isinf(term.low) and math.isinf(term.high):
+        return value
+    return f"clipped({value}, {real(term.low)}, {real(term.high)})"
 
 
 def constants_of(controller: Controller) -> int:
@@ -130,10 +170,7 @@ def _array(name: str, array: Array) -> str:
 def _observation(entries: Iterable[Observed]) -> str:
     lines = []
     for i, entry in enumerate(entries):
-        value = " + ".join(_part(part) for part in entry.parts)
-        if not (math.isinf(entry.low) and math.isinf(entry.high)):
-            value = f"clipped({value}, {real(entry.low)}, {real(entry.high)})"
-        lines.append(f"observation[{i}] = (real)(float)({value}); /* {plain(entry.name)} */")
+        lines.append(f"observation[{i}] = (real)(float)({_clipped(entry)}); /* {plain(entry.name)} */")
     return _lines(4, lines)
 
 

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from surrogym_trainer.deployment.c.files import prefix_of
-from surrogym_trainer.deployment.controller import Controller, Decision, Dense, NotDeployable, Observed, Part
+from surrogym_trainer.deployment.controller import Controller, Decision, Dense, KeptLimit, NotDeployable, Observed, Part
 
 REAL_TYPES = ("LREAL", "REAL")  # types of numbers with 64 and with 32 bits
 LARGEST = {"LREAL": float(np.finfo(np.float64).max), "REAL": 3.4028234e38}
@@ -166,9 +166,69 @@ def source_of(controller: Controller, real: str, name: str) -> str:
         observe=_indented(4, "\n".join(_observation(controller.observation, rounded))),
         network=_indented(4, "\n".join(_layers(decision.layers))),
         y=outputs,
+        **_guard(controller, real),
         decide=_indented(4, squash + decide.substitute(last=last["F"] - 1, y=outputs, real=real)),
         rounded_command=rounded("command[i]"),
     )
+
+
+GUARDED = """\
+(* Limits: their fallback acts shortly before one would be left. *)
+IF measured THEN
+    limited := FALSE;
+$limits
+    IF limited THEN
+        status := 16;
+$fallback
+    END_IF
+END_IF"""
+
+
+def _guard(controller: Controller, real: str) -> dict[str, str]:
+    """Return the parts of the source that keep limits; empty ones without limits."""
+    guard = controller.guard
+    if guard is None:
+        return {"guard": "", "guard_variables": "", "limited": ""}
+    limits: list[str] = []
+    fallback: list[str] = []
+    for i, limit in enumerate(guard.limits):
+        margin = _number(limit.margin, real)
+        limits += [f"(* {plain(limit.term.name)} *)", *_value(limit.term), "now := LARGEST;"]
+        limits += [f"IF {room} < now THEN\n    now := {room};\nEND_IF" for room in _rooms(limit)]
+        limits += [
+            "soon := now;",
+            f"IF known THEN\n    soon := now + now - room[{i}];\nEND_IF",
+            f"room[{i}] := now;",
+            f"IF now < {margin} OR soon < {margin} THEN\n    limited := TRUE;\nEND_IF",
+        ]
+    for i, term in enumerate(guard.fallback):
+        fallback += [*_value(term), f"command[{i}] := value;"]
+    body = Template(GUARDED).substitute(
+        limits=_indented(4, "\n".join(limits)), fallback=_indented(8, "\n".join(fallback))
+    )
+    variables = f"    room : ARRAY[0..{len(guard.limits) - 1}] OF {real}; (* distance to each limit *)\n"
+    return {
+        "guard": f"{body}\n",
+        "guard_variables": f"{variables}    now, soon : {real};\n    limited : BOOL;\n",
+        "limited": ", 16: the fallback of the limits acts",
+    }
+
+
+def _rooms(limit: KeptLimit) -> Iterable[str]:
+    """Yield the distance of the value from each end of a limit."""
+    if math.isfinite(limit.low):
+        yield _sum([(1.0, "value"), (-limit.low, "")])
+    if math.isfinite(limit.high):
+        yield _sum([(limit.high, ""), (-1.0, "value")])
+
+
+def _value(term: Observed) -> Iterable[str]:
+    """Yield the lines that compute a clipped term."""
+    yield f"value := {_sum(map(_part, term.parts))};"
+    for sign, limit in (("<", term.low), (">", term.high)):
+        if math.isfinite(limit):
+            literal = _number(limit, "LREAL")
+            yield f"IF value {sign} {literal} THEN\n    value := {literal};\nEND_IF"
 
 
 def _constants(controller: Controller, real: str) -> Iterable[str]:
@@ -223,11 +283,7 @@ def _number(value: float, real: str) -> str:
 def _observation(entries: Iterable[Observed], rounded: Callable[[str], str]) -> Iterable[str]:
     for index, entry in enumerate(entries):
         yield f"(* {plain(entry.name)} *)"
-        yield f"value := {_sum(map(_part, entry.parts))};"
-        for sign, limit in (("<", entry.low), (">", entry.high)):
-            if math.isfinite(limit):
-                literal = _number(limit, "LREAL")
-                yield f"IF value {sign} {literal} THEN\n    value := {literal};\nEND_IF"
+        yield from _value(entry)
         yield f"observation[{index}] := {rounded('value')};"
 
 
