@@ -36,7 +36,7 @@ class Code(StrEnum):
     TOO_LARGE = "too_large"
     UNSUPPORTED_MEDIA_TYPE = "unsupported_media_type"
     REQUEST_TIMEOUT = "request_timeout"  # the body of the request did not arrive in time
-    TOO_MANY_REQUESTS = "too_many_requests"  # a queue or a cap is full
+    TOO_MANY_REQUESTS = "too_many_requests"  # a queue or a limit of the server is full
     DEADLINE_EXCEEDED = "deadline_exceeded"  # the reply would have been late, so it was not computed
     UNAVAILABLE = "unavailable"
     DAMAGED = "damaged"  # stored data are corrupt

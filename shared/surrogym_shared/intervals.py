@@ -19,7 +19,7 @@ class Interval(NamedTuple):
 
 
 def of_mean(values: Sequence[float]) -> Interval | None:
-    """Return the interval of the mean, by a bootstrap with a fixed seed; None for fewer than two values.
+    """Return the 95 % interval of the mean, by a bootstrap with a fixed seed; None for fewer than two values.
 
     Returns of episodes are often skewed, so no normal distribution is assumed.
     """
@@ -39,8 +39,8 @@ def of_mean(values: Sequence[float]) -> Interval | None:
 
 
 def of_share(successes: int, trials: int) -> Interval | None:
-    """Return the interval of a share of successes, by Wilson's score; None without trials. 100 of 100 gives 0.963 to
-    1."""
+    """Return the 95 % interval of a share of successes, by Wilson's score; None without trials. 100 of 100 gives 0.963
+    to 1."""
     if not trials:
         return None
     share, spread = successes / trials, Z**2 / trials

@@ -166,7 +166,7 @@ class EnvironmentSpec(Frozen):
         return PRESETS[self.design.preset]
 
     def known(self, coordinates: Sequence[float]) -> bool:
-        """Whether all lags (past values) in a state (C,) are known, so that a model learns from a step from there."""
+        """Whether all lags (past values) in a state (C,) are known, so that a model can learn from a step there."""
         return all(q >= c.counted for c, q in zip(self.coordinates, coordinates, strict=True) if c.counted)
 
     @model_validator(mode="after")
