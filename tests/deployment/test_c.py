@@ -340,5 +340,5 @@ def test_an_arduino_sketch_keeps_its_period_when_its_clock_wraps_around(tmp_path
 
 def test_an_arduino_sketch_with_a_period_its_clock_cannot_count_is_refused(tmp_path: Path):
     path = network(tmp_path, plant().model_copy(update={"sampling_period": 3e6}))
-    with pytest.raises(NotDeployable, match="up to 2,000,000 s, got 6e"):
+    with pytest.raises(NotDeployable, match="at most 2,000,000 s for a sketch, got 6e"):
         write_arduino(controller_of(path), tmp_path)

@@ -182,7 +182,7 @@ def test_a_nan_observation_ends_the_evaluation(diary):
             self.x = 0.0
             return np.zeros(2), info
 
-    with pytest.raises(EvaluationFailed, match="expected 1 finite coordinates and a finite reward"):
+    with pytest.raises(EvaluationFailed, match="to give 1 finite coordinates and a finite reward"):
         run(Blind, lambda observation: np.ones_like(observation))
     assert diary()[-2:] == ["step 1", "close"]
 

@@ -97,7 +97,7 @@ def test_an_environment_program_can_restore_its_snapshot():
 @pytest.mark.parametrize("snapshot", [b"", b"nonsense", original.make("CartPole-v1").save()])
 def test_restoring_bytes_that_are_no_snapshot_of_the_task_is_refused(snapshot):
     plant = original.make("Pendulum-v1", access="snapshot")
-    with pytest.raises(StepFailed, match="expected a snapshot of"):
+    with pytest.raises(StepFailed, match="expected a snapshot with"):
         plant.restore(snapshot)
     plant.close()
 

@@ -84,9 +84,9 @@ def test_a_server_that_returns_more_queries_than_requested_causes_no_real_step(s
 @pytest.mark.parametrize(
     ("change", "why"),
     [
-        ({"coordinates": [1e6]}, r"coordinate 'x': expected a value in \[-1, 1\], got 1e\+06"),
-        ({"action": [500.0]}, r"action 0: expected a value in \[-1, 1\], got 500"),
-        ({"coordinates": [0.0, 0.0]}, "coordinates: expected 1 numbers, got 2"),
+        ({"coordinates": [1e6]}, r"coordinate 'x': expected a value in the environment's range \[-1, 1\], got 1e\+06"),
+        ({"action": [500.0]}, r"action 0: expected a value in the environment's range \[-1, 1\], got 500"),
+        ({"coordinates": [0.0, 0.0]}, "coordinates of the query: expected 1 numbers, .* got 2: .*"),
     ],
 )
 def test_a_query_outside_the_environments_limits_is_refused_without_a_step(server_process, line, change, why):
@@ -128,7 +128,7 @@ def test_queries_may_use_the_whole_bounds_up_to_float32_rounding():
     for x in (-1.0, -1.0 - 1e-7, 2.9, 3.0 + 2e-7):
         check_query(spec, step([x], [1.0 + 1e-7]))
     for x in (-1.1, 3.1, math.inf, math.nan):
-        with pytest.raises(QueryRefused, match=r"in \[-1, 3\]"):
+        with pytest.raises(QueryRefused, match=r"range \[-1, 3\]"):
             check_query(spec, step([x], [0.0]))
 
 

@@ -265,7 +265,8 @@ def _known(name: str, spec: EnvironmentSpec | None, choose: Choose, preset: str,
         if name not in TASKS:
             raise
         raise UnknownEnvironment(
-            f"{error}, or {', '.join(TASKS[name].spec().coordinate_names)} in this order"
+            f"{error}; or describe the task of Surrogym, whose coordinates are "
+            f"{', '.join(TASKS[name].spec().coordinate_names)}, in this order"
         ) from error
     except BaseException:
         simulator.close()
