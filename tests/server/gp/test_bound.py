@@ -195,7 +195,7 @@ def test_a_sparse_fit_keeps_relevant_inputs():
     assert fewer_inputs(x, y, fitted(x, y, 60), FitOptions(), 60, torch.ones(2, dtype=torch.bool), -1.0) is None
 
 
-def test_a_sparse_fit_of_an_odd_function_keeps_an_input_that_changes_sign():
+def test_a_sparse_process_with_an_odd_kernel_never_drops_its_mirrored_input():
     """Of a function that is zero everywhere else nothing would be left."""
     x, _ = points(600, 2, seed=7)
     y = 0.01 * torch.from_numpy(np.random.default_rng(0).normal(size=600))
