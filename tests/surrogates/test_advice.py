@@ -247,7 +247,7 @@ def test_waiting_messages_mention_a_running_fit() -> None:
     assert words_of_audit(view(output("x", 0.7), phase="ready")) == "0 real steps of audits"
 
 
-def test_the_message_of_a_design_that_ended_unsure_names_index_and_target() -> None:
+def test_the_message_of_a_design_that_ended_unsure_names_confidence_index_and_target() -> None:
     assert words_of_uncertainty(view(output("x", 0.7))) == (
         "the design has spent its budget without being certain of its model: confidence index 0.7000, target 0.999"
     )

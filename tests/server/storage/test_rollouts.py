@@ -81,7 +81,7 @@ def test_a_rollout_that_terminates_early_returns_its_unused_steps_to_the_budget(
     assert storage.ledger.read(name).total == 2
 
 
-def test_repeating_a_rollouts_samples_is_harmless_and_changed_ones_are_refused(
+def test_rollout_samples_sent_twice_are_stored_once_and_changed_ones_refused(
     storage: Storage, name: str, long: LeasedQuery, answer: Answer
 ) -> None:
     batch = [answer(long, step=0), answer(long, step=1)]
