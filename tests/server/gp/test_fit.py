@@ -95,7 +95,7 @@ def test_the_fitted_marginal_likelihood_is_at_least_that_of_scikit_learn(seed):
     assert ours >= theirs - 1e-3
 
 
-def test_known_length_scales_and_noise_are_recovered(rng):
+def test_a_fit_recovers_the_length_scales_and_noise_that_generated_its_points(rng):
     x, y = draw(rng, 120, [0.7, 2.5], 1e-2)
     hyper = fit(x, y, FitOptions(linear=False)).posterior.hyper
     assert hyper.lengthscale.tolist() == pytest.approx([0.7, 2.5], rel=0.35)

@@ -92,7 +92,7 @@ def test_input_warping_and_amplitude_of_a_process_with_growth_rates_are_consiste
     assert math.isclose(float(bend(torch.tensor([1.0]), torch.tensor([1.0]))), math.e - 1, rel_tol=1e-6)
 
 
-def test_a_process_with_growth_rates_with_a_quadratic_kernel_is_refused():
+def test_combining_growth_rates_with_a_quadratic_kernel_is_refused():
     z, t = points(5)
     with pytest.raises(ValueError, match="quadratic"):
         fit_growing(z, t, ALL, FitOptions(quadratic=True), [])
