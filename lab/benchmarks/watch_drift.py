@@ -9,7 +9,7 @@ steps are counted from the change, and those of them at which it shows.
 
 Run it by::
 
-    python lab/benchmarks/watch_drift.py --first-seed 450 --seeds 3
+    python lab/benchmarks/watch_drift.py --first-seed 460 --seeds 3
 """
 
 from __future__ import annotations
