@@ -95,7 +95,7 @@ A sampler claims queries and adds samples; a trainer opens a session and steps i
 @dataclass(frozen=True)
 class DesignPort:
     """The two functions of the design: ``plan`` chooses the first queries, and ``run`` computes a round (a fit and the
-    next queries). Tests replace them by cheaper ones."""
+    next queries). Tests replace both by faster functions."""
 
     plan: Plan = initial_queries
     run: Callable[[DesignJob], DesignResult] = run_design_job
@@ -172,7 +172,8 @@ def create_app(settings: Settings, design: DesignPort = DesignPort(), fits: Fits
     if settings.loopback and not settings.tokens:
         app.add_middleware(KnownHosts, hosts=frozenset({*LOCAL_NAMES, "127.0.0.1", "::1", *settings.host_names}))
     app.add_middleware(Observed, metrics=app.state.metrics)
-    # Steps are the most frequent requests, so their routes come first and without the search in an included router.
+    # Steps are the most frequent requests. Their routes come first and are added directly, because an included router
+    # would cost a search of its own.
     app.router.routes.extend(stepping.routes)
     rooms = (sessions, service, metrics, surrogates, queries, samples, logs, models)
     for one in (*(room.router for room in rooms), *(feature.router for feature in FEATURES), events.router):
@@ -219,7 +220,7 @@ async def _lifespan(
     fits: Fits | None,
 ) -> AsyncIterator[State]:
     torch.set_num_threads(settings.threads)
-    threadpool_limits(settings.threads, user_api="blas")  # NumPy computes the actions of policies
+    threadpool_limits(settings.threads, user_api="blas")  # threads of NumPy's BLAS, which computes policies' actions
     process = _build_process(settings, design, storage, app.state.metrics, engine, fits)
     app.state.notices = process.notices
     services = _build_services(settings, design, process)

@@ -111,7 +111,7 @@ class SeqConflict(Conflict):
 
 
 class ForeignLease(Conflict):
-    """The lease token of a request is not that of a lease of the query."""
+    """The lease token of a request does not belong to the query that the request names."""
 
 
 class LeaseExpired(Conflict):
@@ -147,7 +147,7 @@ class Unavailable(SurrogymError):
 
 
 class Damaged(Unavailable):
-    """Stored data differ from what was written. Trying again helps only after a copy was restored."""
+    """Stored data differ from what was written. Trying again helps only after a backup was restored."""
 
 
 class Overloaded(Unavailable):
@@ -163,12 +163,13 @@ class NotInstalled(SurrogymError):
 
 
 class PluginFailed(SurrogymError):
-    """An acquisition or a family of models raised an error or broke its invariants. The message names it."""
+    """An acquisition or a family of models raised an error, or its result violates a rule of its interface. The message
+    names the acquisition or the family."""
 
 
 class ChoiceFailed(PluginFailed):
-    """An acquisition raised an error or broke its invariants. The model was fitted, but its next queries could not be
-    chosen."""
+    """An acquisition raised an error, or its result violates a rule of its interface. The model was fitted, but its
+    next queries could not be chosen."""
 
 
 class NumericalFailure(SurrogymError):

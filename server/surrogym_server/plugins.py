@@ -33,7 +33,8 @@ class Registry(plugins.Registry[T]):
     """Classes by name, and instances made from them. A request chooses a class only by its name."""
 
     def lack(self, choice: Choice) -> str | None:
-        """Describe what must be installed or repaired before a stored choice can be made; None if nothing.
+        """Describe what must be installed or repaired before an instance of a stored choice can be made; None if
+        nothing must.
 
         The text is a noun phrase that can follow "it needs".
         """
@@ -78,11 +79,13 @@ class Registry(plugins.Registry[T]):
 
 @contextmanager
 def guarded(what: str, failure: type[SurrogymError], *, interrupts: bool = False) -> Iterator[None]:
-    """Return a context for code of another package: its errors become a ``failure`` whose message begins with ``what``.
+    """Return a context for calls of another package's code: errors of this code become a ``failure``.
 
-    A ``SurrogymError`` passes unchanged. The message includes the type of the error, except that of a ``ValueError``
-    where ``failure`` is ``InvalidSpec``: plug-ins refuse a specification by a ``ValueError``. ``KeyboardInterrupt``
-    passes unless ``interrupts`` is set, which requests of a server do: there it is not a person's Ctrl-C.
+    The message of the failure begins with ``what``. It includes the type of the error, except that of a ``ValueError``
+    if ``failure`` is ``InvalidSpec``, because plug-ins raise ``ValueError`` on purpose to refuse a specification.
+
+    A ``SurrogymError`` passes unchanged. ``KeyboardInterrupt`` passes unless ``interrupts`` is True. Requests of a
+    server set it, because no person has pressed Ctrl-C there.
     """
     try:
         yield

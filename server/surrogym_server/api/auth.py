@@ -66,7 +66,7 @@ def bearer_token(scope: Scope) -> str | None:
 class Access(HTTPBearer):
     """Dependency that declares which roles may call a route, in addition to admin.
 
-    It only describes the route in OpenAPI; ``api.door`` enforces the roles.
+    The dependency only describes the route in OpenAPI; the module ``api.door`` enforces the roles.
     """
 
     def __init__(self, *roles: Role) -> None:

@@ -38,9 +38,9 @@ class Door:
     """Conditions for a request to a route, checked before the body is read.
 
     Attributes:
-        roles: roles that may call the route, in addition to admin; None if it needs no token.
-        bodies: largest size in bytes of each accepted media type, None for the server's own limit; empty if the route
-            reads no body.
+        roles: roles that may call the route, in addition to admin; None if the route needs no token.
+        bodies: accepted media types of the body, each with its largest size in bytes (None: the server's general
+            limit); empty if the route reads no body.
     """
 
     roles: tuple[Role, ...] | None
@@ -52,7 +52,8 @@ class Door:
         Raises:
             Unauthenticated: the token is missing or unknown.
             Forbidden: the token's role does not allow this route.
-            HTTPException: 415 for a wrong media type or a content encoding, 413 if Content-Length is too large.
+            HTTPException: 415 if the media type is wrong or the body has a content encoding such as gzip, 413 if
+                Content-Length is too large.
         """
         state = scope["app"].state
         gate: Gate = state.gate

@@ -38,8 +38,8 @@ HEADERS = {"cache-control": "no-store", "x-accel-buffering": "no"}
     },
 )
 async def changes(request: Request, use: Use) -> StreamingResponse:
-    """Stream an event ``changed`` after changes of any surrogate; read ``/v1/surrogates`` again after it. Several
-    changes in quick succession make one event."""
+    """Stream an event ``changed`` after changes of any surrogate. A client should then read ``/v1/surrogates`` again.
+    Several changes in quick succession make one event."""
     return _stream(request, _changes(use.events.changes()))
 
 

@@ -17,8 +17,8 @@ OWN_SITE = (b"", b"same-origin", b"none")  # Sec-Fetch-Site of programs, the ser
 
 
 class BodyLimit:
-    """Middleware that refuses bodies larger than the limit of their route, or than ``max_together`` bytes in all
-    requests at a time."""
+    """Middleware that refuses a request if its body is larger than the limit of its route, or if the bodies of all
+    running requests together are larger than ``max_together`` bytes."""
 
     def __init__(self, app: ASGIApp, max_together: int) -> None:
         self._app = app
@@ -72,7 +72,8 @@ class KnownHosts:
 
 
 class OwnPages:
-    """Middleware that refuses requests of another web site's pages, if they could change something or open a stream.
+    """Middleware that refuses a request from a page of another web site, if the request could change something or open
+    a stream.
 
     A browser names the page's site in ``Origin``, and its relation to this server in ``Sec-Fetch-Site``. Programs send
     neither header.

@@ -75,7 +75,8 @@ def get(name: str, version: int, use: Use, format: Literal["json", "safetensors"
     responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST, Code.TOO_LARGE, Code.NOT_INSTALLED),
 )
 async def add(name: str, request: Request, use: Use) -> ModelView:
-    """Import a model from an exported file that has the same outputs. It becomes the newest version."""
+    """Import a model from an exported file. The model must have the same outputs as the surrogate. It becomes the
+    surrogate's newest version."""
     data = await request.body()
     return resources.model_view(await run_in_threadpool(use.models.add, name, data))
 
@@ -109,9 +110,9 @@ async def predict(
 async def imagine(
     name: str, body: Annotated[Imagine, example(examples.IMAGINE)], request: Request, use: Use
 ) -> Imagined:
-    """Simulate episodes in the model, without a session: one along the mean, and ``draws`` along functions sampled from
-    the posterior, which diverge where the model is uncertain. An episode that terminates is shorter than
-    ``actions``."""
+    """Simulate episodes in the model, without a session. One episode follows the model's mean. ``draws`` further
+    episodes follow functions sampled from the posterior, which diverge where the model is uncertain. An episode that
+    terminates is shorter than ``actions``."""
     q, u = numbers("coordinates", body.coordinates), numbers("actions", body.actions)
     draws, seed, version = body.draws, body.seed, body.model
     episodes = await _in_turn(request, lambda: use.models.imagine(name, q, u, draws=draws, seed=seed, version=version))
@@ -119,7 +120,7 @@ async def imagine(
 
 
 async def _in_turn(request: Request, work: Callable[[], T]) -> T:
-    """Run ``work`` in a thread when few enough predictions run, so that read-only callers don't delay samplers and
-    trainers."""
+    """Wait until few enough predictions run at the same time, then run ``work`` in a thread. Without this limit,
+    read-only callers would delay samplers and trainers."""
     turns: Turns = request.app.state.turns
     return await turns.take(request, work)

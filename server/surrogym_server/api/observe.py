@@ -45,7 +45,8 @@ _GIVEN = re.compile(r"[A-Za-z0-9._-]{1,64}")
 _HEADER = REQUEST_HEADER.encode()
 # Headers for browsers: pages of other web sites may not load a reply, and its media type is not guessed.
 _FOR_BROWSERS = ((b"cross-origin-resource-policy", b"same-origin"), (b"x-content-type-options", b"nosniff"))
-_PROCESS, _NUMBERS = secrets.token_hex(4), count(1)  # a random id for each request would cost a system call
+# Parts of request ids: a random prefix and a number. A new random id for each request would cost a system call.
+_PROCESS, _NUMBERS = secrets.token_hex(4), count(1)
 
 
 class Observed:
@@ -79,7 +80,7 @@ class Observed:
                 self._note(scope, status, time.perf_counter() - started)
 
     def _note(self, scope: Scope, status: int, seconds: float) -> None:
-        method = scope.get("method", "GET")  # the scope of a stream has no method; it begins with a GET
+        method = scope.get("method", "GET")  # the scope of a WebSocket has no method; its handshake is a GET
         method = method if method in METHODS else "other"
         route = getattr(scope.get("route"), "path", UNKNOWN_ROUTE)
         key = (method, route, status)

@@ -29,7 +29,7 @@ WITH_TOKEN = documented(Code.UNAUTHENTICATED, Code.FORBIDDEN)
 
 
 def install(app: FastAPI) -> None:
-    """Make the app's reply 405 (method not allowed) list all methods of the path, of all its routes."""
+    """Make the app's reply 405 (method not allowed) list the methods of all routes that have the requested path."""
     app.add_exception_handler(405, _method_not_allowed)
 
 
@@ -64,7 +64,8 @@ def describe(app: FastAPI) -> dict[str, Any]:
 
 
 def _add_refusals(operation: dict[str, Any]) -> None:
-    """Add the error replies that all routes share to an operation, unless it describes them itself."""
+    """Add the error replies that all routes share to an operation. A reply that the operation describes itself
+    stays."""
     for status in (*ANY_REQUEST, *(WITH_TOKEN if "security" in operation else ())):
         operation["responses"].setdefault(str(status), {"$ref": RESPONSES.format(name=status)})
 

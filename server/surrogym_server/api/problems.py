@@ -152,10 +152,10 @@ def documented(*codes: Code) -> dict[int | str, dict[str, Any]]:
 
 
 def validation_detail(found: Sequence[Any]) -> str:
-    """Describe the most specific of the errors of a validation in one sentence: field, expected value, actual value.
+    """Describe one error of a validation in one sentence: field, expected value, actual value.
 
-    If a value fits none of several types, this is the error with the longest path, because it belongs to the type that
-    the value nearly fits.
+    This is the most specific error, the one with the longest path. If a value fits none of several types, this error
+    belongs to the type that the value nearly fits.
     """
     telling = max(found, key=lambda error: len(error["loc"]))
     said = in_words(telling)

@@ -106,8 +106,8 @@ def add_queries(name: str, body: Annotated[AddQueries, example(examples.ADD_QUER
     responses=documented(Code.UNKNOWN_SURROGATE, Code.IDEMPOTENCY_CONFLICT, Code.BEYOND_BUDGET, Code.INVALID_REQUEST),
 )
 def audit(name: str, body: Annotated[AuditModel, example(examples.ADD_QUERIES)], use: Use) -> QueryList:
-    """Queue the real steps of an audit, at states that a policy visits, to compare them with the model. They don't
-    count towards the budget, and the model learns from them too."""
+    """Queue the real steps of an audit, which compares the model with real steps at states that a policy visits. They
+    don't count towards the budget, and the model learns from them too."""
     queries = resources.requested(body)
     return resources.query_list(use.queries.add(name, queries, body.idempotency_key, purpose="audit"))
 
@@ -119,7 +119,7 @@ def audit(name: str, body: Annotated[AuditModel, example(examples.ADD_QUERIES)],
     responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST),
 )
 def withdraw(name: str, body: Annotated[WithdrawQueries, example(examples.WITHDRAW)], use: Use) -> WithdrawnQueries:
-    """Remove the given queries of an audit, except those of which a sampler may have taken a real step."""
+    """Remove queries of an audit, given by their ids. A query stays if a sampler may have taken a real step of it."""
     return WithdrawnQueries(withdrawn=use.queries.withdraw_audit(name, body.query_ids))
 
 
@@ -130,6 +130,6 @@ def withdraw(name: str, body: Annotated[WithdrawQueries, example(examples.WITHDR
     responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST),
 )
 def list_all(name: str, use: Use, status: Annotated[list[QueryStatus], Query()] = []) -> QueryList:  # noqa: B006
-    """List the queries of a surrogate, oldest first; only those with a given ``status``, of which there may be
-    several."""
+    """List the queries of a surrogate, oldest first. With ``status``, which can be given several times, list only the
+    queries that have one of these statuses."""
     return resources.query_list(use.queries.list(name, status))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from surrogym_server.storage.records import SurrogateSummary
 
-Series = Iterable[tuple[str, float]]  # pairs of a label's value and the number
+Series = Iterable[tuple[str, float]]  # pairs of a label's value and the metric's value
 
 PURPOSES = ("initial", "adaptive", "manual", "audit", "logged", "evaluation")
 STATUSES = ("pending", "leased", "answered", "set_aside", "refused")

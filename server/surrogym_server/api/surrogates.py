@@ -97,8 +97,8 @@ def get(name: str, use: Use) -> SurrogateView:
 def patch(name: str, body: Annotated[PatchSurrogate, example(examples.PATCH)], use: Use) -> SurrogateView:
     """Change the given fields of a surrogate. A larger budget or target continues a finished design. After a change of
     a tolerance, the server computes the model's confidence again. Resuming a failed design retries it. After a change
-    of target or tolerance, or with a lower budget, adaptive queries without a real step so far are withdrawn, and the
-    design chooses new ones."""
+    of target or tolerance, or with a lower budget, the design withdraws the queries that it chose by the model and that
+    have no real step so far, and chooses new ones."""
     return resources.surrogate_view(use.surrogates.change(name, **dict(body)))
 
 
@@ -124,9 +124,10 @@ async def delete(name: str, use: Use) -> Response:
 def improve(
     name: str, body: Annotated[Improve, example(examples.IMPROVE)], request: Request, use: Use
 ) -> ImprovedSurrogate:
-    """Request more queries from the design. The acquisition chooses them, weighted by the submitted occupancy of
-    policies. The budget must have enough real steps left; steps of open queries and of earlier requests count as used.
-    For a token of role ``admin`` the budget is raised if needed, and ``budget_raised_by`` is the increase."""
+    """Request more queries from the design. The acquisition chooses them, weighted by the submitted occupancy (states
+    that policies visited). The budget must have enough real steps left; steps of open queries and of earlier requests
+    count as used. For a token of role ``admin`` the budget is raised if needed, and ``budget_raised_by`` is the
+    increase."""
     may_raise = role_of(request.scope) == "admin"
     granted = use.designer.improve(name, body.queries, body.checkpoint, body.idempotency_key, raise_budget=may_raise)
     return resources.improved(use.surrogates.status(name), granted.raised)

@@ -16,7 +16,7 @@ from surrogym_server.errors import Overloaded
 
 T = TypeVar("T")
 
-MAX_WAITING = 2_000  # waiting requests of one kind with one token; two kinds take at most a quarter of all connections
+MAX_WAITING = 2_000  # waiting requests of one kind with one token: an eighth of the default of 16,384 connections
 
 
 class Turns:
@@ -51,7 +51,8 @@ class Turns:
 
 
 class Waiting:
-    """Limit on the requests of each token that wait for something to happen, because each takes memory."""
+    """Limit on the number of requests of each token that wait for something to happen. Each waiting request takes
+    memory."""
 
     def __init__(self, what: str, most: int = MAX_WAITING) -> None:
         """Set the limits. ``what`` is the name of the requests in error messages."""

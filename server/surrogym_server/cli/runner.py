@@ -112,8 +112,9 @@ def run(settings: Settings, ready_file: Path | None, exit_with_parent: bool, tel
 
 @contextmanager
 def _fits(settings: Settings) -> Iterator[Fits | None]:
-    """Return a context with the child processes of fits. The first is started now, because a fork is cheap and safe
-    only before other modules and threads are loaded. None if fits may run in a cluster."""
+    """Return a context with an object that runs fits in child processes; with None if fits may run in a cluster. The
+    first child process is started now, because a fork is cheap and safe only before other modules and threads are
+    loaded."""
     if settings.engine != "local":
         yield None
         return
@@ -135,8 +136,9 @@ def _exempt_from_collection() -> None:
     """Exempt all objects that exist now from garbage collection, and enable the collector for later objects.
 
     The present objects belong to torch and other imports and stay alive. A full collection would traverse them, which
-    delays steps by some 200 ms. Later objects are collected less often than by Python's default threshold of 700 new
-    objects, because a request for 1,000 samples creates many times as many, which all stay in use.
+    delays steps by some 200 ms. Python collects garbage after 700 new objects by default. Here the collector waits for
+    ``YOUNG_OBJECTS`` new objects, because a request for 1,000 samples creates far more than 700 objects, which all stay
+    in use.
     """
     gc.freeze()
     gc.set_threshold(YOUNG_OBJECTS, *gc.get_threshold()[1:])

@@ -134,7 +134,7 @@ def reset_reply(reply: Reply) -> dict[str, Any]:
 
 
 def step_reply(reply: Reply) -> dict[str, Any]:
-    """Return the fields of the JSON reply to a step. They are not validated again, because each step does this."""
+    """Return the fields of the JSON reply to a step. They are not validated again, to keep each step fast."""
     assert isinstance(reply.outcome, tuple)
     return _step_fields(reply.seq, reply.outcome[0])
 
@@ -180,7 +180,8 @@ def policy_run(request: replies.RolloutSession) -> PolicyRun:
 
 
 def framed_policy_run(request: frames.PolicyRequest, shape: frames.Shape) -> PolicyRun:
-    """Read the policy and its settings from a binary request for a rollout. Raises ``FrameError``."""
+    """Read the policy and its settings from a binary request for a rollout. ``shape`` has the sizes of the session's
+    arrays. Raises ``FrameError`` if the request does not fit these sizes."""
     policy, until = frames.policy_of(request, shape), frames.until_of(request, shape)
     return PolicyRun(policy, request.steps, frames.noise_of(request), until)
 

@@ -19,7 +19,7 @@ import surrogym_server.virtual.compiled.step
 import surrogym_server.virtual.words
 """
 PACKAGE = "surrogym_server"
-LONGEST = 120.0  # longest wait of a session for the compilation, in seconds; after it, the session compiles itself
+LONGEST = 120.0  # longest wait of a session in seconds; after that, the session compiles its steps itself
 
 
 class Compiling:

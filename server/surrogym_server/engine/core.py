@@ -119,9 +119,10 @@ def resolved(opening: Opening, definition: EnvironmentDefinition) -> VirtualSett
 
 
 def limits_rewards(definition: EnvironmentDefinition) -> bool:
-    """Whether rewards of virtual steps are limited to the range of the samples' rewards.
+    """Whether rewards of virtual steps are limited to about the range of the samples' rewards.
 
-    They are not if the reward is declared, which makes it exact, or in preset ``paper``.
+    They are not limited in preset ``paper``, or if the specification declares the reward function, because such rewards
+    are exact.
     """
     return definition.declared_reward is None and definition.learning.limits_rewards
 

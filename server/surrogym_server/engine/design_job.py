@@ -71,7 +71,8 @@ class DesignResult:
 
     @property
     def phase(self) -> Phase:
-        """Next phase of the design: ``sampling`` if it continues or has next queries, else its verdict."""
+        """Phase of the design after this round: ``sampling`` if the verdict is ``continue`` or there are next queries,
+        else the verdict."""
         return "sampling" if self.verdict == "continue" or self.queries else self.verdict
 
 

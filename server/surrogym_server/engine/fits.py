@@ -92,8 +92,8 @@ class Fits(Compute):
         self._idle = []
 
     def _give_back(self, process: _Process, whole: bool) -> None:
-        """Keep a child process for the next fit; end it if enough are idle or if its job has not ended (not
-        ``whole``)."""
+        """Keep a child process for the next fit, or end it. It is ended if enough processes are idle, or if its last
+        job was interrupted (``whole`` is False)."""
         self._busy.remove(process)
         if whole and len(self._idle) < self._most_idle:
             self._idle.append(process)
@@ -151,7 +151,7 @@ def error_of(outcome: Failure) -> PluginFailed:
 def _terminal_blocked() -> Iterator[None]:
     """Return a context in which new child processes start with SIGINT and SIGHUP blocked, the signals of a terminal.
 
-    This process receives such signals when the context ends.
+    If such signals arrive meanwhile, this process receives them when the context ends.
     """
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGHUP})
     try:

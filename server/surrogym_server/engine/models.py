@@ -72,7 +72,7 @@ class ModelCache:
         return self.refresh(surrogate)
 
     def refresh(self, surrogate: int) -> int:
-        """Read the newest model version of a surrogate that is not damaged from the storage, and return it.
+        """Load the newest undamaged model of a surrogate from the storage, and return its version.
 
         Raises:
             NoModel, UnknownSurrogate: the surrogate has no model, or does not exist.
@@ -87,7 +87,7 @@ class ModelCache:
         raise NoModel("the surrogate has no model yet: start surrogym sample, or import a log")
 
     def look(self) -> list[int]:
-        """Publish newer models that other servers have stored, for the surrogates in this cache.
+        """For each surrogate in this cache, load its newest model if another server has stored a newer one.
 
         Returns:
             The ids of surrogates that were deleted. Their models stay in the cache until ``forget``.

@@ -35,7 +35,7 @@ class SessionEngine(ABC):
 
     idle_seconds: float  # a session without requests for this long expires
     lasting: bool = False  # whether sessions outlive this process and are open to other processes
-    replay: int = 0  # number of last requests that a client should keep, to repeat them after a checkpoint is restored
+    replay: int = 0  # number of its last requests that a client should keep, to repeat them from a restored checkpoint
 
     @abstractmethod
     async def open(self, request: Open) -> SessionInfo:

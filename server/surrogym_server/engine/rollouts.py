@@ -22,7 +22,8 @@ from surrogym_shared.port import PolicyRollout, StepResult
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
-OneStep = Callable[[Session, Floats], tuple[Session, StepResult]]  # takes a step with actions (N, F) of the model
+# Takes one step of a session, given actions (N, F) as the model encodes them.
+OneStep = Callable[[Session, Floats], tuple[Session, StepResult]]
 
 
 def parts_of(run: PolicyRun) -> tuple[object, ...]:

@@ -113,7 +113,8 @@ def replay(session: Session, seq: int | None, request: Fingerprint) -> Answer | 
     one.
 
     Raises:
-        SeqConflict: the request is neither, by its sequence number ``seq`` and its content hash.
+        SeqConflict: the sequence number ``seq`` is neither the last nor the next one, or it is the last one but the
+            request has another content hash.
     """
     if seq is None or seq == session.seq + 1:
         return None
@@ -153,8 +154,8 @@ def step_session(
     """Step the lanes of ``mask`` (None: all lanes) with actions (N, F) as the model encodes them.
 
     Each lane steps under the model version of its episode. A lane that begins a new episode in this step continues
-    under the version ``latest``. ``model_of`` returns the model of a version. With ``stds``, the result has standard
-    deviations.
+    under the version ``latest``. ``model_of`` returns the model of a version. With ``stds``, the result has the
+    standard deviations of the model's outputs.
     """
     if mask is not None:
         _check_mask(mask, session.settings.num_envs)
@@ -189,7 +190,8 @@ def _step_versions(
 
 
 def _join(parts: Sequence[tuple[NDArray[np.intp], LaneTransition]]) -> LaneTransition:
-    """Join the transitions of disjoint sets of lanes, given with the indices of each set, to one of all lanes."""
+    """Join the transitions of several sets of lanes to one transition of all lanes. Each part has the indices of its
+    lanes, and each lane is in one part."""
     order = np.argsort(np.concatenate([index for index, _ in parts]))
 
     def lanewise(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:

@@ -28,8 +28,8 @@ from surrogym_shared.port import PolicyRollout
 
 logger = logging.getLogger(__name__)
 
-# Requests that are predicted to be shorter run in the event loop. A thread would add about 70 us, and several times
-# that on a busy machine; two milliseconds hardly delay other sessions.
+# Requests with a shorter predicted duration run in the event loop, because a thread would add about 70 us, and several
+# times as much on a busy machine. A request of two milliseconds hardly delays other sessions.
 INLINE_SECONDS = 2e-3
 MEBIBYTE = 2**20
 REMEMBERED_EXPIRED = 10_000
@@ -128,7 +128,8 @@ class LiveSessions:
         self._check_memory(nbytes)
 
     def add(self, session: Session, reserved: int = 0) -> Session:
-        """Add an open session, with memory for ``reserved`` bytes. Raises the errors of ``check_room``."""
+        """Add an open session. It counts as at least ``reserved`` bytes of memory. Raises the errors of
+        ``check_room``."""
         live = _Live(session, self.clock(), reserved=reserved)
         self.check_room(live.nbytes)
         self._live[session.id] = live

@@ -29,7 +29,7 @@ BUCKETS = (1e-4, 2.5e-4, 5e-4, 1e-3, 2.5e-3, 5e-3, 1e-2, 2.5e-2, 5e-2, 0.1, 0.25
 
 @dataclass
 class Durations:
-    """Histogram of durations in seconds, with the bounds of ``BUCKETS``, and their sum."""
+    """Histogram of durations in seconds, with the upper bounds in ``BUCKETS``, and the sum of the durations."""
 
     sum: float = 0.0
     _counts: list[int] = field(default_factory=lambda: [0] * (len(BUCKETS) + 1))

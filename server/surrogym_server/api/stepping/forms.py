@@ -66,7 +66,7 @@ def frame_of(operation: Operation, content: bytes) -> frames.Request:
 def request_in_frame(frame: frames.Request, session: str, shape: frames.Shape, within: float | None = None) -> Advance:
     """Convert a binary frame to a request of the engine. ``within`` is how long the caller waits, in seconds.
 
-    Raises ``FrameError`` if the arrays of the frame do not have the sizes in ``shape``, those of the session.
+    ``shape`` has the sizes of the session's arrays. Raises ``FrameError`` if an array of the frame has another size.
     """
     match frame:
         case frames.StepRequest():
@@ -81,7 +81,8 @@ def request_in_frame(frame: frames.Request, session: str, shape: frames.Shape, w
 
 
 async def carried_out(engine: SessionEngine, request: Advance, writers: Writers) -> bytes:
-    """Carry out a request, and return the reply as bytes. A long reply is written in a thread."""
+    """Carry out a request, and return the reply as bytes. ``writers`` has the function that writes the reply to each
+    kind of request. It writes a long reply in a thread."""
     reply = await engine.advance(request)
     write = writers[type(request)]
     return write(reply) if steps_of(reply.outcome) <= SHORT_ROLLOUT else await asyncio.to_thread(write, reply)
@@ -96,7 +97,8 @@ def _step_in_json(reply: Reply) -> bytes:
 
 
 def _rollout_in_json(reply: Reply) -> bytes:
-    """Write the reply to a rollout as JSON, one step at a time, because the encoder blocks all other threads."""
+    """Write the reply to a rollout as JSON. Each step is encoded separately, because the encoder blocks all other
+    threads while it runs."""
     steps = [msgspec.Raw(_JSON.encode(step)) for step in sessions.rollout_steps(reply)]
     return _JSON.encode({"seq": reply.seq, "steps": steps, **sessions.rollout_actions(reply)})
 

@@ -42,11 +42,11 @@ def prompt(seconds: float, most_together: int) -> type[WebSocketsSansIOProtocol]
 
 
 class PromptMessages(WebSocketsSansIOProtocol):
-    """uvicorn's WebSocket, extended so that the app can answer a message as it arrives.
+    """uvicorn's WebSocket, extended so that the app can answer a message in the call that receives it.
 
-    ASGI passes each message to a task through a queue, which takes as long as a small step. That path is still used for
-    messages that are not whole and binary, for those that the app does not answer at once, and while the app is busy,
-    so that the order of messages is kept. uvicorn's parser receives whole frames only.
+    Without this class, each message goes through a queue to a task of ASGI, which takes as long as a small step. A
+    message still goes this way if it is not a single binary frame, if the app can't answer it at once, or if the app is
+    busy with an earlier message, so that the order of messages is kept. uvicorn's parser receives whole frames only.
     """
 
     _together = Unfinished(2**28)
@@ -68,7 +68,7 @@ class PromptMessages(WebSocketsSansIOProtocol):
             offers[EXTENSION] = self._take
 
     def data_received(self, data: bytes) -> None:
-        if not self.handshake_initiated or self._oversized:  # the handshake and too large frames are passed on
+        if not self.handshake_initiated or self._oversized:  # uvicorn handles the handshake and too large frames
             super().data_received(data)
             if not self.handshake_initiated:
                 self._refuse_handshake()

@@ -135,7 +135,7 @@ def _left(limit: float | None, began: float) -> float | None:
 
 async def _body(request: Request) -> bytes:
     """Read the body of a request, faster than ``Request.body`` does if the body comes in one message. Raises
-    ``ClientDisconnect``."""
+    ``ClientDisconnect`` if the client disconnects before the end of the body."""
     parts = []
     while True:
         message = await request.receive()

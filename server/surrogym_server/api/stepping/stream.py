@@ -57,7 +57,8 @@ class StepStream:
 
 
 def _admit(scope: Scope) -> None:
-    """Check that a request has a token of role train. Raises ``Unauthenticated`` or ``Forbidden``."""
+    """Check that the token of a request has the role train or admin. Raises ``Unauthenticated`` if the token is missing
+    or unknown, and ``Forbidden`` if it has another role."""
     gate: Gate = scope["app"].state.gate
     gate.check(bearer_token(scope), ("train",))
 

@@ -79,8 +79,8 @@ def list_all(name: str, jobs: Jobs) -> JobList:
 )
 def add(name: str, body: Annotated[AddJob, example(ADD)], jobs: Jobs) -> JobView:
     """Queue a training or an evaluation for a trainer worker (``surrogym work``). The task contains no code, only
-    numbers and words from fixed lists. An evaluation runs in the original environment of the worker, which must accept
-    that many real episodes."""
+    numbers and words from fixed lists. An evaluation runs in the original environment of a worker, and only a worker
+    that accepts its number of real episodes gets it."""
     task, fields = body.task, body.task.model_dump(mode="json")
     if isinstance(task, TrainTask):
         return forms.job_view(jobs.train(name, fields, body.idempotency_key))

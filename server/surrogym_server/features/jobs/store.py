@@ -81,8 +81,8 @@ class Jobs:
     """Storage of the jobs of surrogates and their leases.
 
     When the lease of a training expires, the training is queued again, or fails after ``MAX_RUNS`` attempts. When the
-    lease of an evaluation expires, the evaluation fails, because real steps may have been taken. A job that should be
-    cancelled becomes cancelled.
+    lease of an evaluation expires, the evaluation fails, because real steps may have been taken. When the lease of a
+    job expires whose cancellation was requested, the job becomes cancelled.
 
     A worker whose lease has expired may continue as long as no other worker has claimed the job and it is not
     cancelled: the worker's next report makes the job running again, and its result is stored.

@@ -51,7 +51,8 @@ def open_blobs(storage: Storage, url: str, folder: Path | None) -> Blobs:
 
 
 class FolderBlobs(Blobs):
-    """Blobs as files in a folder, which is created with the first file. Only the files' owner may read them."""
+    """Storage of policy files in a folder, which is created with the first file. Only the files' owner may read
+    them."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -106,7 +107,7 @@ class FolderBlobs(Blobs):
 
 
 class RowBlobs(Blobs):
-    """Blobs as rows of the table ``blobs``."""
+    """Storage of policy files as rows of the table ``blobs``."""
 
     def __init__(self, database: Database) -> None:
         self._database = database

@@ -117,9 +117,10 @@ def _fields(record: PolicyRecord, card: wire.PushedCard) -> dict[str, Any]:
 
 
 def _trust(card: wire.PushedCard, evaluations: list[dict[str, Any]]) -> tuple[bool | None, str]:
-    """Return whether a policy's promise is trusted, with the reason.
+    """Return whether a policy's promise (an interval for its mean return) is trusted, with the reason.
 
-    Both are those of the card, unless the latest evaluation that can judge the promise broke it.
+    It is not trusted if the mean return in the latest evaluation that can judge the promise is below the interval.
+    Otherwise, the policy's card has the answer and the reason.
     """
     latest = _latest(evaluations)
     if latest is None or latest["promise_kept"] or card.promise is None:
@@ -131,7 +132,8 @@ def _trust(card: wire.PushedCard, evaluations: list[dict[str, Any]]) -> tuple[bo
 
 
 def _standing(evaluations: list[dict[str, Any]], drifts: tuple[EvaluationRecord, ...]) -> EvaluationRecord | None:
-    """Return the latest report of drift; None if there is none, or if a later evaluation judges the promise."""
+    """Return the latest report of drift (real steps that no longer agree with the model). Return None if there is none,
+    or if a later evaluation can judge the policy's promise."""
     judged, drift = _latest(evaluations), max(drifts, key=lambda one: one.id, default=None)
     return drift if drift is not None and (judged is None or drift.id > int(judged["id"])) else None
 
@@ -142,7 +144,7 @@ def _words(drift: EvaluationRecord) -> str:
 
 
 def _latest(evaluations: list[dict[str, Any]]) -> dict[str, Any] | None:
-    """Return the latest evaluation that can judge the promise; None if there is none."""
+    """Return the latest evaluation that can judge the promise (the interval of the return); None if there is none."""
     judged = [one for one in evaluations if one["promise_kept"] is not None]
     return max(judged, key=lambda one: int(one["id"]), default=None)
 

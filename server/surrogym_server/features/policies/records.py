@@ -47,10 +47,10 @@ class EvaluationRecord:
 
 
 def judges(summary: JSON) -> bool:
-    """Return whether an evaluation, given its summary, can judge a policy's promise.
+    """Return whether an evaluation, given its summary, can judge a policy's promise (the interval of its return).
 
-    It can if it has enough episodes, if the policy itself acted, if the starts were those of the specification, and if
-    the original environment was the surrogate's own.
+    It can if the evaluation has enough episodes, if the policy itself acted, if the starts were those of the
+    specification, and if the original environment was the surrogate's own.
     """
     there = OLDER | summary
     declared = there.get("controller") == "policy" and there.get("declared") and there["own"]
@@ -82,7 +82,7 @@ Freed = tuple[str, ...]  # names of blobs that no row refers to any more
 
 
 class Blobs(ABC):
-    """Interface of a storage of files by name. A name is never used twice."""
+    """Interface of a storage of files, each of which has a name. A name is never used twice."""
 
     @abstractmethod
     def put(self, content: bytes) -> str:

@@ -72,7 +72,8 @@ ALIAS_EXAMPLE = {"version": 1}
 
 @router.get("", summary="All policies", dependencies=[READ], responses=documented(*THERE))
 def list_all(name: str, policies: Policies) -> PolicyList:
-    """List policies, newest first, each with its promise, its files and the statistics of its real episodes."""
+    """List policies, newest first, each with its promise (interval of the return), its files and the statistics of its
+    real episodes."""
     return forms.policy_list(policies.list(name))
 
 
@@ -128,7 +129,7 @@ async def put_file(
     request: Request,
     policies: Policies,
 ) -> PolicyView:
-    """Store a file of a policy, which is the body. Its size, digest and format are checked, but it is never loaded. A
+    """Store the body as a file of a policy. The file's size, digest and format are checked, but it is never loaded. A
     stored file is never replaced, and only the token that stored the version may add files. If the files of a
     surrogate's policies exceed their limit, files of the oldest policies without an alias are removed."""
     content = await request.body()

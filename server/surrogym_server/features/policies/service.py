@@ -136,7 +136,7 @@ class PolicyService:
         Args:
             name: name of the surrogate.
             version: version of the policy.
-            file: format, size and hash of the file; of the main file as ``add`` announced it.
+            file: format, size and hash of the file. The main file must have the hash that ``add`` was called with.
             content: the file.
             by: role and fingerprint of the token that sends the file; None for an admin.
 
@@ -266,10 +266,11 @@ class PolicyService:
 
     @contextmanager
     def _removed_if_refused(self, blob: str) -> Iterator[None]:
-        """Return a context that removes a blob if the row that names it is refused within the context.
+        """Return a context in which the database stores a row that names a file, ``blob``. If it refuses the row, the
+        file is removed.
 
-        After a lost connection it is unknown whether the row was stored, so the blob stays. If there is no row, a later
-        sweep removes it.
+        If the connection is lost, it is unknown whether the row was stored, so the file stays. If there is no row, a
+        later sweep removes the file.
         """
         try:
             yield

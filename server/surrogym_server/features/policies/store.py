@@ -60,7 +60,7 @@ class Policies:
     """Storage of the policies of surrogates, by version.
 
     An argument ``which`` is a version, an alias, or ``latest``. An operation on a policy that does not exist raises
-    ``UnknownPolicy``. ``Freed`` in a result are the names of blobs that no row names any more.
+    ``UnknownPolicy``. ``Freed`` in a result are the names of stored files (blobs) that no row refers to any more.
     """
 
     def __init__(self, database: Database) -> None:
@@ -71,8 +71,9 @@ class Policies:
 
         Also returns the names of blobs that are no longer needed.
 
-        A version never changes. A repeat with the same main file, card and curve returns the stored version. Beyond
-        ``MAX_POLICIES`` policies, one without an alias is removed: the oldest of the token that stored most policies.
+        A version never changes. A repeat with the same main file, card and curve returns the stored version. If there
+        are more than ``MAX_POLICIES`` policies, one without an alias is removed: the oldest of those that the token
+        with the most policies has stored.
 
         Raises:
             TooLarge: the surrogate has ``MAX_POLICIES`` policies, and all have aliases.
@@ -106,7 +107,7 @@ class Policies:
         """Store a file of a policy, and return the names of blobs that are no longer needed.
 
         If the files of the surrogate's policies then exceed ``most`` bytes together, files of policies without an alias
-        are removed: the oldest of the token that stored most bytes. The policies themselves stay.
+        are removed: the oldest of those that the token with the most bytes has stored. The policies themselves stay.
 
         Raises:
             InvalidInput: a file of this format with another hash was stored or announced for the policy.
@@ -305,8 +306,8 @@ def _sizes(connection: Connection, surrogate: int) -> dict[int, int]:
 def _in_order_of_removal(connection: Connection, surrogate: int, kept: int, sizes: Mapping[int, int]) -> Iterator[int]:
     """Yield the policy versions without an alias, except ``kept``, in the order in which to remove them.
 
-    The next one is always the oldest of the token with the largest remaining sum of ``sizes`` (by version). So a token
-    that stores very many policies displaces its own.
+    The next one is always the oldest policy of the token whose remaining policies have the largest sum of ``sizes`` (by
+    version). So a token that stores very many policies displaces its own policies.
     """
     cards = sa.select(policies.c.version, policies.c.card).where(policies.c.surrogate_id == surrogate)
     senders = {row.version: row.card.get(PUSHED_BY) for row in connection.execute(cards)}

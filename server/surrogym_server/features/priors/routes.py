@@ -40,8 +40,9 @@ def get(name: str, priors: Priors) -> PriorView:
 )
 async def put(name: str, request: Request, priors: Priors) -> PriorView:
     """Store the prior of a surrogate: the body is a file of ``surrogym export`` with the same coordinates and actions.
-    In the next fit, each output learns the error of the prior, if this predicts left-out samples better. Adaptive
-    queries without a real step so far are withdrawn, and the design chooses new ones."""
+    In the next fit, each output of the model learns the difference between the samples and the prior, if this predicts
+    left-out samples better than learning without the prior. Adaptive queries without a real step so far are withdrawn,
+    and the design chooses new ones."""
     data = await request.body()
     await run_in_threadpool(priors.put, name, data)
     return _view(await run_in_threadpool(priors.get, name))
@@ -49,8 +50,8 @@ async def put(name: str, request: Request, priors: Priors) -> PriorView:
 
 @router.post(":await", summary="Wait for a prior", dependencies=[ADMIN], responses=documented(*THERE))
 def wait(name: str, priors: Priors) -> PriorView:
-    """Let the design of a surrogate wait after its initial queries until a prior is stored. Does nothing if it has
-    one."""
+    """Let the design of a surrogate wait after its initial queries until a prior is stored. Does nothing if the
+    surrogate has a prior."""
     priors.wait(name)
     return _view(priors.get(name))
 

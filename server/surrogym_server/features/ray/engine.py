@@ -49,7 +49,7 @@ class RayEngine(SessionEngine):
     """
 
     lasting = True
-    replay = 10_000  # number of requests since a checkpoint, which may be some seconds old
+    replay = 10_000  # number of last requests that a client should keep, to repeat those since a checkpoint
 
     def __init__(
         self, hosts: Sequence[Any], machines: Sequence[str], store: LiveSessions, settings: HostSettings
@@ -95,7 +95,8 @@ class RayEngine(SessionEngine):
         holder = await asyncio.to_thread(self._store.holder, session)
         await asyncio.to_thread(self._store.remove, session)
         self._places.pop(session, None)
-        with suppress(Unavailable, TimeoutError):  # a silent host will find the record removed
+        # A host that does not answer now will end the session later, when it finds that the record is removed.
+        with suppress(Unavailable, TimeoutError):
             async with asyncio.timeout(ANSWERING_SECONDS):
                 host = _number(holder.owner) if holder else self._place(session)
                 if host < len(self._hosts):
@@ -264,7 +265,8 @@ class RayEngine(SessionEngine):
             raise Unavailable(f"session host {host} {gone}: try again later") from gone
 
     async def _heard(self, host: int, is_gone: Callable[[], Awaitable[bool]], operation: str, *arguments: Any) -> Any:
-        """Send an operation to a host, and wait for the reply. Call ``is_gone`` each time that half a lease has passed.
+        """Send an operation to a host, and wait for the reply. Call ``is_gone`` each time that half the duration of a
+        lease has passed.
 
         Raises:
             _Gone: the host has died, or ``is_gone`` returned True.

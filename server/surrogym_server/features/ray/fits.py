@@ -75,8 +75,8 @@ def _end(asked: Any) -> None:
 
 
 def _done_there(function: Function, job: DesignJob, expected: Mapping[str, str]) -> DesignResult | Failure:
-    """Compute a job in a process of the cluster. Return a ``Failure`` if its versions of packages are not those in
-    ``expected``."""
+    """Compute a job in a process of the cluster. Return a ``Failure`` if this process has other versions of Python or
+    of packages than those in ``expected``."""
     for name, here in versions().items():
         if here != expected[name]:
             wrong = f"expected {name} {expected[name]} on every machine of the cluster, got {here} on {platform.node()}"

@@ -46,8 +46,8 @@ class _Held:
 class Leases:
     """The leases and checkpoints of this process's sessions.
 
-    A lease counts from before the SQL statement that renews it, so it ends here no later than in the database. A step
-    only compares the end of the lease with a clock, without asking the database.
+    For this process, a lease begins before the SQL statement that renews it. So it ends here no later than in the
+    database. Before a step, the end of the lease is only compared with a clock, without asking the database.
 
     Args:
         store: records of the sessions in the database.

@@ -42,7 +42,8 @@ class Surroundings:
 
 
 class RecordedEngine(SessionEngine):
-    """Engine that wraps the engine of this process, and carries out a request only under the session's lease.
+    """Engine that wraps the engine of this process. It carries out a request only while this process has the session's
+    lease.
 
     A session that was taken over from another process is in the state of its last checkpoint. It refuses new requests
     until its client has repeated the requests since that checkpoint, in order.
@@ -64,7 +65,7 @@ class RecordedEngine(SessionEngine):
         self._surroundings = surroundings
         self._opening = OpeningLocks()
         self._taking = asyncio.Lock()
-        self._behind: dict[str, int] = {}  # for sessions taken over: sequence number to reach
+        self._behind: dict[str, int] = {}  # sequence number up to which the client of a taken-over session must repeat
         self._tasks: list[asyncio.Task[None]] = []
 
     async def open(self, request: Open) -> SessionInfo:

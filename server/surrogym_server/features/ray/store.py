@@ -19,7 +19,7 @@ from surrogym_server.storage.sql.database import NOW, Database, conflict_insert
 from surrogym_server.storage.sql.rows import IS_THERE, has_ended, shorten
 from surrogym_server.storage.sql.tables import AT_ONCE, checked, metadata, owner, surrogates
 
-live = checked(  # last checkpoint of each session, which itself is in the memory of its owner
+live = checked(  # last checkpoint of each session; the session itself is in the memory of its owner
     sa.Table(
         "live_sessions",
         metadata,
@@ -107,7 +107,7 @@ class LiveSessions:
     def record(self, lease: SessionLease, checkpoint: Checkpoint) -> bool:
         """Store a checkpoint of a leased session. If another process has taken the lease, store nothing and return
         False."""
-        with self._database.write() as connection:  # one row only, against a deadlock with ``renew``
+        with self._database.write() as connection:  # changes one row only, so it can't deadlock with ``renew``
             update = _held(sa.update(live), lease).values(seq=checkpoint.seq, data=checkpoint.data)
             return connection.execute(update).rowcount == 1
 
