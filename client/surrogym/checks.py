@@ -31,8 +31,8 @@ SHOWN = 80  # most characters of a wrong value that an error message shows
 
 
 def require_specification(given: object) -> None:
-    """Raise ``InvalidInput`` if ``given`` is not a specification, but for example an environment with a method
-    ``spec``."""
+    """Raise ``InvalidInput`` if ``given`` is not a specification. If it is an environment, the message proposes its
+    method ``spec``, which returns one."""
     if not isinstance(given, EnvironmentSpec):
         kind = type(given).__name__
         hint = f": give {kind}.spec()" if callable(getattr(given, "spec", None)) else ""
@@ -40,8 +40,15 @@ def require_specification(given: object) -> None:
 
 
 def whole(what: str, value: Any, low: int, high: int, why: str = "") -> int:
-    """Return ``value`` as a whole number from ``low`` to ``high``, or raise ``InvalidInput``, with ``why`` in the
-    message."""
+    """Return ``value`` as an int if it is a whole number from ``low`` to ``high``; otherwise raise ``InvalidInput``.
+
+    Args:
+        what: name of the value in the message.
+        value: the value to check.
+        low: smallest number that is allowed.
+        high: largest number that is allowed.
+        why: what the limits mean, such as ", the rest of the budget"; the message contains it.
+    """
     try:
         number = None if isinstance(value, bool | np.bool_) else operator.index(value)
     except TypeError:
@@ -52,14 +59,15 @@ def whole(what: str, value: Any, low: int, high: int, why: str = "") -> int:
 
 
 def share(what: str, value: Any) -> float:
-    """Return a target confidence index, above 0.5 and below 1, or raise ``InvalidInput``."""
+    """Return a target confidence index as a float if it is above 0.5 and below 1; otherwise raise ``InvalidInput``."""
     if isinstance(value, bool) or not isinstance(value, float | np.floating | int) or not 0.5 < value < 1:
         raise InvalidInput(f"{what}: expected a number above 0.5 and below 1, got {_shown(value)}")
     return float(value)
 
 
 def states(definition: EnvironmentDefinition, what: str, values: Any) -> Floats:
-    """Return states as an array (v, C) with at least one row, or raise ``InvalidInput``."""
+    """Return ``values`` as an array (v, C): v states, at least one, of C coordinates. Raises ``InvalidInput`` if they
+    have another shape, are not finite, or lie absurdly far from the sampling range."""
     rows = check_coordinates(definition, what, _numbers(what, values))
     if not len(rows):
         raise InvalidInput(f"{what}: expected at least one state, got none")
@@ -76,7 +84,8 @@ def steps_of(given: Any) -> list[RealStep]:
 
 
 def real_step(definition: EnvironmentDefinition, step: RealStep) -> RealStep:
-    """Check a real step, and return it with arrays of shapes (C,), (F,) and (C,)."""
+    """Check a real step, and return it with arrays: coordinates (C,), action (F,), next coordinates (C,). Raises
+    ``InvalidInput`` if the step can't be used."""
     q, q_next = (
         _near(definition, what, check_coordinates(definition, what, _row(what, getattr(step, what))))
         for what in ("coordinates", "next_coordinates")
@@ -92,8 +101,8 @@ def real_step(definition: EnvironmentDefinition, step: RealStep) -> RealStep:
 
 
 def _near(definition: EnvironmentDefinition, what: str, rows: Floats) -> Floats:
-    """Return states (n, C) if they are finite and not absurdly far from the sampling range, or raise
-    ``InvalidInput``."""
+    """Return states (n, C) if they are finite and no more than about ``FARTHEST`` widths of the sampling range away
+    from it; otherwise raise ``InvalidInput``."""
     if not np.isfinite(rows).all():
         raise InvalidInput(f"{what}: expected finite numbers, got {_shown(rows.tolist())}")
     for index, coordinate in enumerate(definition.coordinates):

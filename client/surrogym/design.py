@@ -128,7 +128,8 @@ class Design:
     @property
     def phase(self) -> Phase:
         """Phase of the design: ``collecting`` the initial queries, ``sampling`` adaptive ones, ``ready``,
-        ``over_budget`` if the budget is spent, or ``unsure`` if no further query can be asked within it."""
+        ``over_budget`` if the budget was spent before, or ``unsure`` if no useful query is left although the
+        budget is not spent."""
         return self._phase
 
     @property
@@ -148,8 +149,8 @@ class Design:
 
         Raises:
             QueriesOpen: all queries of this round were handed out, and some lack an answer.
-            InvalidInput: the model can't be fitted, because fewer than two steps were given and the other queries were
-                given up.
+            InvalidInput: the model can't be fitted, because ``tell`` has received fewer than two real steps, and no
+                query is left.
             NumericalFailure, PluginFailed: the fit fails.
         """
         if not self._queue and self._open:
@@ -198,8 +199,8 @@ class Design:
             self._answered.append(self._open.pop(query.id))
 
     def give_up(self, query: Query) -> None:
-        """Leave a query unanswered. It counts towards the budget, and similar queries are avoided. If it begins at a
-        snapshot, no other query begins there.
+        """Leave a query unanswered. The query still counts towards the budget, and similar queries are avoided. If it
+        begins at a snapshot, no later query begins at this snapshot.
 
         Raises:
             InvalidInput: the query is not open.

@@ -111,7 +111,7 @@ class ActingPolicy:
 
     @property
     def units(self) -> tuple[int, ...]:
-        """Number of outputs of each layer; the last is A."""
+        """Number of outputs of each layer. The last number is A, the outputs of the whole network."""
         return tuple(len(layer.bias) for layer in self.layers)
 
     @property
@@ -202,7 +202,7 @@ class Actor:
             raise ValueError(f"policy: expected log_deviations of {len(self.low)} entries, got {log.size}")
 
     def act(self, observation: NDArray[Any], noise: NoiseKey | None) -> Acted:
-        """Return actions for observations (N, D): with the noise of a key, or the most probable ones if it is None.
+        """Return actions for observations (N, D): noisy ones by a key, or the most probable ones if ``noise`` is None.
 
         Raises:
             ValueError: the network's outputs are not finite.

@@ -7,10 +7,10 @@ LagKind = Literal["change", "value", "action", "steps"]
 Function = Literal["one", "linear", "sin", "cos"]  # basis function of a summand of a term
 Relation = Literal["<", "<=", ">", ">="]  # relation of the two sides of an inequality
 RewardShape = Literal["one", "linear", "absolute", "square", "bump", "ball"]  # function of a term in a declared reward
-RewardTiming = Literal["before", "after", "auto"]  # the state that a learned reward depends on
+RewardTiming = Literal["before", "after", "auto"]  # a learned reward depends on the state before or after the step
 Side = Literal["lower", "upper"]  # end of a range
 
 Variant = Literal["deterministic", "probabilistic", "pathwise"]
 AutoresetMode = Literal["next_step", "same_step", "disabled"]
-Propagation = Literal["mean", "sample"]  # how particles move: by the mean, or by a posterior sample each
+Propagation = Literal["mean", "sample"]  # how a particle moves: by the mean, or by its own posterior sample
 Weighting = Literal["inverse_variance", "uniform"]  # how the particles' rewards are averaged

@@ -67,7 +67,7 @@ def fallback_action(spec: EnvironmentSpec, coordinates: Array) -> Array:
 def nearest(spec: EnvironmentSpec, coordinates: Array) -> tuple[Limit, float]:
     """Return the limit that is nearest to coordinates (C,), and the distance to it.
 
-    Distances are compared in units of the limits' margins, if they have one.
+    To compare the limits, each distance is divided by the margin of its limit, if it has one.
     """
     every = room(spec, coordinates[None])[0]
     index = int(np.argmin([r / (limit.margin or 1.0) for r, limit in zip(every, limits_of(spec).keep, strict=True)]))
@@ -75,7 +75,8 @@ def nearest(spec: EnvironmentSpec, coordinates: Array) -> tuple[Limit, float]:
 
 
 def words_of_steps(spec: EnvironmentSpec, before: Array, after: Array) -> list[str]:
-    """Describe how real steps from ``before`` (n, C) to ``after`` (n, C) kept each limit. Empty without steps."""
+    """Describe for each limit how many real steps from ``before`` to ``after`` (n, C) went beyond it; empty without
+    steps. The last line counts the steps after which the fallback should have acted."""
     if not len(after):
         return []
     least, near = room(spec, after), falls_back(spec, before, after).sum()

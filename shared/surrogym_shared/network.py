@@ -77,8 +77,8 @@ class Network:
     def of(
         cls, spec: EnvironmentSpec, mean: Array, deviation: Array, units: int | Sequence[int], vector: Array
     ) -> Self:
-        """Make policies from parameter vectors (..., ``size``). The weights of a layer are those of the vector divided
-        by sqrt(number of its inputs)."""
+        """Make policies from parameter vectors (..., ``size``). Each weight of a layer is its entry in the vector,
+        divided by sqrt(number of the layer's inputs)."""
         layers, begin = [], 0
         for inputs, outputs in pairwise(_sizes(spec, units)):
             middle, end = begin + inputs * outputs, begin + (inputs + 1) * outputs
@@ -89,7 +89,7 @@ class Network:
 
     @staticmethod
     def size(spec: EnvironmentSpec, units: int | Sequence[int]) -> int:
-        """Return the number of parameters of a policy with a hidden layer of ``units``, or with one for each entry."""
+        """Return the number of parameters of a policy. ``units``: size of its hidden layer, or of each hidden layer."""
         return sum((inputs + 1) * outputs for inputs, outputs in pairwise(_sizes(spec, units)))
 
     @property

@@ -56,7 +56,7 @@ class PolicyRollout:
 
     action: Floats  # (T, N, F) float64 actions before they are clipped to their bounds
     log_probability: Floats | None  # (T, N) float64 log probability of each action; None without noise
-    observation: Floats  # (T, N, D) observations after each step; the first action is for the ones before the rollout
+    observation: Floats  # (T, N, D) observations after each step; action t was chosen at observation t - 1
     reward: Floats  # (T, N) rewards, less the penalty for uncertainty
     terminated: Bools  # (T, N) whether the episode ended in a terminal state
     truncated: Bools  # (T, N) whether the episode ended for another reason
@@ -110,8 +110,8 @@ class PolicyRollout:
 
 
 def quick(kind: type[T], **fields: Any) -> T:
-    """Make an instance of a frozen dataclass from all its fields, in half the time of its constructor, because every
-    step needs two."""
+    """Make an instance of a frozen dataclass from all its fields, in half the time of its constructor: every virtual
+    step makes two instances."""
     instance = object.__new__(kind)
     instance.__dict__.update(fields)
     return instance

@@ -59,7 +59,7 @@ class Preset:
         return max(4, coordinates + actions) if by_steps else 4 * (coordinates + actions)
 
     def budget(self, initial: int, coordinates: int, actions: int, by_steps: bool) -> int:
-        """Return the default number of real steps of a design, with the ``initial`` ones.
+        """Return the default number of real steps of a design, including the ``initial`` steps.
 
         The paper needed 125 steps in all after 40 initial steps, and 120 after 50. Arguments as in ``initial_steps``.
         """

@@ -76,7 +76,7 @@ class SurrogateFile:
     spec: EnvironmentSpec
     model: bytes
     samples: RealSamples
-    tolerances: dict[str, float] = field(default_factory=dict)  # by output: an error that is too small to matter
+    tolerances: dict[str, float] = field(default_factory=dict)  # for each output, an error too small to matter
     ledger: dict[str, int] = field(default_factory=dict)  # counts of real steps by purpose, on the exporting server
     predictions: list[list[list[float]]] = field(
         default_factory=list

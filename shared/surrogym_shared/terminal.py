@@ -38,8 +38,8 @@ def give(result: dict[str, Any], text: Callable[[], str], *, as_json: bool, quie
 
 
 def watch(look: Callable[[], str], seconds: float = WATCH_SECONDS) -> None:
-    """Show the output of ``look`` until Ctrl-C, updated every few ``seconds``: in place on a terminal, elsewhere as new
-    text when it has changed."""
+    """Show the output of ``look`` until Ctrl-C, and update it after each pause of ``seconds``: in place on a terminal,
+    elsewhere as new text if it has changed."""
     with suppress(KeyboardInterrupt), _screen() as show:
         while True:
             show(look())

@@ -58,10 +58,10 @@ def command(
 ) -> None:
     """Test a policy's promise with a few real steps.
 
-    The real steps are taken on the policy's way and compared with the model. This needs a running sampler. With --env
-    they are whole episodes, whose returns are compared too; the command says how many steps they may take. The promise,
-    the audit and the verdict (trusted or not) go into the card beside the policy. With --surrogate, the card names
-    that surrogate from then on.
+    Most real steps are taken at states that the policy visits; all are compared with the model. This needs a running
+    sampler. With --env, the real steps are whole episodes, whose returns are compared with the promised return too;
+    the command says beforehand how many steps they may take. The promised return, the audit and the verdict (trusted or
+    not) go into the card beside the policy. With --surrogate, the card names that surrogate from then on.
 
     Example: surrogym audit policy.zip --steps 16
 
@@ -110,8 +110,8 @@ def command(
 def _by_episodes(
     subject: Subject, env: str, card: PolicyCard, settings: EvaluationSettings, *, quiet: bool
 ) -> Handover:
-    """Audit a policy by whole episodes in an environment. Their real steps are announced before, and reported to the
-    server even after an error."""
+    """Audit a policy by whole episodes in an environment. The largest number of real steps is printed before the first
+    episode. The steps taken are reported to the server, even after an error."""
     from surrogym.cli.errors import CommandError
     from surrogym.cli.opening import opener_for_policy
     from surrogym_sampler.original.errors import EvaluationFailed
@@ -175,8 +175,8 @@ def _of_another(card: PolicyCard) -> PolicyCard:
 
 
 def _floor(port: SurrogatePort, seed: int, session: dict[str, object]) -> float:
-    """Return the mean imagined return without a policy, to compare the promised return with. It replaces the return of
-    an untrained policy, if the card has none."""
+    """Return the mean imagined return without a policy: with an action of zero, or with random actions. The promised
+    return is compared with it if the card does not contain the return of an untrained policy."""
     from surrogym_trainer.evaluation.imagined import imagined_returns
     from surrogym_trainer.evaluation.uncontrolled import baseline, default_baseline
     from surrogym_trainer.training.settings import CHECK_EPISODES
@@ -187,8 +187,8 @@ def _floor(port: SurrogatePort, seed: int, session: dict[str, object]) -> float:
 
 
 def session_of(card: PolicyCard, view: SurrogateView) -> dict[str, object]:
-    """Return the options of the session in which the policy was judged, from its card, with noise that the surrogate
-    has confirmed since then."""
+    """Return the options of the session in which the policy was judged, from the policy's card. Noise that the design
+    has confirmed is added, unless the card has these options already."""
     from surrogym_trainer.training.settings import noise_of
 
     judged = card.settings.get("judge") or card.settings.get("session") or {}

@@ -57,9 +57,10 @@ def screen_width() -> int:
 
 
 def _widths(heading: Sequence[str], body: Sequence[Sequence[str]], room: int) -> list[int] | None:
-    """Return the widths of a table's columns that fit into ``room`` characters; None if no word may be broken.
+    """Return widths of a table's columns that fit into ``room`` characters together; None if words would be broken.
 
-    Whole headings are preferred, then whole cells, then widths as even as the longest words allow.
+    If possible, nothing is broken. Otherwise headings are broken between words. If that is not enough, cells are broken
+    between words too, those of the widest columns first.
     """
     cells = [list(column) for column in zip(*body, strict=True)] or [[] for _ in heading]
     values = [max(map(len, column), default=0) for column in cells]
@@ -77,8 +78,8 @@ def _longest_word(text: str) -> int:
 
 
 def _broken(row: Sequence[str], widths: Sequence[int], *, bottom: bool = False) -> Iterator[str]:
-    """Yield the lines of a table's row whose cells are broken between words to their widths. Cells with fewer lines are
-    aligned to the top, or with ``bottom`` to the bottom.
+    """Yield the lines of a table's row. Each cell is broken between words into lines of its column's width. Cells with
+    fewer lines than others are aligned to the top, or with ``bottom`` to the bottom.
     """
     cells = [wrap(text, width, break_on_hyphens=False) or [""] for text, width in zip(row, widths, strict=True)]
     height = max(map(len, cells))

@@ -156,12 +156,12 @@ class Differences:
 
 
 def left(promise: Promise | None, result: Evaluation) -> bool:
-    """Whether the mean return of an evaluation lies outside the interval of the promise; False without a promise."""
+    """Whether the mean return of an evaluation lies outside the promised interval; False without a promise."""
     return promise is not None and not promise.low <= result.returns.mean() <= promise.high
 
 
 def missed(promise: Promise | None, result: Evaluation) -> bool:
-    """Whether the mean return of an evaluation lies below the interval of the promise; False without a promise."""
+    """Whether the mean return of an evaluation lies below the promised interval; False without a promise."""
     return promise is not None and bool(result.returns.mean() < promise.low)
 
 
@@ -175,8 +175,8 @@ class Imagining:
     seed: int = 0
 
     def changes(self, api: Api, view: SurrogateView, shifted: Systematic, weights: Any) -> Any:
-        """Return the changes of the imagined return that systematic errors of the model of ``view`` cause. The other
-        arguments are those of ``changes_of``."""
+        """Return by how much systematic errors of the surrogate's model change the return of imagined episodes.
+        ``shifted`` and ``weights`` describe the errors, as in ``changes_of``."""
         from surrogym.cli.audit import session_of
         from surrogym_client.transport import HttpSurrogate
         from surrogym_trainer.evaluation.consequences import EFFECT_STARTS, changes_of
@@ -206,7 +206,7 @@ def _compare(api: Api, surrogate: str, result: Evaluation, first_seed: int, imag
     if not steps:
         return Differing(Disagreements(0, (), {}), first_seed, changed=result.varied, left_out=left_out)
     beside = compared(api, view.spec, view, steps)
-    takes_residual = view.spec.preset.moves == "coordinates"  # a model that moves observations takes no residual
+    takes_residual = view.spec.preset.moves == "coordinates"  # the server adds no residual to observations
     changes = partial(imagining.changes, api, view) if takes_residual else None
     effects, share = effects_of(view.spec, beside, changes)
     explaining = tuple(steps[i] for i in np.argsort(-share).tolist() if share[i] > 0)
@@ -252,11 +252,11 @@ class Differing:
         learned: number of steps that were added to the surrogate's samples.
         all_steps: whether all real steps were added, and not only those that differ.
         changed: names of the constants that changed within an episode.
-        left_out: number of steps in which such a constant changed. They are not compared, because the model keeps
-            constants.
+        left_out: number of steps in which such a constant changed. They are not compared, because the model assumes
+            that constants don't change.
         without: reason why no step was compared; empty if steps were compared.
-        effects: outputs with an error that only all steps together show.
-        broken: whether the mean return is below the promise.
+        effects: outputs whose errors have a part that all steps share.
+        broken: whether the mean return is below the promised interval.
     """
 
     found: Disagreements
@@ -295,7 +295,8 @@ class Differing:
         return [*lines, *self._together(), *self._left_out(), *self._learned()]
 
     def _none(self) -> list[str]:
-        """Return lines for a comparison in which no single step differs, also if the return is below the promise."""
+        """Return lines for a comparison in which no single step differs from the model. If the mean return is below
+        the promised interval, the lines say that no single step explains it."""
         none = f"none of {self.found.compared} real steps differs from the model by more than the model's uncertainty"
         if not self.broken:
             return [] if self.effects else [none]
@@ -307,7 +308,7 @@ class Differing:
         ]
 
     def _together(self) -> list[str]:
-        """Return lines about the outputs with an error that only all steps together show; empty if there is none."""
+        """Return lines about the outputs whose errors have a part that all steps share; empty if there is none."""
         if not self.effects:
             return []
         return [f"{self.found.compared} real steps together:", *(f"  {one.words()}" for one in self.effects)]

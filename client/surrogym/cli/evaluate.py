@@ -230,7 +230,7 @@ def _why_not_judged(card: PolicyCard, settings: EvaluationSettings, result: Eval
 
 
 def _unseeded(reports: Sequence[tuple[Controller, Evaluation]]) -> list[str]:
-    """Return a remark if the environment ignores the seeds of resets; empty if the seeds repeat the starts."""
+    """Return a remark if the environment ignores the seed of a reset; empty if the same seed repeats the same start."""
     if all(result.seeded for _, result in reports):
         return []
     others = ", so these controllers did not run the same starts" if len(reports) > 1 else ""
@@ -238,7 +238,8 @@ def _unseeded(reports: Sequence[tuple[Controller, Evaluation]]) -> list[str]:
 
 
 def _repeated(result: Evaluation) -> list[str]:
-    """Return a remark if all episodes were equal, so that one is enough; empty if they differ, or are too few."""
+    """Return a remark if all episodes are equal in every state, action and reward, so that one episode is enough. Empty
+    if they differ, or if they are too few to tell."""
     from surrogym_trainer.evaluation.evaluator import FEW_EQUAL
 
     if len(result.returns) < FEW_EQUAL or not result.equal:
@@ -428,7 +429,8 @@ def _settings(settings: EvaluationSettings) -> dict[str, Any]:
 
 
 def _kept(promise: Promise | None, result: Evaluation) -> bool | None:
-    """Whether the mean return is at least the 5 % quantile of the promise; None without a promise."""
+    """Whether the policy kept its promise: its mean return is at least the lower end of the promised interval (the 5 %
+    quantile). None without a promise."""
     return None if promise is None else bool(result.returns.mean() >= promise.low)
 
 

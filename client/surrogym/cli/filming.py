@@ -54,8 +54,8 @@ def film(
 
 
 def _spec(env: str | None, card: PolicyCard, opener: Callable[[], Episode]) -> EnvironmentSpec:
-    """Return the specification of the environment to draw. If the policy's card has it, a user's own environment, which
-    may be a machine, is not opened for it."""
+    """Return the specification of the environment to draw. The environment is opened to get it, unless it is a user's
+    own environment, which may be a machine, and the policy's card contains a specification."""
     from surrogym_sampler.original.loading import is_own
 
     if env is not None and is_own(env) and card.spec is not None:

@@ -135,8 +135,8 @@ class Steps:
             self.file.unlink(missing_ok=True)
 
     def require_stored(self) -> None:
-        """Raise ``CommandError`` if the server has not confirmed all steps. It names the file, and the command that
-        sends it."""
+        """Raise ``CommandError`` if the server has not confirmed all steps. The message names the file with the steps,
+        and the command that sends this file."""
         from surrogym.cli.errors import CommandError
 
         if self.waiting:

@@ -83,7 +83,8 @@ def _limited(noted: EnvironmentSpec, name: str, *, quiet: bool) -> EnvironmentSp
 
 
 def _bins(spec: EnvironmentSpec | None) -> int | None:
-    """Return the number of values of each continuous action that a policy chooses from; None without discretisation."""
+    """Return the number of discrete values among which a policy chooses each continuous action; None if its continuous
+    actions are not discretised."""
     from surrogym_shared.spec import BoxAction
 
     action = None if spec is None else spec.action

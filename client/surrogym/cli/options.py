@@ -113,7 +113,8 @@ def connect(server: str | None, token: str | None, wait: float = 0.0, *, quiet: 
 
 
 def token_from(context: typer.Context, token: str | None, file: Path | None) -> str | None:
-    """Return the bearer token. A value on the command line precedes the environment, and a token precedes a token file.
+    """Return the bearer token. An option on the command line takes precedence over an environment variable. Between two
+    environment variables, a token takes precedence over a token file.
 
     Warns on the terminal if other users of the machine can read the token.
 

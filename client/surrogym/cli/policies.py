@@ -69,7 +69,8 @@ def _row(name: str, policy: PolicyView) -> tuple[str, ...]:
 
 
 def _real(evaluation: EvaluationView | None) -> str:
-    """Describe the mean return of an evaluation, and whether it had other starts than the promise; "-" without one."""
+    """Describe the mean return of an evaluation, with a remark if the promised return is for other starts of episodes;
+    "-" without an evaluation."""
     if evaluation is None:
         return "-"
     return words_of_mean(evaluation) + ("" if evaluation.declared else "; the promise is for others")

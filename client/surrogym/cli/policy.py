@@ -181,8 +181,8 @@ def parsed(policy: str) -> tuple[str, str]:
 
 
 def stored_card(api: Api, name: str, which: str) -> tuple[PolicyDetail, PolicyCard]:
-    """Return a policy that the server stores, and its card. If the policy was trained for the surrogate's present
-    specification, the card has it."""
+    """Return a policy that the server stores, and its card. The card contains the surrogate's specification if the
+    policy was trained for this specification, otherwise none."""
     found, spec = api.policies.get(name, which), api.surrogate(name).spec
     return found, _card(name, found, spec if found.differs is None else None)
 

@@ -32,11 +32,11 @@ def prints_aside() -> Iterator[None]:
 
 @contextmanager
 def unregistered(steps: Callable[[], int], what: str) -> Iterator[None]:
-    """Context that prints, after Ctrl-C, how many real steps a description of an environment took, and raises Ctrl-C
-    again.
+    """Context in which an environment's specification is drafted. After Ctrl-C, it prints how many real steps the draft
+    took, and raises ``KeyboardInterrupt`` again.
 
     Args:
-        steps: returns the real steps of a description that has ended.
+        steps: returns the number of real steps of a draft that is complete.
         what: end of the printed sentence, such as "nothing was registered".
     """
     from surrogym_shared.terminal import say

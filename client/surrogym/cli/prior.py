@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 LOOK_SECONDS = 1.0
 OTHER = "surrogate:"  # prefix of the name of another surrogate
 LEAST = 2  # least number of real steps from which a prior is calibrated
-LACKING = 0.01  # error, as a share of the changes, from which calibrated values may not be those of the plant
+LACKING = 0.01  # error of a simulator, as a share of the changes, above which calibrated values may be wrong
 
 
 def register(app: typer.Typer) -> None:
@@ -145,8 +145,8 @@ class _Target:
             time.sleep(LOOK_SECONDS)
 
     def fitted(self, after: int, update: Update) -> SurrogateView:
-        """Wait for the fit that follows a new prior, and return the surrogate; at once if it has too few samples.
-        ``after`` is the number of the round before this fit."""
+        """Wait for the fit that follows a new prior, and return the surrogate. Return at once if the surrogate has too
+        few samples for a fit. ``after`` is the number of the last round before this fit."""
         view = self.api.surrogate(self.view.name)
         while view.samples >= LEAST and view.round <= after and view.phase != "failed" and not _asked(view):
             update(None, "a model is being fitted")

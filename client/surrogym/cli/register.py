@@ -268,7 +268,7 @@ def _opened_by(environment: str, spec: EnvironmentSpec) -> EnvironmentSpec:
     from surrogym_sampler.original.executables import is_executable
     from surrogym_shared.environments import is_name
 
-    if is_name(spec.environment) or is_executable(environment):  # a program's command line is not sent to the server
+    if is_name(spec.environment) or is_executable(environment):  # a command line stays on this machine
         return spec
     return spec.model_copy(update={"environment": environment})
 

@@ -304,7 +304,7 @@ def _words_of_consent(name: str) -> str:
 @contextmanager
 def _telling(api: Api, surrogate: str, *, quiet: bool, plain: bool = False) -> Iterator[Tell | None]:
     """Context that shows progress: a bar for the design on a terminal, otherwise a line for each query. Yields the
-    function that shows a line; None if ``quiet``. ``plain``: lines, also on a terminal."""
+    function that shows a line; None if ``quiet``. With ``plain``, a terminal shows lines too, and no bar."""
     from surrogym_shared.terminal import progress, say
 
     if quiet or plain or not sys.stderr.isatty():

@@ -16,7 +16,8 @@ FILE = ".surrogate"  # suffix of a surrogate's file
 
 
 def is_surrogate(name: str) -> bool:
-    """Whether a name refers to a surrogate or to its file, and not to a policy: another file, or a name with ``@``."""
+    """Whether a name refers to a surrogate: the name of one on a server, or a file that ends in ``.surrogate``. Other
+    files, names with ``@`` and names with another ending refer to policies."""
     return name.endswith(FILE) or not (Path(name).is_file() or "@" in name or Path(name).suffix)
 
 

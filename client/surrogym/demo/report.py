@@ -172,7 +172,7 @@ def _share(value: float | None) -> str:
 
 
 def _number(value: float | None) -> str:
-    """Format a return: with one decimal, or three digits if it is below 10 in size."""
+    """Format a return with one decimal, or with three significant digits if its size is below 10; "-" for None."""
     if value is None:
         return "-"
     return f"{value:.1f}" if abs(value) >= 10 else f"{value:.3g}"

@@ -32,7 +32,7 @@ class DemoSettings:
 
     @property
     def run_name(self) -> str:
-        """Name of the kind of run, which its folder and its table of results have."""
+        """Name of this kind of run, with which the name of its folder begins."""
         return self.task if self.access == "any" else f"{self.task}-{self.access}"
 
     @property
@@ -46,8 +46,8 @@ class DemoSettings:
 
     @property
     def real_steps(self) -> int:
-        """Budget of real steps. Without a given budget, it is that of the task, or, if its states are not set directly,
-        the default of its specification."""
+        """Budget of real steps. The default is the task's budget. If ``access`` does not allow any state to be set, the
+        default is that of the specification's preset."""
         if self.budget is not None:
             return self.budget
         if self.access == "any":
@@ -67,8 +67,8 @@ class DemoSettings:
 
     @property
     def prolong(self) -> bool:
-        """Whether a training is prolonged while the return still rises: if ``prolongs`` advises it, and the policy
-        search supports it."""
+        """Whether the training is prolonged while the return still rises. This requires that the policy search supports
+        it, and that no number of virtual steps is given (see ``prolongs``)."""
         return SEARCHES.get(self.search).prolongable and prolongs(TrainSettings(total_steps=self.steps), self.spec())
 
     @property

@@ -44,7 +44,7 @@ class LaneReset:
 
 @dataclass(frozen=True)
 class LaneStep:
-    """Result of a step, with further facts that the environment classes report in their own form."""
+    """Result of a step, with facts about its episodes that each environment class reports in its own form."""
 
     result: StepResult
     began: Bools  # (N,) lanes that were reset instead of stepped (autoreset mode next_step); their action had no effect

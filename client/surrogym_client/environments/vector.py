@@ -186,7 +186,7 @@ def _step_infos(step: LaneStep, lanes: Bools) -> dict[str, Any]:
 
 
 def _entry(key: str, values: NDArray[Any], lanes: Bools) -> dict[str, Any]:
-    """Return an info in Gymnasium's form: an array with a value for each of ``lanes``, 0 for others, and its mask."""
+    """Return an info as Gymnasium has it: values at ``key``, 0 outside of ``lanes``, and ``lanes`` at ``_key``."""
     shown = np.zeros_like(values)
     shown[lanes] = values[lanes]
     return {key: shown, f"_{key}": lanes.copy()}

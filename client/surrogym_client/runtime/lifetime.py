@@ -28,8 +28,8 @@ def _watch(parent: int) -> None:
 
 
 def terminations() -> list[signal.Signals]:
-    """Return the signals that ask this process to end (SIGTERM, SIGHUP), without those that it ignores, as under
-    nohup."""
+    """Return the signals that ask this process to end: SIGTERM and SIGHUP, without those that this process ignores,
+    such as SIGHUP under nohup."""
     return [number for number in TERMINATIONS if signal.getsignal(number) is not signal.SIG_IGN]
 
 

@@ -18,7 +18,7 @@ FEWEST_MODELS = 4  # fewest models from which to estimate a rate
 NOISY_SLACK = 1.25  # factor on the allowed leave-one-out error once noise is confirmed
 NOISE_BAND = 1.5  # standard deviations of the noise that the server adds to a tolerance in the confidence index
 MOSTLY_NOISE = 0.8  # share of noise in the squared leave-one-out error from which more real steps hardly help
-TOLERABLE = 1e-6  # share of the leave-one-out error; a smaller tolerance comes from samples with equal values
+TOLERABLE = 1e-6  # share of the leave-one-out error; if a tolerance is smaller, all initial samples had the same value
 
 
 def verdict(view: SurrogateView) -> str:
@@ -157,7 +157,7 @@ def _largest_error(output: OutputFidelity) -> float:
 
 
 def _slack(output: OutputFidelity) -> float:
-    """Return the factor on the tolerance that the server allows a leave-one-out error."""
+    """Return the largest leave-one-out error that the server allows, as a multiple of the tolerance."""
     return NOISY_SLACK if output.noise else 1.0
 
 
@@ -252,5 +252,5 @@ def _within_reach(view: SurrogateView, output: OutputFidelity) -> float:
 
 
 def _beyond(value: float, part: float) -> float:
-    """Return a standard deviation without an independent part: sqrt(value^2 - part^2); 0 if the part is larger."""
+    """Return the standard deviation ``value`` less an independent ``part``: sqrt(value^2 - part^2), at least 0."""
     return sqrt(max(value**2 - part**2, 0.0))

@@ -176,7 +176,7 @@ def wait_for_model(
 def _looks(
     api: Api, name: str, seconds: float, progress: Callable[[SurrogateView], None] | None
 ) -> Iterator[SurrogateView | None]:
-    """Poll a surrogate for ``seconds``, report each state and yield it; yield None if the server did not answer."""
+    """Poll a surrogate for ``seconds``. Call ``progress`` with each view and yield it; yield None without an answer."""
     deadline = time.monotonic() + seconds
     while True:
         view = _look(api, name, deadline)
@@ -202,5 +202,5 @@ def _look(api: Api, name: str, deadline: float) -> SurrogateView | None:
 
 
 def _under_way(view: SurrogateView) -> bool:
-    """Whether a design has open queries, also such that were added after its end."""
+    """Whether a design has open queries, including those that were added after its end."""
     return view.queries.pending + view.queries.leased > 0

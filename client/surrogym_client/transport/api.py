@@ -225,8 +225,8 @@ class Api:
     def fail(
         self, name: str, query_id: int, lease_token: str, error: str, *, begun: bool = True, refused: bool = False
     ) -> None:
-        """Return a query without an answer, with the error it caused. ``begun``: a real step may have been taken.
-        ``refused``: the original environment refused the query before a real step."""
+        """Hand a query back to the server without an answer, with the error it caused. ``begun``: whether a real step
+        may have been taken. ``refused``: whether the original environment refused the query before a real step."""
         body = wire.FailQuery(lease_token=lease_token, error=error, begun=begun, refused=refused)
         self._send(f"{routes.surrogate(name)}/queries/{query_id}:fail", body)
 
@@ -288,10 +288,10 @@ class Api:
         """Send real steps, and return once the server has stored them.
 
         Steps of purpose ``logged`` were recorded before: they don't count towards the budget, and storing a log twice
-        changes nothing. A log may be sent in several calls: ``after`` is the ``digest`` of the reply to the part
-        before, and ``complete`` is true for the last part, which starts a fit. If the reply has a ``restart``, nothing
-        of the log was stored, and it has to be sent from its beginning with this as ``after``; a call without ``after``
-        does so by itself.
+        changes nothing. A log may be sent in several calls: ``after`` is the ``digest`` of the reply to the
+        previous part, and ``complete`` is true for the last part, which starts a fit. If a reply has a ``restart``, no
+        part of the log is stored: send the log again from its beginning, with this ``restart`` as ``after``. A call
+        without ``after`` does this by itself.
 
         A batch of up to about 300 samples is stored whole or not at all. A larger one is sent in several requests, so
         an error may leave its first part stored; the same call with the same key then adds the rest. ``stored`` is

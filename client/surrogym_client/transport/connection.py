@@ -57,7 +57,7 @@ class Timeouts:
 class Retries:
     """Retry budget of a request: ``seconds`` from the first failure; 0 does not retry.
 
-    Pauses grow by ``factor``. Each is drawn at random between half its length and its length.
+    Pauses grow by ``factor``. The actual pause is drawn at random between half of this length and all of it.
     """
 
     seconds: float = 30.0

@@ -226,7 +226,7 @@ class HttpSurrogate:
 
     def _answered(self, live: _Live, sent: Sent) -> tuple[bytes, tuple[int, Any]]:
         """Send a request until it is answered. If the server has restored an older checkpoint of the session, first
-        send the requests since then again."""
+        send the requests after this checkpoint again."""
         if live.window is None:
             return self._sent(live, sent)
         window, returns = live.window, 0
@@ -238,7 +238,7 @@ class HttpSurrogate:
                 if behind is None or behind >= sent.seq or returns == _RETURNS:
                     raise
                 returns += 1
-                with suppress(SeqConflict):  # the server went back again; the next attempt shows how far
+                with suppress(SeqConflict):  # restored once more; the next attempt shows from where
                     self._send_again(live, window, behind)
 
     def _send_again(self, live: _Live, window: Window, behind: int) -> None:

@@ -74,7 +74,7 @@ class Stream:
         with self._turn:
             try:
                 connected = self._socket or self._connect()
-                if seconds != connected.gettimeout():  # setting a time-out is a system call
+                if seconds != connected.gettimeout():  # spares a system call if nothing changes
                     connected.settimeout(seconds)
                 key = secrets.token_bytes(KEY_BYTES)
                 with suppress(ConnectionError):  # a server that refuses a large message stops reading, and answers
@@ -176,7 +176,7 @@ class Stream:
 
 
 def _refused(response: Response) -> Exception:
-    """Return the error for a refused handshake: a problem of this session, or ``StreamUnavailable``."""
+    """Return the error for a refused handshake: the ``ProblemError`` from the server, or else ``StreamUnavailable``."""
     try:
         problem = Problem.model_validate_json(response.body or b"")
     except ValidationError:

@@ -36,8 +36,8 @@ def has_any(package: str) -> bool:
 
 
 def _digest_of_sources(package: str) -> str:
-    """Return one digest of all source files that a package compiles and of this folder's files. Numba itself checks
-    only the file of the called function."""
+    """Return one digest of all source files that a package compiles, and of the files in ``surrogym_shared.compiled``.
+    Numba itself checks only the file of the called function."""
     files = set(Path(__file__).parent.glob("*.py"))
     if source := getattr(sys.modules[package], "__file__", None):
         root = Path(source).parent

@@ -17,7 +17,7 @@ from surrogym_shared.fmu.description import build_description, model_description
 
 FLAGS = ("-std=c99", "-O2", "-fPIC", "-shared", "-fvisibility=hidden", "-ffp-contract=off")
 WRAPPER = "fmi3.c"
-LOADS = "import ctypes, sys; ctypes.CDLL(sys.argv[1])"  # test of the library: CC may compile for another machine
+LOADS = "import ctypes, sys; ctypes.CDLL(sys.argv[1])"  # test that this machine loads the library
 EPOCH = (1980, 1, 1, 0, 0, 0)  # fixed date of all entries, so that the same block gives the same bytes
 SYSTEMS = {"linux": ("linux", ".so"), "darwin": ("darwin", ".dylib"), "win32": ("windows", ".dll")}
 MACHINES = {"amd64": "x86_64", "x86_64": "x86_64", "arm64": "aarch64", "aarch64": "aarch64"}

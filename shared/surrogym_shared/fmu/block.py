@@ -92,7 +92,7 @@ class Block:
 
     @property
     def token(self) -> str:
-        """Token that binds description and native code: equal for equal blocks, and only for these."""
+        """Token by which native code recognises its description. Only equal blocks have equal tokens."""
         parts = [self.name, self.description, repr(self.variables), repr((self.period, self.memory, self.acts_first))]
         parts += [part for name in sorted(self.sources) for part in (name, self.sources[name])]
         return "{" + hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:32] + "}"

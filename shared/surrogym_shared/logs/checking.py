@@ -204,8 +204,8 @@ def _shaped(spec: EnvironmentSpec, roles: Roles, steps: Transitions) -> Transiti
 def _consistent(spec: EnvironmentSpec, steps: Transitions) -> Transitions:
     """Reject the steps that contradict the specification.
 
-    These are steps with a discrete action that is not a whole number, and steps that end, or don't end, against the
-    declared termination.
+    These are steps with a discrete action that is not a whole number, steps that are marked as terminated although no
+    declared termination holds, and steps that are not marked although one holds.
     """
     reasons: dict[int, str] = {}
     if not isinstance(spec.action, BoxAction):

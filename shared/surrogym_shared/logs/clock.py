@@ -21,7 +21,7 @@ SHARED = 0.1
 # Of the rows with the time of the row before, some differ from it in other numbers. Up to a share of REPEATS, all these
 # rows are repeats. From a share of DIFFER on, they are steps under a coarse clock. Between the two, the log is refused.
 REPEATS, DIFFER = 0.02, 0.2
-# A coarse clock is refused if at more than this share of its times the number of rows is unusual by more than one.
+# A coarse clock is refused if, at more than this share of its times, the number of rows is not the usual one +- 1.
 IRREGULAR = 0.1
 GAP = 1.5  # from this number of ticks between two times on, rows are missing between them
 
@@ -32,9 +32,9 @@ class Episodes:
 
     Attributes:
         number: number of each row's episode, (n,).
-        overlapping: numbers of the episodes that begin at a time within the episode before, as joined files do that
-            share some rows.
-        notes: sentences that say where an episode begins for another reason than a mark or a new name.
+        overlapping: numbers of the episodes whose first time lies within the previous episode. This happens if a log
+            was joined from files that share some rows.
+        notes: sentences about episodes that begin without a mark or a new name, such as where the time goes back.
     """
 
     number: Ints
@@ -45,9 +45,9 @@ class Episodes:
 def episodes_of(rows: Rows) -> Episodes:
     """Number the episodes of a log.
 
-    An episode begins at each name in a column of episodes. It also begins where such a name returns after other
-    episodes, unless the rows of several episodes alternate. Without a column, it begins after each end. In both cases
-    it begins where the time starts again.
+    If the log has a column of episode names, an episode begins at each new name. It also begins where an earlier name
+    returns, unless the log has times, or the rows of several episodes alternate. If the log has no such column, an
+    episode begins after each row that ends one. In both cases, an episode also begins where the time goes back.
     """
     notes: list[str] = []
     label = np.zeros(len(rows), dtype=np.int64) if rows.episode is None else _names(rows, rows.episode, notes)
@@ -76,14 +76,15 @@ def episodes_of(rows: Rows) -> Episodes:
 def _names(rows: Rows, names: Ints, notes: list[str]) -> Ints:
     """Return the number of each row's episode (n,), by its name.
 
-    A name that returns after other names gets a new number, unless a clock orders the rows, or episodes alternate.
+    A name that returns after other names gets a new number, unless the log has times, or the rows of several episodes
+    alternate.
     """
     changes = np.zeros(len(rows), dtype=np.bool_)
     changes[1:] = names[1:] != names[:-1]
     stretch = np.cumsum(changes, dtype=np.int64)
     alternate = bool(np.median(np.bincount(stretch)) < 2) if len(rows) else False
     returned = int(stretch[-1]) + 1 - len(np.unique(names)) if len(rows) else 0
-    if rows.time is not None or alternate or not returned:  # a clock shows without names which rows continue an episode
+    if rows.time is not None or alternate or not returned:  # times show where an episode begins again
         return names
     first: dict[int, int] = {}
     back = next(
@@ -185,11 +186,11 @@ class Ticks:
 
 
 def ticks_of(rows: Rows, episode: Ints, left_out: Mapping[int, str]) -> Ticks | None:
-    """Find out whether the clock of a log is coarser than its rows; None if it is not.
+    """Return the ticks of a log's clock if the clock is coarser than the rows; otherwise None.
 
     Raises:
-        UnusableLog: rows of the same time may be repeats or not; or the clock is coarser, and the number of rows at the
-            same time varies, so that rows may be missing anywhere.
+        UnusableLog: it is unclear whether rows of the same time are repeats or steps; or the clock is coarser than the
+            rows, and the number of rows at the same time varies, so that rows may be missing anywhere.
     """
     if rows.time is None:
         return None

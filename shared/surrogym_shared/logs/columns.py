@@ -126,8 +126,8 @@ Columns = Annotated[dict[str, str], Field(max_length=MOST)] | Annotated[list[str
 class LogMapping(FailFast):
     """Roles of the columns of a log, as a person declares them.
 
-    ``state`` and ``action`` are lists of columns, whose names are then also those of coordinates and action entries, or
-    tables from other names to columns.
+    ``state`` and ``action`` are lists or tables. In a list, each column is also the name of the coordinate or action
+    entry. A table has the column of each coordinate or action entry by its name.
     """
 
     model_config = ConfigDict(extra="forbid")
@@ -162,7 +162,7 @@ def roles_by_name(names: Sequence[str]) -> Roles:
     """Find the roles of columns by their names; see the how-to page on logs.
 
     Raises:
-        UnusableLog: states or actions have no column, too many, or two for one name, or another role has two.
+        UnusableLog: there are no states or no actions, or too many; or two columns have the same state, action or role.
     """
     headings = [heading(name) for name in names]
     single: dict[str, Any] = {role: _only(role, headings, names_of_role) for role, names_of_role in SINGLE.items()}
@@ -417,7 +417,8 @@ def _require(names: Iterable[str], state: Mapping[str, str], action: Mapping[str
 
 
 def _only(role: str, headings: Iterable[Heading], names: Sequence[str]) -> str | None:
-    """Return the column with a known name of a role; None without one. Raises ``UnusableLog`` if there are several.
+    """Return the column whose heading is one of the known ``names`` of a role; None if there is no such column. Raises
+    ``UnusableLog`` if there are several.
 
     Case only matters for single letters: t is a time, T a temperature. A letter with a physical unit is a quantity.
     """

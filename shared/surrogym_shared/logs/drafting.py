@@ -185,7 +185,8 @@ def _stays_at(after: Floats, end: float, ends: tuple[float, float]) -> bool:
 
 
 def _start(coordinate: Coordinate, steps: Transitions, index: int) -> Uniform | Fixed:
-    """Return the range of a coordinate at the starts of the log's episodes; of one episode, the range of all states."""
+    """Return the range of a coordinate at the starts of the log's episodes. If the log has only one episode, return the
+    range over all states."""
     begins = steps.q[steps.first, index]
     values = begins if len(begins) >= FEW_EPISODES else steps.q[:, index]
     if coordinate.kind == "angle":
@@ -212,7 +213,8 @@ def _starts(steps: Transitions, columns: list[int], coordinates: list[Coordinate
 
 
 def _outside_reward(steps: Transitions, budget: int, notes: list[str]) -> float | None:
-    """Return the log's worst reward if the design takes no real steps; else None."""
+    """Return the reward for each step that is missing after a virtual episode has left the ranges: the log's worst
+    reward. Return None if the design takes real steps, or if the log has no rewards."""
     if budget or steps.reward is None:
         return None
     worst = float(steps.reward.min())
@@ -241,8 +243,9 @@ def _entries_of(coordinate: Coordinate) -> Iterator[ObservationEntry]:
 def _action(roles: Roles, steps: Transitions, notes: list[str]) -> BoxAction | DiscreteAction | MultiDiscreteAction:
     """Draft the action space from the values in the log.
 
-    It is discrete if choices are declared, or if every column has all whole numbers from 0. Otherwise it is continuous,
-    with a note that asks whether few whole numbers are choices.
+    The action is discrete if the mapping declares this, or declares choices. Without a declaration, it is discrete if
+    each column has all whole numbers from 0 to its largest value, and the columns are no one-hot code. Otherwise it is
+    continuous; a note then asks about columns with few whole numbers whether these are choices.
 
     Raises:
         UnusableLog: a discrete action is declared, and its values are not numbered from 0; or an action never varies.

@@ -142,7 +142,7 @@ def _numbering(name: str, table: Table) -> Numbering | None:
     its name is that of a counter.
 
     Raises:
-        UnusableLog: the column numbers the rows, and they are in another order.
+        UnusableLog: the column numbers the rows, and the rows are not in the order of these numbers.
     """
     kind, one = numbering(table.columns[name]), heading(name)
     is_index = name in table.unnamed or bool(INDEX.intersection(one.words))

@@ -39,8 +39,9 @@ class _Head:
 def table_of_text(text: str, where: str, most_rows: int = MOST_ROWS, remarks: Sequence[str] = ()) -> Table:
     """Read a table from text with a heading.
 
-    Lines before the heading that begin with ``#``, ``%`` or ``//`` are comments. The last of them is the heading if no
-    other line is, as ``numpy.savetxt`` writes it. A column without a name is left out.
+    Lines before the heading that begin with ``#``, ``%`` or ``//`` are comments. If the
+    first other line is a row, the last comment is the heading, as in files of ``numpy.savetxt``. A column without a
+    name is left out.
 
     Args:
         text: the log.

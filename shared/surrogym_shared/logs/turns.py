@@ -19,24 +19,24 @@ FULL_TURN = 2 * math.pi
 KNOWN = {FULL_TURN: "radians", 360.0: "degrees", 400.0: "gon", 1.0: "turns", 24.0: "hours", 60.0: "minutes"} | {
     float(2**bits): "counts" for bits in range(8, 25)
 }
-FILLED = 0.8  # least width of a column's values, as a share of a turn
+FILLED = 0.8  # least width of a column's values, as a share of a full turn
 MOST_JUMPS = 1 / 3  # largest share of the steps that may jump
-CONTINUES = 4.0  # most standard deviations by which a jump, with a turn added, may differ from the predicted change
+CONTINUES = 4.0  # most standard deviations by which a jump plus a full turn may differ from the predicted change
 ROUGHLY = 0.1  # largest difference from the predicted change, as a share of a usual change, if the motion is not linear
 OUTLIERS = 0.05  # largest share of the jumps that may differ from the predicted change by more than is allowed
-BY_CHANCE = 1e-3  # largest probability that jumps of a column without turns match a turn by chance
-NEAR = 1e-3  # largest difference between the size of the jumps and a turn, as a share of the turn
+BY_CHANCE = 1e-3  # largest probability that jumps of a column that does not wrap match a full turn by chance
+NEAR = 1e-3  # largest difference between the size of the jumps and a full turn, as a share of the full turn
 FINEST = 1e-6  # least standard deviation of the predicted change, as a share of the width of the values
 
 
 @dataclass(frozen=True)
 class Turn:
-    """The turn after which the values of a column wrap.
+    """Full turn after which the values of a column wrap, such as 360 for an angle in degrees.
 
     Attributes:
-        size: size of the turn, in the unit of the column.
-        unit: name of the unit in which a turn has this size; empty for an unknown one.
-        sure: whether the motion continues across the jumps more closely than by chance.
+        size: size of the full turn, in the unit of the column.
+        unit: name of the unit in which a full turn has this size, such as degrees; empty if the unit is unknown.
+        sure: whether the jumps agree with full turns so closely that this is hardly by chance.
     """
 
     size: float
@@ -45,7 +45,7 @@ class Turn:
 
 
 def turn_of(steps: Transitions, index: int) -> Turn | None:
-    """Return the turn after which column ``index`` of the states wraps; None if it does not wrap."""
+    """Return the full turn after which the values of column ``index`` of the states wrap; None if they don't wrap."""
     before, after = steps.q[:, index], steps.q_next[:, index]
     change, low, high = after - before, min(before.min(), after.min()), max(before.max(), after.max())
     width = float(high - low)
@@ -75,7 +75,7 @@ def turn_of(steps: Transitions, index: int) -> Turn | None:
 
 
 def _lies_in(low: float, high: float, turn: float) -> bool:
-    """Whether values from ``low`` to ``high`` lie within one turn that begins at 0 or is centred at 0."""
+    """Whether values from ``low`` to ``high`` lie within one full turn that begins at 0 or is centred at 0."""
     slack = NEAR * turn
     return (low >= -slack and high <= turn + slack) or (low >= -turn / 2 - slack and high <= turn / 2 + slack)
 

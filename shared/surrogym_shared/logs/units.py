@@ -73,7 +73,8 @@ def unit_notes(q: Floats, spec: EnvironmentSpec) -> list[str]:
 def require_reward_unit(paid: Floats, known: Floats, name: str) -> None:
     """Check that the rewards of a log seem to be in the same unit as those of a surrogate's samples.
 
-    Nothing is checked if the samples are few, whose rewards may be small by chance, or if all their rewards are 0.
+    Nothing is checked if the samples are few, because their rewards may be small by chance, or if all rewards of the
+    samples are 0.
 
     Args:
         paid: rewards of the log, (m,).
@@ -81,7 +82,8 @@ def require_reward_unit(paid: Floats, known: Floats, name: str) -> None:
         name: name of the surrogate.
 
     Raises:
-        UnusableLog: the middle half of ``paid`` is ``BEYOND`` times as large as all known rewards, or spreads as far.
+        UnusableLog: the middle half of ``paid`` lies beyond ``BEYOND`` times the largest size of a known reward, or is
+            wider than that.
     """
     largest = float(np.abs(known).max(initial=0.0))
     if len(known) < FEWEST or largest == 0:

@@ -91,7 +91,7 @@ class Bounds(Frozen):
 
 
 class Lag(Frozen):
-    """Past value that a coordinate repeats. Its next value is known, so no process learns it.
+    """Past value that a coordinate repeats. Its next value is known, so no model learns it.
 
     ``change``: how far coordinate ``of`` moved in the step, an angle by at most half a turn. ``value``: the value of
     coordinate ``of`` before the step. ``action``: entry ``entry`` of the step's action. ``steps``: the number of steps

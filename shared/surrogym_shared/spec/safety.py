@@ -15,7 +15,7 @@ class Limit(Frozen):
     """Range of a term of the state that must never be left, such as the angle of an arm between its stops.
 
     ``margin``: distance from ``low`` and ``high``, in the term's unit, within which the fallback acts. It has to be
-    larger than what one step can add to the change of the step before.
+    larger than the most by which the term's change in one step can exceed its change in the step before.
 
     ``unit``: unit of ``low``, ``high`` and ``margin``. If the term is a single coordinate, it is the coordinate's unit.
     """

@@ -47,8 +47,8 @@ class Prediction(Reply):
 
 
 class Imagine(Request):
-    """Request for virtual episodes under given actions: one along the mean, and some along functions sampled from the
-    posterior."""
+    """Request for virtual episodes under given actions: one with the model's mean prediction in each step, and some
+    with functions that are sampled from the model's posterior."""
 
     coordinates: Vector = Field(description="(C,) state at the start")
     actions: Annotated[list[Vector], Field(min_length=1, max_length=MAX_IMAGINED)] = Field(description="(T, F) actions")

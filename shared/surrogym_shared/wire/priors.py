@@ -24,8 +24,8 @@ class CalibratedParameter(Request):
 
 
 class PriorAbout(Request):
-    """Origin of a prior, a model learned from a simulator. Errors are shares of the standard deviation of each
-    coordinate's changes."""
+    """Origin of a prior, a model learned from a simulator. The simulator's errors are given as shares of the standard
+    deviation of each coordinate's changes in a step."""
 
     source: Word = Field(description="the simulator, or the surrogate")
     parameters: Annotated[list[CalibratedParameter], Field(max_length=64)] = Field(

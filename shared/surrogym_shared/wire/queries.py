@@ -97,7 +97,7 @@ class RenewLease(Request):
 
 
 class FailQuery(Request):
-    """Request of a sampler to return a query without an answer. Another sampler may then claim it."""
+    """Request of a sampler to hand a query back without an answer. Another sampler may claim it, unless ``refused``."""
 
     lease_token: Key = Field(description="token of the lease")
     error: Annotated[str, Field(min_length=1, max_length=4_000)] = Field(
