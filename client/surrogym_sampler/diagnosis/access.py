@@ -22,7 +22,7 @@ from surrogym_shared.spec import BoxAction, EnvironmentSpec, limits
 PLACES = 3  # number of states to set, and of steps in each test episode
 EXACT = 1e-6  # share of a coordinate's range; a smaller difference is rounding
 CLOSE = 1e-2  # share of a coordinate's range: the largest error of a state that counts as set
-FEW = 3.0  # factor on the measured noise, which is estimated from few steps
+FEW = 3.0  # a difference may be this multiple of the measured noise, because few steps show the noise
 
 
 class CheckFailed(StepFailed):
@@ -39,18 +39,21 @@ class CheckFailed(StepFailed):
 
 @dataclass(frozen=True)
 class Access:
-    """Results of repeated steps and resets. Each error is the largest difference, as a share of a coordinate's sampling
-    range; None if the environment lacks the methods that the comparison needs.
+    """Results of repeated steps and resets.
+
+    Each error is the largest difference that was found, as a share of a coordinate's sampling range; differences of
+    rewards are relative. It is None if the comparison was not made, for example because the environment lacks a method
+    that it needs.
 
     Attributes:
         steps: number of real steps.
         resets: number of resets.
-        set_error: between the requested coordinates and those that were read back.
-        repeat_error: between two steps from one state.
-        reset_error: between two resets with one seed.
-        replay_error: between two episodes from one seed under the same actions.
-        memory_error: between a step of an episode and the same step after its state was set.
-        restore_error: between a step from a saved state and the same step after a return to it.
+        set_error: difference between the coordinates that were requested and those that were read back.
+        repeat_error: difference between two steps from the same state with the same action.
+        reset_error: difference between the starts of two resets with the same seed.
+        replay_error: difference between two episodes with the same seed and actions.
+        memory_error: difference between a step of an episode and the same step after its state was set.
+        restore_error: difference between a step from a saved state and the same step after the state was restored.
     """
 
     steps: int
@@ -69,14 +72,14 @@ class Access:
 
     @property
     def noise(self) -> float:
-        """The larger difference between steps that should be equal, as a share of the range; 0 if no steps were
-        compared."""
+        """The larger one of ``repeat_error`` and ``replay_error``, the differences between steps that should be equal;
+        0 if neither was measured."""
         return max(self.repeat_error or 0.0, self.replay_error or 0.0)
 
     @property
     def can_set(self) -> bool:
-        """Whether the environment can be set to a state so completely that the next step is the same as in
-        an episode."""
+        """Whether the environment can be set to a state completely: the state is read back as requested, and the next
+        step equals the original step from this state in an episode."""
         if self.set_error is None or self.set_error > CLOSE:
             return False
         return self.memory_error is None or self.memory_error <= self._allowed
@@ -88,14 +91,15 @@ class Access:
 
     @property
     def _allowed(self) -> float:
-        """The largest difference at which two steps from the same state count as equal; larger if the environment is
-        random."""
+        """The largest difference at which two steps from the same state count as equal: ``CLOSE``, or a multiple of the
+        measured noise if the environment is random and the multiple is larger."""
         random = self.replay_error is None or self.replay_error > EXACT
         return max(CLOSE, FEW * self.noise) if random else CLOSE
 
     @property
     def mode(self) -> str:
-        """The recommended access to the environment, with the option that registers it."""
+        """The recommended kind of state in which queries begin (any state, a snapshot or a reset), in words, with the
+        command line option for it."""
         if self.can_set:
             return "set any state"
         return "snapshots (--access snapshot)" if self.can_restore else "reset only (--access reset)"
@@ -144,7 +148,8 @@ class _Looking:
             self._note("repeat_error", self._between([first], [again]))
 
     def begin_again(self) -> None:
-        """Reset twice with one seed and take the same actions. Then set the last step's state and repeat the step."""
+        """Run two episodes with the same seed and actions, and compare them. Then set a state from which one of their
+        steps began, and repeat that step."""
         actions = [self._action() for _ in range(PLACES)]
         try:
             starts, episodes = zip(*(self._episode(actions) for _ in range(2)), strict=True)
@@ -212,8 +217,8 @@ class _Looking:
         return bool(((at >= ends[:, 0]) & (at <= ends[:, 1])).all())
 
     def _between(self, ones: Sequence[RealStep], others: Sequence[RealStep]) -> float:
-        """Return the largest difference between two lists of steps, in next states (share of the range) or rewards
-        (relative)."""
+        """Return the largest difference between two lists of steps: of next states as a share of the range, of rewards
+        relative. It is 1 if the lists have different lengths."""
         if len(ones) != len(others):
             return 1.0  # one episode ended earlier, so the steps can't be compared
         states = [self._apart(a.next_coordinates, b.next_coordinates) for a, b in zip(ones, others, strict=True)]
@@ -243,8 +248,8 @@ def random_action(spec: EnvironmentSpec, rng: np.random.Generator) -> Array:
 
 
 def apart(spec: EnvironmentSpec, one: object, other: object) -> float:
-    """Return the largest difference between two states (C,), as a share of the sampling range; angles differ by the
-    shorter way."""
+    """Return the largest difference between two states (C,), as a share of the sampling range. Angles are compared by
+    the shorter way around the circle."""
     difference = np.asarray(one, dtype=np.float64) - np.asarray(other, dtype=np.float64)
     for i, coordinate in enumerate(spec.coordinates):
         if coordinate.kind == "angle":

@@ -55,10 +55,10 @@ class Finding:
     """The result of one check.
 
     Attributes:
-        name: the checked thing.
+        name: name of the check.
         said: the result in words.
         way_out: what to do about a problem; None if there is no problem.
-        notable: whether the result is no problem but should be shown to a person.
+        notable: whether to show the result to a person although it is no problem.
     """
 
     name: str
@@ -121,7 +121,7 @@ def environment(
 ) -> Iterator[Finding]:
     """Check whether the original environment can be opened, can take a step, and can be set to a state.
 
-    The checks take real steps, which no ledger counts.
+    The checks take real steps, which are not counted towards the budget of any surrogate.
 
     Args:
         opened: opens the environment.
@@ -167,7 +167,8 @@ def _access_of(original: IsolatedEnvironment | Executable | Simulated, spec: Env
 
 
 def _resets(access: Access) -> Finding:
-    """Report whether a reset with the same seed gives the same start, and the same actions the same episode."""
+    """Report whether two resets with the same seed give the same start, and whether the same actions then give the same
+    episode."""
     same, alike = _error(access.reset_error), _error(access.replay_error)
     if not access.ignores_seed:
         return Finding("resets", f"two with one seed: {same}; the same actions from there: {alike}")
@@ -180,7 +181,8 @@ def _resets(access: Access) -> Finding:
 
 
 def _history_of(original: IsolatedEnvironment | Executable | Simulated, spec: EnvironmentSpec, steps: int) -> Finding:
-    """Report how many earlier changes and actions, beyond the declared lags, the next change depends on."""
+    """Report how many earlier changes and actions the next change depends on, and whether the specification already
+    declares them as coordinates (lags)."""
     if spec.query != "rollout":
         return Finding("history", "not looked for: an environment that is set to a state has no past")
     try:
@@ -204,7 +206,7 @@ def _history_of(original: IsolatedEnvironment | Executable | Simulated, spec: En
 
 
 def _declaring(found: History) -> str:
-    """Return the advice that names the call which declares this history."""
+    """Return the advice to declare this history, with the source text of the call that does it."""
     moving = ", with at_start if a reset leaves it moving" if found.changes else ""
     return f"declare {found.call}{moving}; see docs/how-to/history.md"
 

@@ -44,7 +44,7 @@ class History:
         actions: number of earlier actions in the history.
         error: prediction error with this history.
         error_without: prediction error without earlier changes or actions.
-        largest: by name, the largest observed change of each moving coordinate, widened by ``WIDER``.
+        largest: for each moving coordinate, by name, its largest observed change times ``WIDER``.
     """
 
     steps: int
@@ -144,7 +144,8 @@ def _episodes(environment: RolloutEnvironment, spec: EnvironmentSpec, steps: int
 def _rows(episode: _Episode, changes: int, actions: int, turning: Bools, moving: Bools) -> tuple[Array, Array]:
     """Return the regression's inputs (n, d) and next changes (n, M) from one episode.
 
-    Every history uses the same steps, those that ``LONGEST`` others precede, so that their errors can be compared.
+    The rows are the steps that have at least ``LONGEST`` earlier steps in the episode. So the errors of all histories
+    come from the same steps and can be compared.
 
     Args:
         episode: the episode.
@@ -163,7 +164,8 @@ def _rows(episode: _Episode, changes: int, actions: int, turning: Bools, moving:
 
 
 def _changes(episode: _Episode, turning: Bools) -> Array:
-    """Return the change of each coordinate in each step (T, R); an angle changes by the shorter way."""
+    """Return the change of each coordinate in each step (T, R). The change of an angle is the shorter way around the
+    circle."""
     change: Array = np.diff(episode.read, axis=0)
     change[:, turning] = (change[:, turning] + np.pi) % (2 * np.pi) - np.pi
     return change

@@ -124,8 +124,8 @@ def _columns(name: str, array: Cells, names: Sequence[str]) -> dict[str, Cells]:
 
 
 def _rows(columns: dict[str, dict[str, Cells]]) -> int:
-    """Return the number of rows of the log: the length of its actions or, without an array of actions, the most
-    frequent length."""
+    """Return the number of rows of the log. It is the length of the array of actions; without such an array, it is the
+    length that most arrays have."""
     lengths = {name: len(next(iter(found.values()), ())) for name, found in columns.items()}
     known = [length for name, length in lengths.items() if name in ACTIONS or ACTION.match(name)]
     return known[0] if known else Counter(lengths.values()).most_common(1)[0][0]

@@ -75,7 +75,7 @@ def read_log(path: str | Path, options: Options | None = None) -> ReadLog:
 
     Raises:
         UnusableLog: the file is not a log, or has columns whose role is not clear.
-        TooFewSteps: no step is usable, or only one, though a specification is to be drafted.
+        TooFewSteps: no step is usable; or only one is, and a specification has to be drafted from it.
         OSError: a file can't be read.
     """
     path, options = Path(path), options or Options()
@@ -160,7 +160,7 @@ def import_log(
         UnusableLog: the file is not a log, the role of a column is not clear, ``register`` is not a valid name,
             ``rejected`` is the log or the mapping, the file beside the log is not one of rejected rows, or ``draft`` is
             a file with another specification.
-        TooFewSteps: no step is usable, or only one, though a specification is to be drafted.
+        TooFewSteps: no step is usable; or only one is, and a specification has to be drafted from it.
         SurrogymClientError: the server can't be reached, or refuses a request.
 
     Examples:

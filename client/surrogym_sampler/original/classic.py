@@ -45,7 +45,7 @@ class Task:
         write: puts coordinates (C,) into the unwrapped environment, and clears its memory of earlier steps.
         read: returns the coordinates (C,) of the unwrapped environment.
         perturbable: names of the physical attributes that ``--perturb`` may change.
-        settle: recomputes the attributes that depend on those; None if there are none.
+        settle: recomputes further attributes that depend on the changed ones; None if there are none.
     """
 
     spec: Callable[[], EnvironmentSpec]
@@ -231,7 +231,7 @@ def _write_cartpole(env: Native, coordinates: Array) -> None:
 
 def _write_cartpole_of_the_paper(env: Native, coordinates: Array) -> None:
     _write_state(env, coordinates)
-    # with 1, Gymnasium counts the pole as fallen before, and pays 0 outside the limits, as in eq. 17
+    # with 1, Gymnasium counts the pole as fallen before, and pays 0 outside the limits, as in eq. 17 of the paper
     env.steps_beyond_terminated = 1
 
 

@@ -24,7 +24,7 @@ class Moment:
     terminated: bool
     coordinates: Array  # (C,) state after the step
     truncated: bool = False  # whether the environment itself ended the episode without termination
-    fallback: Array | None = None  # (F,) action of the fallback that was applied in the place of the requested one
+    fallback: Array | None = None  # (F,) applied action, if the limits' fallback replaced the requested one
 
 
 class Episode(ABC):

@@ -62,7 +62,8 @@ class SnapshotGone(OriginalError):
 
 
 class SnapshotNotKept(OriginalError):
-    """A state could not be saved or written. The step before it is still counted."""
+    """A state could not be saved, or its snapshot could not be written. The real step that led to the state still
+    counts."""
 
 
 class UnusableFolder(OriginalError):

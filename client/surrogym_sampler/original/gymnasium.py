@@ -29,9 +29,9 @@ def task_for(environment: str, preset: str) -> Task:
 
 
 def opens_task(name: str, spec: EnvironmentSpec | None) -> bool:
-    """Return whether this module opens an environment of this name: it is a classic control task, and the
-    specification, if any, has the task's own coordinates in their order. A described specification has others, so a
-    simulator opens the environment."""
+    """Return whether this module opens the environment of this name. The name must be that of a classic control task.
+    If there is a specification, it must have the task's own coordinates in the same order; a drafted specification has
+    others, and a simulator opens its environment."""
     return name in TASKS and (spec is None or spec.coordinate_names == TASKS[name].spec().coordinate_names)
 
 
@@ -84,7 +84,8 @@ class GymnasiumEnvironment:
         )
 
     def save(self) -> bytes:
-        """Return the task's own state as a snapshot; an angle keeps its turns, a number its precision."""
+        """Return the task's own state as a snapshot. It is exact: full turns of an angle, and all digits of a number,
+        are kept."""
         return packed(np.asarray(self._env.state))
 
     def restore(self, snapshot: bytes) -> Array:

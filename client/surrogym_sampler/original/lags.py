@@ -13,13 +13,15 @@ from surrogym_shared.spec import EnvironmentSpec, limits
 
 
 def read_names(spec: EnvironmentSpec) -> tuple[str, ...]:
-    """Return the names of the R coordinates that the environment itself reads; the others are lags."""
+    """Return the names of the R coordinates that the environment itself reports. The others are lags, which repeat
+    earlier coordinates or actions or count steps."""
     return tuple(c.name for c in spec.coordinates if c.lag is None)
 
 
 def begun(spec: EnvironmentSpec, read: Array) -> Array:
-    """Return the coordinates (C,) after a reset that read the values ``read`` (R,). A lag that counts steps is 0; each
-    other lag has the middle of its declared start.
+    """Return the coordinates (C,) after a reset in which the environment reported the values ``read`` (R,). The other
+    coordinates are lags, which repeat earlier values: a lag that counts steps is 0, any other lag has the middle of its
+    declared start.
 
     Examples:
         A policy on a machine observes ``surrogym_shared.terms.observe(spec, begun(spec, read)[None])[0]``.
@@ -54,7 +56,8 @@ def followed(spec: EnvironmentSpec, before: Array, action: Array, read: Array) -
 
 
 def placed(spec: EnvironmentSpec, read: Array, lags: Array) -> Array:
-    """Return coordinates (C,) with the read values (R,), and with the lags in ``lags`` (C,)."""
+    """Return coordinates (C,) with the values ``read`` (R,) that the environment reported. Coordinates that repeat
+    earlier values (lags) are taken from ``lags`` (C,)."""
     placed = lags.copy()
     placed[[c.lag is None for c in spec.coordinates]] = read
     return wrapped(spec, placed)

@@ -101,9 +101,10 @@ def isolated(
 
 
 def for_queries(name: str, step_limit: float, spec: EnvironmentSpec | None = None) -> Environment:
-    """Build an original environment as ``isolated`` does, which also keeps the limits of its specification."""
+    """Make an original environment as ``isolated`` does, but one that keeps the limits of its specification."""
     made = isolated(name, step_limit, spec)
-    return made if isinstance(made, IsolatedEnvironment) else keeping_limits(made)  # the former keeps them by itself
+    # an IsolatedEnvironment keeps the limits by itself
+    return made if isinstance(made, IsolatedEnvironment) else keeping_limits(made)
 
 
 def is_own(name: str) -> bool:
@@ -167,7 +168,8 @@ def specification(name: str) -> EnvironmentSpec:
 
 def fits(noted: str, name: str) -> bool:
     """Return whether the specification of the environment ``noted`` may be used for the environment ``name``, which an
-    adapter opens: both are the same environment, which is built in or has no specification of its own."""
+    adapter opens. It may if both names stand for the same environment, and this is built in or has no specification of
+    its own."""
     return is_same(noted, name) and (is_known(name) or not has_specification(name))
 
 

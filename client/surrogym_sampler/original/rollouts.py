@@ -28,7 +28,8 @@ KINDS = (("spec", "step_from", "close"), ("spec", "reset", "step", "coordinates"
 class FromReset:
     """A ``ResettableEnvironment`` as a ``RolloutEnvironment``: each step begins where the previous one ended.
 
-    The environment reads R coordinates; the others are lags of these and of the actions.
+    The environment reports R coordinates. The others are lags, which repeat earlier values of these coordinates or
+    earlier actions.
     """
 
     def __init__(self, environment: ResettableEnvironment) -> None:
@@ -187,8 +188,9 @@ def keeping_limits(environment: Environment) -> Environment:
 
 
 def _missing(environment: object) -> str:
-    """Return the names of the methods that an object lacks to be an environment of either kind. The kind of which
-    fewest methods are missing is taken; of two such kinds, the one with more methods."""
+    """Return the names of the methods that an object lacks to be an original environment. There are two kinds of
+    environment; the names are those for the kind that lacks fewer methods or, if both lack equally many, for the kind
+    that has more methods."""
     lacking = [[name for name in names if not callable(getattr(environment, name, None))] for names in KINDS]
     nearest = min(range(len(KINDS)), key=lambda kind: (len(lacking[kind]), -len(KINDS[kind])))
     return " and ".join(lacking[nearest])

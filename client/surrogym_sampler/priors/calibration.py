@@ -28,9 +28,10 @@ SMALLEST = 1e-9  # share of the changes; a smaller error counts as rounding
 FAR = 1e3  # error of a step that the simulator can't take, in standard deviations of the changes
 CONFIDENCE = 0.9  # probability of each parameter's interval
 NUDGE = 1e-5  # share of a parameter's range: step size of numerical derivatives
-WITHIN = 0.29  # standard deviation of a uniform distribution, as a share of its range: nothing but the range is known
+WITHIN = 0.29  # standard deviation of a uniform distribution as a share of its range: the prior of a parameter
 FINEST = 1e-7  # smallest standard deviation of a parameter, as a share of its range; the fit is no more precise
-ROUNDING = 1e-14  # share of the largest eigenvalue, below which a direction counts as undetermined
+# the steps don't determine a direction of the parameters whose eigenvalue is below this share of the largest
+ROUNDING = 1e-14
 FIT: dict[str, Any] = {"bounds": (0.0, 1.0), "x_scale": 0.3, "ftol": 1e-12, "xtol": 1e-12, "gtol": 1e-12}
 LEAST_SHARE = 1e-3  # share of the largest error; a coordinate with a smaller error gets no larger weight
 
@@ -223,8 +224,8 @@ def _best(errors: _Errors, scaling: _Scaling, own: Array) -> Array:
 
 
 def _weights(errors: Array) -> Array:
-    """Return the weight (M,) of each coordinate: one with noise, or that the simulator predicts badly, gets a smaller
-    weight."""
+    """Return the weight (M,) of each coordinate. A coordinate that is noisy, or that the simulator predicts badly, gets
+    a smaller weight."""
     sizes = np.sqrt((errors**2).mean(0))
     return np.asarray(1.0 / np.maximum(sizes, max(SMALLEST, LEAST_SHARE * sizes.max())))
 
@@ -237,7 +238,8 @@ def _with_intervals(
     off = errors(scaling.values(x))
     weights, rows = _weights(off), len(off)
     jacobian = np.stack([((_moved(errors, scaling, x, i) - off) * weights / NUDGE).ravel() for i in range(len(x))], 1)
-    # degrees of freedom for each coordinate; the weights come from the same steps
+    # degrees of freedom of a single coordinate; those of all would be too many, because the weights come from the same
+    # steps
     left = max(1.0, rows - len(parameters) / errors.moving)
     variance = float(((off * weights) ** 2).sum()) / errors.moving / left
     size, axes = np.linalg.eigh(jacobian.T @ jacobian)

@@ -27,7 +27,7 @@ FEWEST, MOST = 100, 400  # smallest and largest number of simulated steps
 WORSE = 1.5  # if the error on the real steps so far exceeds this multiple of the calibration's error, calibrate again
 AGAIN = 2  # factor by which the number of real steps must grow before the parameters are calibrated again
 TRIALS = 5  # number of steps that test whether a simulator works
-RIGHT = 1e-3  # share of the changes: an error of the simulator that is small enough
+RIGHT = 1e-3  # an error of the simulator below this share of the coordinates' changes is small enough
 
 Progress = Callable[[float | None, str], None]
 
@@ -162,7 +162,7 @@ class SimulatorPrior(ABC):
         return np.asarray(self.simulator.step_from(coordinates, action).next_coordinates, dtype=np.float64)
 
     def _error(self, steps: RealTransitions, by: Calibration) -> float:
-        """Return the error on real steps of the simulator with the values of the calibration ``by``."""
+        """Return the simulator's error on real steps, with the parameter values of the calibration ``by``."""
         values = np.array([by.values[parameter.name] for parameter in self.parameters])
         return calibrate(self.spec, steps, (), values, self._step).error
 

@@ -148,13 +148,14 @@ class _Member:
     name: str
     actor: Any
     run: Any  # Ray's reference to the result of its run
-    asked: Any  # Ray's reference to the look that was requested and not received yet
-    reports: dict[str, SamplerReport] = field(default_factory=dict)  # the last known report of each start
+    asked: Any  # Ray's reference to the requested result of ``look``, which has not arrived yet
+    # the last known report of each process that ran this sampler, by its start id
+    reports: dict[str, SamplerReport] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class News:
-    """What is new since the last look at the samplers."""
+    """The new output lines of all samplers since the last call of ``look``, and whether all samplers have ended."""
 
     lines: tuple[Line, ...]
     over: bool  # whether all samplers have ended
@@ -280,8 +281,8 @@ class RaySamplers:
 
 
 def _noted(member: _Member, look: Look) -> list[Line]:
-    """Store the report of a look, and return its lines. The first look at a process adds a line that says on which
-    machine it runs."""
+    """Store the counts in a sampler's report ``look``, and return the report's output lines. The first report of a
+    process adds a line that names its machine."""
     lines = list(look.lines)
     if look.start not in member.reports:
         again = bool(member.reports)

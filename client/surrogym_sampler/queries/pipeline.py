@@ -53,8 +53,8 @@ class ClaimAhead:
         self._future = beside(self._run)
 
     def take(self) -> ClaimedQueries | None:
-        """Return the claimed queries, once the step is over; None if there are none, or the step ended too early or too
-        late."""
+        """Return the claimed queries, once the running step is over. None if there are none: the step ended before the
+        claim began, nothing was claimed, or the step took so long that the queries were returned to the queue."""
         self._over.set()
         return self._future.result()
 
@@ -71,10 +71,11 @@ class ClaimAhead:
 
 
 class Pipeline(Generic[T]):
-    """At most one answer being sent and one claim ahead, during the running step of a sampler.
+    """Sends an answer and claims the next query while a sampler takes real steps: at most one of each at a time.
 
-    They run beside the step as long as each answer is accepted. After an answer that is not accepted, each request
-    waits for the one before it, so that no further step begins after a fault of the machine or of an answer.
+    These requests run at the same time as a step only as long as the server accepts each answer. After an answer that
+    is not accepted, each request waits for the one before it, so that no further step begins after a fault of the
+    machine or of an answer.
 
     Args:
         settle: called with the result of each answer, in order, by the thread that owns the pipeline. Returns whether
@@ -107,13 +108,15 @@ class Pipeline(Generic[T]):
         return taken
 
     def send(self, answer: Callable[[], T], *, clean: bool, last: bool) -> None:
-        """Send an answer. When this returns, it is acknowledged, unless the last answer was accepted and another query
-        is at hand.
+        """Send an answer, and wait until the server has acknowledged it. There is no wait if the server has accepted
+        the previous answer, is likely to accept this one, and another claimed query can begin: the answer is then sent
+        during that query's step.
 
         Args:
             answer: sends the answer.
-            clean: whether the server is likely to accept it.
-            last: whether it answers the last of the claimed queries. One that was claimed ahead may follow.
+            clean: whether the server is likely to accept the answer.
+            last: whether this is the answer to the last of the claimed queries. A query that was claimed ahead may
+                follow.
         """
         self.settle()
         if not (clean and self._flows):

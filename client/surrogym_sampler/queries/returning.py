@@ -110,8 +110,8 @@ class Returning:
         return name
 
     def handed_in(self, names: Iterable[str]) -> None:
-        """Add to ``gone`` those of these snapshots, which the server has just learned of, that no longer exist: another
-        sampler has deleted them, or this one has while their samples were being sent."""
+        """Check snapshots that the server has just learned of, and add the names of those that no longer exist to
+        ``gone``. Another sampler may have deleted them, or this one while it sent their samples."""
         self.gone += [name for name in names if name not in self._folder and name not in self.gone]
 
     def remarks(self) -> str:

@@ -37,8 +37,8 @@ SPEC = EnvironmentSpec(
 
 
 class Target:
-    """A server under test and its surrogate. Checked requests are sent as plain HTTP, so that the raw reply can be
-    compared; ``api`` sends the others."""
+    """A server under test, and the surrogate that the test makes there. Requests whose replies are checked are sent as
+    plain HTTP, so that the raw reply can be compared. All other requests go through the client ``api``."""
 
     def __init__(self, url: str | None, token: str | None, surrogate: str) -> None:
         self.surrogate = surrogate

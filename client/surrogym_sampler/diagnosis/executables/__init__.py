@@ -50,5 +50,5 @@ def _outcome(check: Callable[[Subject], None], way_out: str, subject: Subject) -
 
 
 def _own(error: Exception) -> str:
-    """Return the error's message without its advice to run the very command that is running."""
+    """Return an error's message without the advice to run this check, which is running already."""
     return str(error).removesuffix(f"; {CHECK}")

@@ -26,7 +26,8 @@ from surrogym_sampler.original.state_parts import (
     mujoco_parts,
 )
 
-# a server's name of this package is opened without consent, so the working directory is not searched for it
+# environments of this package are opened without consent if a server names them, so the package must be the installed
+# one: the working directory is not searched
 ROBOTICS = "gymnasium_robotics"
 # spaces whose values are not numbers that change gradually
 SYMBOLS = ("Discrete", "MultiDiscrete", "MultiBinary", "Text", "Graph", "Sequence")

@@ -19,11 +19,12 @@ from surrogym_sampler.original.protocol import Array
 from surrogym_shared.spec import EnvironmentSpec, Inequality, Term
 from surrogym_shared.terms import evaluate, holds
 
-LEVEL = 1e-5  # largest difference between points of the same level, as a share of the quantity's range
-SHARED = 2  # smallest number of points of a face
-SURE = 3  # number of points that don't share a level by chance
+LEVEL = 1e-5  # points have the same value (level) of a quantity if they differ by at most this share of its range
+SHARED = 2  # smallest number of boundary points of a face, on which a quantity has one value
+SURE = 3  # smallest number of points that have the same value (level) of a quantity not by chance
 MOST_FACES = 6
-# smallest share of the points that must lie on faces; the others may be where the state jumps, as at a contact
+# smallest share of the boundary points that must lie on faces of the box; the others may be where the state jumps, as
+# at a contact
 ALMOST_ALL = 0.75
 
 
@@ -35,11 +36,12 @@ class _Face:
 
 
 def has_face(spec: EnvironmentSpec, terms: Sequence[Term], bounds: Array, states: Array) -> bool:
-    """Return whether at least three points of the boundary share a level of one quantity.
+    """Return whether at least three points of the boundary have the same value (level) of some quantity, as the points
+    of a face of a box have.
 
     Args:
         spec: the environment.
-        terms: quantities that may have levels.
+        terms: quantities by which the points are compared.
         bounds: points of the boundary (K, C).
         states: states (n, C) that show the range of each quantity.
     """
@@ -47,11 +49,11 @@ def has_face(spec: EnvironmentSpec, terms: Sequence[Term], bounds: Array, states
 
 
 def alone(spec: EnvironmentSpec, terms: Sequence[Term], bounds: Array, states: Array) -> NDArray[np.bool_]:
-    """Return which points of the boundary share no level with another point (K,).
+    """Return which points of the boundary (K,) have no quantity whose value (level) another point has too.
 
     Args:
         spec: the environment.
-        terms: quantities that may have levels.
+        terms: quantities by which the points are compared.
         bounds: points of the boundary (K, C).
         states: states (n, C) that show the range of each quantity.
     """
@@ -64,14 +66,14 @@ def alone(spec: EnvironmentSpec, terms: Sequence[Term], bounds: Array, states: A
 def box(
     spec: EnvironmentSpec, terms: Sequence[Term], bounds: Array, states: Array, inside: NDArray[np.bool_]
 ) -> tuple[Inequality, ...]:
-    """Return inequalities that all hold in the region, and on whose faces most points of its boundary lie; empty if
-    there are none.
+    """Return inequalities that describe a region, such as a box; empty if there are none. All of them hold inside. At
+    most points of the boundary, a quantity has the limiting value of one of them, so the point lies on a face.
 
     A face of two points is left out if the other faces already exclude all states outside the region.
 
     Args:
         spec: the environment.
-        terms: quantities that may have levels.
+        terms: quantities that the inequalities may limit.
         bounds: points of the boundary (K, C).
         states: states inside and outside the region (n, C).
         inside: which of these states are in the region (n,).
@@ -112,8 +114,8 @@ def _faces(spec: EnvironmentSpec, terms: Sequence[Term], bounds: Array, states: 
 
 
 def _side(spec: EnvironmentSpec, face: _Face, inside: Array) -> str:
-    """Return the relation between a face's quantity and its level that holds for all states ``inside`` (n, C) of the
-    region; an empty string if they lie on both sides of the face."""
+    """Return the relation, ">=" or "<=", that holds between the face's quantity and its level in all states ``inside``
+    (n, C) of the region; an empty string if these states lie on both sides of the face."""
     x = evaluate(spec, face.term, inside)
     if (x >= face.level).all():
         return ">="

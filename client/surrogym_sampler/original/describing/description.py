@@ -139,8 +139,8 @@ class _Draft:
         require_coordinates(name, len(self._kept), len(seen.rewards))
 
     def spec(self, rng: np.random.Generator) -> EnvironmentSpec:
-        """Return the specification. Its observation is expressed by the coordinates; ``rng`` draws the states at which
-        it is read."""
+        """Return the specification. The entries of its observation are terms of the coordinates, fitted to the
+        simulator's observations; ``rng`` draws states for the fit."""
         variables = [self._simulator.variables[i] for i in self._kept]
         ranges = Ranges(self._simulator, self._seen, self._probed, self._all)
         coordinates = tuple(ranges.coordinate(i) for i in self._kept)
@@ -271,8 +271,8 @@ class _Draft:
         )
 
     def _chosen(self) -> list[int]:
-        """Return the indices of the variables that become coordinates: those that move or differ between episodes, and
-        repeat no other."""
+        """Return the indices of the variables that become coordinates: those that move or differ between episodes.
+        Variables that repeat another one, or whose shift changes nothing, are left out."""
         kept: list[int] = []
         unmoved = {f"{name}{VELOCITY}" for name in self._unmoved}
         for i, variable in enumerate(self._simulator.variables):
@@ -284,7 +284,8 @@ class _Draft:
 
     @property
     def _unmoved(self) -> list[str]:
-        """The joints that no random action moved although they can move: each reset gave them another position."""
+        """Names of the joints that no random action moved although they can move: each reset gave them another
+        position."""
         moved = (self._seen.states != self._seen.next_states).any(0)
         differs = moved_by(self._seen.starts) > 0
         return [

@@ -72,8 +72,9 @@ def explore(counted: Counted, steps: int, rng: np.random.Generator) -> Seen:
     """Take ``steps`` real steps in random episodes, after ``RESETS`` resets.
 
     Half of the episodes start from resets. If the state can be set, the others start at rest from positions within the
-    limits that are far from all positions so far. The reason: random actions leave a state of high energy and don't
-    return to it, so the positions that they did not reach are those from which something falls fastest.
+    limits that are far from all positions so far. Random actions lead away from states of high energy, such as an
+    upright pole, and don't return there. But from these states something falls fastest, which the ranges of speeds have
+    to cover.
     """
     simulator = counted.simulator
     require_variables(counted.name, simulator.variables)

@@ -16,8 +16,8 @@ from surrogym_shared.terms import evaluate
 
 TOLERANCE = 1e-7  # largest error of an expression, as a share of the entry's largest value
 DIGITS = 6  # decimal digits of a rounded weight, which is used if it still explains the entry
-FEW_TURNS = 4  # number of turning coordinates up to which sums of three of them are tried as well
-CLIPPED = 0.02  # share of states at the smallest or largest value above which an entry counts as clipped
+FEW_TURNS = 4  # largest number of angles with which sums of three angles are tried as well
+CLIPPED = 0.02  # an entry counts as clipped if more than this share of the states has its smallest or largest value
 
 
 def express(

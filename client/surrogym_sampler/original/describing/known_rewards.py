@@ -32,9 +32,10 @@ def known_reward(
 ) -> DeclaredReward | None:
     """Return a declared reward that is exact for all steps, or None.
 
-    If a quadratic function explains most explored steps, further steps from random states decide, because explored
-    states may vary too little, and an episode may follow a schedule. Half of the further steps check the fit to the
-    others. If the explored rewards have at most two values, further steps look for the boundary between the two.
+    If the explored rewards have at most two values, further steps look for the boundary between the states with one
+    value and those with the other. Otherwise, the reward may be a quadratic function that explains most explored steps.
+    It is then fitted to further steps from random states, because the explored states may vary too little, and an
+    episode may follow a schedule. Half of the further steps are for the fit, the others check it.
 
     Args:
         counted: a simulator that can be set exactly.

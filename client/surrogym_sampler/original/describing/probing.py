@@ -21,7 +21,7 @@ from surrogym_sampler.original.simulator import Taken
 PLACES = 4  # number of states in each test
 EXACT = 1e-6  # share of a variable's observed range; a smaller difference is rounding
 SETTABLE = 1e-3  # share of a variable's observed range: the largest error of a state that counts as set
-FEW = 3.0  # factor on the measured noise, which is estimated from few steps
+FEW = 3.0  # a difference may be this multiple of the measured noise, because few steps show the noise
 FARTHEST = 3.0  # largest shift of a position in a test, in the simulator's unit
 TURN = 2 * np.pi
 PART = 1.0  # shift of a variable by a part of a turn, in radians
@@ -30,14 +30,15 @@ ANYWHERE = 32  # number of states within the limits from which a step is taken
 
 @dataclass(frozen=True)
 class Probed:
-    """Results of repeated steps. Errors are shares of each variable's observed range, the largest of all variables.
+    """Results of repeated steps. Each error is the largest difference over all variables, as a share of the variable's
+    observed range.
 
     Attributes:
-        set_error: between a step of an episode and the same step from a state that was set.
-        repeat_error: between two steps from the same state.
-        replay_error: between two episodes from one seed under the same actions.
-        shifts: names of positions whose shift changes nothing.
-        turns: names of angles whose whole turn changes nothing.
+        set_error: difference between a step of an episode and the same step after its state was set.
+        repeat_error: difference between two steps from the same state.
+        replay_error: difference between two episodes with the same seed and actions.
+        shifts: names of the positions to which any distance can be added without an effect.
+        turns: names of the angles to which a full turn (2 pi) can be added without an effect.
         leaving: share of the steps from random states within declared limits that lead outside by more than the width
             of the limits; 0 if this was not tested.
     """
@@ -61,8 +62,9 @@ class Probed:
 
     @property
     def settable(self) -> bool:
-        """Whether the state can be set completely. An error that is larger than the difference of equal episodes means
-        that the environment remembers more than its state."""
+        """Whether setting the state restores the environment completely. It does not if a step after setting the state
+        differs from the original step by more than the environment's randomness explains; the environment then has
+        hidden state."""
         noise = FEW * max(self.replay_error, self.repeat_error) if self.noisy else 0.0
         return self.set_error <= max(SETTABLE, noise)
 
@@ -106,12 +108,12 @@ def probe(counted: Counted, seen: Seen, rng: np.random.Generator) -> Probed:
 
 
 class _Alike(NamedTuple):
-    """Which results of a step stay the same after one variable was shifted.
+    """Whether the results of a step stay the same if one variable is shifted before the step.
 
     Attributes:
-        itself: the variable's own next value, less the shift and whole turns.
-        others: the other variables, the reward and the termination.
-        shown: the observation.
+        itself: whether the variable's own next value is shifted by the same amount, apart from full turns (2 pi).
+        others: whether the other variables, the reward and the termination stay the same.
+        shown: whether the observation stays the same.
     """
 
     itself: bool
@@ -126,7 +128,7 @@ class _Shifted:
         counted: the simulator.
         places: for each step its state (V,), action (F,), next state (V,) and results.
         scale: observed range of each variable and of the reward (V + 1,).
-        same: largest difference that counts as none, as a share of ``scale``.
+        same: largest difference at which two results count as equal, as a share of ``scale``.
     """
 
     def __init__(
@@ -139,15 +141,15 @@ class _Shifted:
         return all(all(alike) for alike in self._compared(index, shift))
 
     def turns(self, index: int) -> bool:
-        """Return whether a whole turn of the variable ``index`` changes nothing about the motion."""
+        """Return whether adding a full turn (2 pi) to the variable ``index`` changes nothing about the motion."""
         return all(alike.itself and alike.others for alike in self._compared(index, TURN))
 
     def is_angle(self, index: int) -> bool:
-        """Return whether the variable ``index``, of unknown kind, is an angle: a whole turn changes nothing, and a part
-        of a turn does.
+        """Return whether the variable ``index``, whose kind of motion is unknown, is an angle: adding full turns (2 pi)
+        changes nothing, but adding a part of a turn changes something.
 
-        Without the test of a part, a position on which nothing depends would count as an angle. Only changes of other
-        variables, the reward or the observation count, because the variable's own next value may lose the shift, as a
+        The second test is needed because a position on which nothing depends would pass the first. It compares only the
+        other variables, the reward and the observation. The variable's own next value may lose the shift, as that of a
         remembered action does.
         """
         whole = []

@@ -17,8 +17,9 @@ from surrogym_shared.spec import Coordinate, Fixed, Uniform, limits
 
 FASTER = 1.5  # factor on the largest observed speed, because a policy may be faster than random actions
 MARGIN = 0.25  # margin on each side of the observed range, as a share of it
-SINGLE = 1e-6  # relative error of an observation in single precision
-SHORT_WAY = 0.05  # share of the way between two stops; steps that are longer may meet a stop from any position
+SINGLE = 1e-6  # relative rounding error of an observation in single precision
+# share of the distance between two stops; a joint that moves more in a step may meet a stop from anywhere
+SHORT_WAY = 0.05
 UNKNOWN_SPEED = 1.0  # assumed largest speed of a variable that never moved, in the simulator's unit
 
 
@@ -46,8 +47,12 @@ class Ranges:
         return Coordinate(name=variable.name, kind=kind, sampling=Uniform(low=low, high=high))
 
     def start(self, index: int, coordinate: Coordinate) -> Uniform | Fixed:
-        """Return the distribution of starts of a coordinate: the range of its schedule, or else that of the observed
-        starts. The latter is widened, because the range of n uniform draws is too narrow on average."""
+        """Return the distribution of a coordinate's starts.
+
+        If a schedule sets the coordinate, its starts have the range of the schedule. A constant with declared limits
+        starts anywhere in its sampling range. Otherwise, the range is that of the observed starts, widened because the
+        range of n uniform draws is too narrow on average.
+        """
         if coordinate.name in self._simulator.scheduled:
             low, high = self._simulator.scheduled[coordinate.name]
             return Uniform(low=low, high=high) if low < high else Fixed(value=low)
@@ -95,7 +100,7 @@ class Ranges:
         if variable.motion == "speed":
             fastest = FASTER * max(abs(low), abs(high)) or UNKNOWN_SPEED
             return -fastest, fastest
-        # an object that actions move only indirectly; its limits may be far away
+        # whether actions move the object only indirectly; its limits may then be far from its usual positions
         pushed = variable.motion == "slide" and not variable.driven
         trusted = not pushed and (self._probed.stays or constant)
         if variable.low is not None and variable.high is not None and trusted:
@@ -110,11 +115,11 @@ class Ranges:
         return low - margin, high + margin
 
     def _before_the_stops(self, index: int, low: float, high: float) -> tuple[float, float]:
-        """Return the sampling range of a joint with stops at ``low`` and ``high``. A step that meets a stop is not
-        smooth.
+        """Return the sampling range of a joint with stops at ``low`` and ``high``.
 
-        The range therefore ends before each stop, by the longest way of one step. It always contains all starts. If
-        that way is a large part of the whole, stops are met from everywhere, and the range is the whole.
+        A step that meets a stop is not smooth. So the range ends before each stop, at a distance of the joint's largest
+        change in one step. If this change is a large part of the joint's whole range, stops are met from everywhere,
+        and the sampling range is the whole range. It always contains all starts.
         """
         seen, starts = self._seen, self._seen.starts[:, index]
         way = FASTER * float(np.abs(seen.next_states[:, index] - seen.states[:, index]).max())
@@ -124,9 +129,11 @@ class Ranges:
 
 
 def _on_an_arc(angles: Array) -> Array:
-    """Return the same angles (n,) with whole turns added so that they lie on the shortest arc that contains them all.
+    """Return the same angles (n,) with full turns (2 pi) added so that they lie on the shortest arc that contains them
+    all.
 
-    The middle of the arc is within half a turn of 0. This undoes the jump of wrapped angles at half a turn.
+    The middle of the arc is within half a turn of 0. So angles just below pi, and those just above that were wrapped to
+    -pi, become neighbours again.
     """
     turn = 2 * math.pi
     placed = np.sort(np.mod(angles, turn))

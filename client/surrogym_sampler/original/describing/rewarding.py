@@ -80,7 +80,8 @@ def coefficients(spec: EnvironmentSpec) -> int:
 
 
 def quadratic_reward(spec: EnvironmentSpec, fitted: Paid, checked: Paid) -> DeclaredReward | None:
-    """Fit a quadratic reward to some steps, and return it if it explains these and others exactly; None otherwise.
+    """Fit a quadratic reward to some steps. Return it if it gives the rewards of these and of further steps exactly;
+    None otherwise.
 
     Args:
         spec: the environment. The result is None unless its actions are continuous.
@@ -146,8 +147,8 @@ def _fewest(columns: Array, reward: Array, tolerance: float) -> Array | None:
     """Return weights (k,) of the columns (n, k) that explain the reward (n,), as many of them 0 as possible; None if
     all columns together don't explain it.
 
-    Columns are left out one by one, that with the smallest contribution first. This removes rounding errors and terms
-    that cancel, such as squares of a cosine and a sine.
+    Columns are left out one by one, beginning with the one that contributes least. This removes rounding errors and
+    terms that cancel, such as squares of a cosine and a sine.
     """
     kept = np.ones(columns.shape[1], dtype=bool)
 
@@ -168,32 +169,39 @@ def _fewest(columns: Array, reward: Array, tolerance: float) -> Array | None:
 
 
 def _read(spec: EnvironmentSpec, q: Array, u: Array) -> Array:
-    """Return the entries of x in states (n, C) under actions (n, F): (n, k)."""
+    """Return the values (n, k) of the quantities of a quadratic reward in states (n, C) under actions (n, F)."""
     return np.stack([_values(spec, one, q, u) for one in _quantities(spec)], axis=1)
 
 
 def _scaled(x: Array) -> tuple[Array, Array, Array]:
-    """Return z (n, k), which is x (n, k) centred and scaled, the centre (k,), and the scale (k,)."""
+    """Return the columns of x (n, k) centred and scaled, the centre (k,), and the scale (k,)."""
     centre, reach = x.mean(0), np.where(np.ptp(x, axis=0) > 0, x.std(0), 1.0)
     return (x - centre) / reach, centre, reach
 
 
 def _columns(z: Array) -> Array:
-    """Return the columns of the fit: 1, the entries of z (n, k), and the products of two entries."""
+    """Return the columns of the quadratic fit: 1, the columns of z (n, k), and the product of each pair of these,
+    including their squares."""
     first, second = np.triu_indices(z.shape[1])
     return np.concatenate([np.ones((len(z), 1)), z, z[:, first] * z[:, second]], axis=1)
 
 
 def _parts(weights: Array, k: int) -> tuple[float, Array, Array]:
-    """Split the weights of the columns of ``_columns`` into c, b (k,) and the symmetric A (k, k)."""
+    """Split the weights of the quadratic fit, in the order of ``_columns``, into its constant c, its linear weights b
+    (k,), and its symmetric matrix A (k, k)."""
     a = np.zeros((k, k))
     a[np.triu_indices(k)] = weights[1 + k :]
     return float(weights[0]), weights[1 : 1 + k], (a + a.T) / 2
 
 
 def _squares(quantities: Sequence[Quantity], a: Array, reach: Array) -> Iterator[RewardTerm]:
-    """Yield x' A x as weighted squares, one for each eigenvector of ``a`` (k, k), which is A scaled by the ``reach``
-    (k,) of each entry of x."""
+    """Yield the quadratic part x' A x of a reward as weighted squares of sums, one for each eigenvector of ``a``.
+
+    Args:
+        quantities: the k entries of x.
+        a: the matrix A (k, k), with each row and column multiplied by the ``reach`` of its quantity.
+        reach: scale (k,) of each quantity.
+    """
     values, vectors = np.linalg.eigh(a)
     for value, vector in zip(values, vectors.T, strict=True):
         if abs(value) > EXACT**2 * np.abs(values).max():
@@ -204,7 +212,8 @@ def _squares(quantities: Sequence[Quantity], a: Array, reach: Array) -> Iterator
 
 
 def _rest(quantities: Sequence[Quantity], c: float, b: Array) -> Iterator[RewardTerm]:
-    """Yield the terms of c + b . x."""
+    """Yield the constant c and the linear part b . x of a reward as reward terms; x has the values of the
+    quantities."""
     if b.any():
         yield RewardTerm(shape="linear", of=(_sum(quantities, b),))
     if c:
@@ -225,7 +234,7 @@ def _sum(quantities: Sequence[Quantity], weights: Array) -> Quantity:
 
 
 def _quantities(spec: EnvironmentSpec) -> list[Quantity]:
-    """Return the entries of x: coordinates, cosines and sines of angles, and action entries."""
+    """Return the quantities of a quadratic reward: coordinates, cosines and sines of angles, and action entries."""
     terms: list[Term] = []
     for coordinate in spec.coordinates:
         terms.append(Term.linear(**{coordinate.name: 1.0}))

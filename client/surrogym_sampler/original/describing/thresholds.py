@@ -27,14 +27,14 @@ from surrogym_sampler.original.protocol import Array
 from surrogym_shared.spec import DeclaredReward, EnvironmentSpec, Inequality, Quantity, RewardTerm, Term
 from surrogym_shared.terms import evaluate
 
-SEEK = 200  # largest number of steps from random states to find the second value
+SEEK = 200  # largest number of steps from random states to find a second value of the reward
 BATCH = 12
-ENOUGH = 4  # number of steps with the rarer value that are enough to start bisections
+ENOUGH = 4  # number of steps with the rarer value of the reward that are enough to start bisections
 POINTS = 12  # number of boundary points: twice the unknowns of an ellipsoid of three entries
 HALVINGS = 24
-COARSE = 10  # number of first halvings whose steps are far enough from the boundary to check a form
+COARSE = 10  # number of first halvings of a bisection; their steps are far enough from the boundary to test its form
 NEAR = 0.02  # share of the range of states by which the end of a bisection moves to find a neighbouring point
-FLAT = 1e-3  # share of the largest singular value; with a smaller one, the points lie on more than one ellipsoid
+FLAT = 1e-3  # a singular value below this share of the largest means that the points lie on more than one ellipsoid
 MOST = 5_000  # largest number of groups of entries that are tried
 READS: dict[Timing, Callable[[Paid], Array]] = {"after": Paid.after, "before": Paid.before}
 
@@ -45,7 +45,8 @@ Drawn = Callable[[int], tuple[Array, Array]]
 
 
 def threshold_reward(spec: EnvironmentSpec, seen: Paid, step: Steps, draw: Drawn) -> DeclaredReward | None:
-    """Find a reward of two values, and return it if it explains all steps; None otherwise.
+    """Find a reward that has two values, such as a bonus near a goal. Return it if it explains all steps; None
+    otherwise.
 
     Args:
         spec: the environment.
@@ -69,11 +70,12 @@ def threshold_reward(spec: EnvironmentSpec, seen: Paid, step: Steps, draw: Drawn
 
 
 def _smooth(spec: EnvironmentSpec, bounds: Paid, steps: Paid, rare: float, usual: float) -> Iterator[DeclaredReward]:
-    """Yield the rewards of two values whose boundary is a level or an ellipsoid through all its points ``bounds``.
+    """Yield possible rewards with two values. Their boundary goes through all points ``bounds``. It is an ellipsoid, or
+    it is where a term of the state has one value (a level).
 
     Args:
         spec: the environment.
-        bounds: steps next to the boundary.
+        bounds: steps next to the boundary between the two values.
         steps: other steps, which show the range of each quantity.
         rare: the reward that fewer steps have.
         usual: the other reward.
@@ -86,11 +88,13 @@ def _smooth(spec: EnvironmentSpec, bounds: Paid, steps: Paid, rare: float, usual
 
 
 def _boxes(spec: EnvironmentSpec, boundary: _Boundary, steps: Paid) -> Iterator[DeclaredReward]:
-    """Yield rewards whose boundary has faces. If points share a level, as many points are added again, and then a
-    neighbour of each point that shares no level, to find the quantity that has a level there.
+    """Yield possible rewards with two values whose boundary consists of faces, like that of a box. On each face, a term
+    of the state has one value (a level).
 
-    If a face has no point yet, the region still contains steps with the outside reward. A bisection towards such a step
-    crosses the missing face.
+    If at least three points have the same level, there may be faces, and further points are added. A point that shares
+    no level with another gets a neighbouring point, because the level that both share shows their face. If the region
+    found so far contains a step with the outside reward, a face is missing. A bisection towards this step finds a point
+    of the missing face.
     """
     terms, values = _single(spec), np.unique(steps.reward)
     timings = [time for time, reads in READS.items() if has_face(spec, terms, reads(boundary.points), reads(steps))]
@@ -112,8 +116,8 @@ def _boxes(spec: EnvironmentSpec, boundary: _Boundary, steps: Paid) -> Iterator[
 
 
 def _with_both_values(steps: Paid, step: Steps, draw: Drawn) -> Paid:
-    """Take a batch of further steps, and then up to ``SEEK`` until the rarer of two values was met ``ENOUGH`` times.
-    Returns all steps."""
+    """Take further steps until the rarer of two reward values has occurred ``ENOUGH`` times: at least one batch, at
+    most ``SEEK`` steps. Returns all steps."""
     for taken in range(0, SEEK, BATCH):
         counts = np.unique(steps.reward, return_counts=True)[1]
         if len(counts) > 2 or (taken and len(counts) == 2 and counts.min() >= ENOUGH):
@@ -123,14 +127,15 @@ def _with_both_values(steps: Paid, step: Steps, draw: Drawn) -> Paid:
 
 
 class _Boundary:
-    """Steps next to the boundary between two rewards, found by bisection between steps with the rare reward and others.
+    """Steps next to the boundary between two reward values, found by bisection between steps with the rarer value and
+    others.
 
-    The first ``explored`` steps come from few episodes. All of them that have the rare reward may be neighbours, and a
-    small part of a boundary does not show its form. So one end of most bisections is in a random state.
+    The first ``explored`` steps come from few episodes. Those of them with the rarer value may all be close together,
+    but a small part of a boundary does not show its form. So one end of most bisections is in a random state.
     """
 
     def __init__(self, steps: Paid, explored: int, rare: NDArray[np.bool_], step: Steps) -> None:
-        # the steps next to the boundary, and the earlier steps of the bisections
+        # ``points``: the steps next to the boundary; ``passed``: earlier steps of their bisections
         self.points = self.passed = steps.at(slice(0))
         self._steps, self._step = steps, step
         self._ends: list[tuple[Paid, Paid]] = []  # the two ends of the bisection that found each point
@@ -148,7 +153,8 @@ class _Boundary:
         return self.points
 
     def beside(self, chosen: NDArray[np.bool_]) -> None:
-        """Add a neighbouring point for each of the chosen points (K,) that has none yet."""
+        """Add a neighbouring boundary point for each of the chosen points (K,), unless an earlier call has done or
+        tried this."""
         width = np.ptp(self._steps.q, axis=0)
         new = self._paired + np.flatnonzero(chosen[self._paired :])
         self._paired = len(chosen)
@@ -156,18 +162,19 @@ class _Boundary:
             self.between(*self._ends[number], shift=NEAR * width * np.where(np.arange(len(width)) % 2, 1, -1))
 
     def between(self, one: Paid, other: Paid, shift: Array | float = 0.0) -> None:
-        """Add the boundary point between two steps with different rewards. The state of the other step is first shifted
-        by ``shift`` (C,)."""
+        """Add the boundary point between two steps with different rewards, found by bisection. The state of the step
+        ``other`` is first shifted by ``shift`` (C,)."""
         found = self._bisected(one, other, shift)
         self.points = self.points.joined(found)
         self._ends += [(one, other)] * len(found)
 
     def _bisected(self, one: Paid, other: Paid, shift: Array | float) -> Paid:
-        """Return the step next to the boundary between two steps, found by bisection of state and action. The state of
-        the other step is first shifted by ``shift`` (C,).
+        """Return the step next to the boundary between the steps ``one`` and ``other``, found by bisection of state and
+        action. The state of ``other`` is first shifted by ``shift`` (C,).
 
-        The result is empty if a step ends an episode, or if all have the same reward: then one of the two steps can't
-        be repeated exactly, or the shifted end is on the same side of the boundary.
+        The result is empty if a step of the bisection ends an episode, or if all its steps have the same reward. In the
+        second case, one of the two ends can't be repeated exactly, or the shift has moved ``other`` across the
+        boundary.
         """
         q, u, q_other, u_other = one.q[0], one.u[0], other.q[0] + shift, other.u[0]
         last, met = self._steps.at(slice(0)), set[bool]()
@@ -187,20 +194,20 @@ class _Boundary:
 
 
 def _spread(chosen: NDArray[np.int64], explored: int) -> NDArray[np.int64]:
-    """Return indices of the steps from random states, followed by those of at most ``POINTS`` evenly spread explored
-    steps.
+    """Return indices of steps at which bisections may begin: all those from random states, followed by at most
+    ``POINTS`` evenly spread explored steps.
 
     Args:
         chosen: indices of the steps to choose from.
-        explored: number of explored steps; smaller indices are theirs.
+        explored: number of explored steps, which have the smallest indices.
     """
     near, anywhere = chosen[chosen < explored], chosen[chosen >= explored]
     return np.append(anywhere, near[np.linspace(0, len(near) - 1, min(POINTS, len(near))).astype(int)])
 
 
 def _groups(spec: EnvironmentSpec) -> Iterator[tuple[Term, ...]]:
-    """Yield groups of one to three terms, the simplest first; the boundary may be a level or an ellipsoid of such a
-    group."""
+    """Yield groups of one to three terms, the simplest first. The boundary of a reward may be where a single term has
+    one value (a level), or an ellipsoid in the terms of a group."""
     shown = _shown(spec)
     yield from ((term,) for term in _single(spec))
     yield from itertools.combinations(shown, 2)
@@ -209,8 +216,8 @@ def _groups(spec: EnvironmentSpec) -> Iterator[tuple[Term, ...]]:
 
 
 def _single(spec: EnvironmentSpec) -> list[Term]:
-    """Return the terms whose level may be the boundary: observation entries, coordinates, cosines and sines, and
-    differences."""
+    """Return the terms that may have one value (a level) on the whole boundary of a reward: observation entries,
+    coordinates, cosines and sines of angles, and differences of observation entries."""
     own: list[Term] = []
     for coordinate in spec.coordinates:
         own.append(Term.linear(**{coordinate.name: 1.0}))
@@ -228,8 +235,8 @@ def _differences(shown: Sequence[Term]) -> list[Term]:
 
 
 def regions(spec: EnvironmentSpec, group: Sequence[Term], bounds: Array, states: Array) -> Iterator[RewardTerm]:
-    """Yield reward terms that are 1 on one side of the boundary and 0 on the other, if all its points agree with the
-    form.
+    """Yield a reward term that is 1 on one side of a boundary and 0 on the other. Nothing is yielded unless the term of
+    the group has the same value (level) at all boundary points, or all of them lie on one ellipsoid in its terms.
 
     Args:
         spec: the environment.
@@ -246,7 +253,8 @@ def regions(spec: EnvironmentSpec, group: Sequence[Term], bounds: Array, states:
 
 
 def _ellipsoid(group: Sequence[Term], x: Array, elsewhere: Array) -> tuple[Quantity, ...] | None:
-    """Return the quantities (x_i - c_i) / r_i of the ellipsoid through all points, or None.
+    """Return the quantities (x_i - c_i) / r_i, whose squares have the sum 1 on the ellipsoid through all points x; None
+    if there is no such ellipsoid.
 
     The result is also None if more than one ellipsoid goes through the points, or if all other states lie on it, as
     with the cosine and the sine of one angle.
@@ -276,7 +284,8 @@ def _ellipsoid(group: Sequence[Term], x: Array, elsewhere: Array) -> tuple[Quant
 
 
 def _paying(timing: Timing, inside: RewardTerm, within: float, elsewhere: float) -> DeclaredReward:
-    """Return a reward of two values: ``within`` in the region of the term ``inside``, ``elsewhere`` outside."""
+    """Return a declared reward with two values: ``within`` where the term ``inside`` is 1, and ``elsewhere`` where it
+    is 0."""
     bonus = inside.model_copy(update={"weight": within - elsewhere})
     terms = (bonus, RewardTerm(weight=elsewhere, shape="one")) if elsewhere else (bonus,)
     return DeclaredReward(kind="declared", timing=timing, terms=terms)

@@ -106,8 +106,8 @@ class Executable:
         return wrapped(self._spec, numbers(reply, "state", len(self._spec.coordinates)))
 
     def _revive(self) -> None:
-        """Start the program again if it has ended. Only the first request of a query may do so, because the others
-        depend on the state."""
+        """Start the program again if it has ended. Only the first request of a query may do so, because later requests
+        depend on the state that ended with the program."""
         if self._program.running:
             return
         try:

@@ -116,11 +116,15 @@ def driven(archive: Archive, choices: Choices) -> tuple[Declared, ...]:
 
 
 def described_by(archive: Archive, choices: Choices) -> tuple[Declared, ...]:
-    """Return the variables whose values are the state.
+    """Return the variables whose values are the state: the first of these groups that exists.
 
-    These are the chosen ones; or else the continuous states if all of them can be set; or, if none are declared, the
-    outputs and internal variables that can be set; or all outputs, or all states. A variable with two names counts
-    once.
+    - The variables that a person chose.
+    - The continuous states, if all of them can be set.
+    - The outputs and internal variables that can be set, if the FMU declares no continuous states.
+    - All outputs.
+    - All continuous states.
+
+    A variable with two names counts once.
 
     Raises:
         UnknownEnvironment: there are none, or a chosen variable is not a real number.

@@ -12,8 +12,8 @@ from surrogym_sampler.original.protocol import Array
 
 
 class GuardedEpisode(Episode):
-    """An episode in which the fallback acts in the place of the policy, shortly before a limit would be left, and when
-    no action comes for a sampling period."""
+    """An episode that keeps the limits of its specification. The declared fallback controller acts in the place of the
+    policy shortly before a limit would be left, and when no action comes for a sampling period."""
 
     def __init__(self, episode: Episode) -> None:
         super().__init__(episode.spec)
@@ -31,14 +31,15 @@ class GuardedEpisode(Episode):
             return self._started(self._episode.place(coordinates))
 
     def step(self, action: Array) -> Moment:
-        """Apply the action (F,), or the fallback's, which the moment then names.
+        """Apply the action (F,), or the fallback controller's shortly before a limit would be left. In that case,
+        ``fallback`` of the result is the applied action.
 
         Raises:
             StepFailed: the watchdog has ended the episode.
         """
         with self._watchdog:
             self._watchdog.check()
-            self._watchdog.over()  # while the environment steps
+            self._watchdog.over()  # no action is due while the environment takes a step
             chosen, fallen = self._guard.choose(action)
             moment = self._episode.step(chosen)
             self._guard.reached(moment.coordinates)

@@ -19,15 +19,16 @@ from surrogym_shared.spec import EnvironmentSpec
 
 Array = NDArray[np.float64]
 
-MOST_STEPS = 200  # of the fallback, after which it ends although the machine still moves
-STILL = 1e-3  # largest change of a coordinate in a step at rest, as a share of its largest change in the episode
+MOST_STEPS = 200  # largest number of steps of the fallback, which then ends even if the machine still moves
+STILL = 1e-3  # a machine rests if no coordinate changes by more than this share of its largest change in the episode
 
 
 class Guard:
-    """Chooses the action of each step of an episode: the requested one, or the fallback's.
+    """Chooses the action of each step of an episode: the requested one or, shortly before a limit would be left, that
+    of the specification's fallback controller.
 
-    It needs no model and no network: it reads the last two states alone. Call ``begin`` at each start, ``choose``
-    before each step, and ``reached`` after it.
+    The choice needs no model and no network, only the last two states. Call ``begin`` at each start, ``choose`` before
+    each step, and ``reached`` after it.
     """
 
     def __init__(self, spec: EnvironmentSpec) -> None:
@@ -46,13 +47,13 @@ class Guard:
         self._fastest = np.maximum(self._fastest, np.abs(self._at - self._before))
 
     def choose(self, action: Array) -> tuple[Array, bool]:
-        """Return the action (F,) to apply, and whether it is the fallback's."""
+        """Return the action (F,) to apply, and whether it is the fallback controller's instead of the requested one."""
         if bool(falls_back(self._spec, self._before[None], self._at[None])[0]):
             return self.fallback(), True
         return action, False
 
     def fallback(self) -> Array:
-        """Return the fallback's action (F,) at the present state."""
+        """Return the action (F,) of the specification's fallback controller in the present state."""
         return fallback_action(self._spec, self._at)
 
     @property
@@ -62,17 +63,17 @@ class Guard:
 
 
 class Watchdog:
-    """Applies the fallback until the machine rests, if an episode runs and no action came for one sampling period.
+    """Applies the specification's fallback controller until the machine rests, if no action comes for a sampling period
+    during an episode.
 
-    An episode runs from its first action on. An environment that runs in parallel is a simulator, which waits for its
-    actions, so nothing is watched.
+    An episode runs from its first action on. A simulator waits for its actions, so nothing is watched there.
 
     The environment is used by one thread at a time: hold the watchdog (``with watchdog:``) around every call of it.
 
     Args:
         spec: specification with limits and a sampling period.
-        guard: of the running episode.
-        step: applies an action (F,) and returns whether the episode goes on. It notes the state in the guard.
+        guard: the guard of the running episode.
+        step: applies an action (F,), reports the new state to the guard, and returns whether the episode continues.
         waits: whether the environment is a simulator that waits for its actions.
     """
 
@@ -83,7 +84,7 @@ class Watchdog:
         self._guard = guard
         self._step = step
         self._changed = threading.Condition(threading.RLock())
-        self._deadline: float | None = None  # when the fallback acts; None: no episode runs
+        self._deadline: float | None = None  # time at which the fallback acts; None if no action is due
         self._wanted = self._closed = False
         self._fallen = ""  # why the episode was ended by the watchdog; empty if it was not
         self._thread: threading.Thread | None = None
@@ -108,7 +109,7 @@ class Watchdog:
         self._fallen, self._deadline = "", None
 
     def running(self) -> None:
-        """Note that an action was applied, so that the next one is due within a period."""
+        """Note that an action was applied. The next one is due within a sampling period."""
         if self._waits:
             return
         self._deadline = time.monotonic() + self._period
@@ -118,11 +119,12 @@ class Watchdog:
         self._changed.notify_all()
 
     def over(self) -> None:
-        """Note that no episode runs, so that nothing has to be watched."""
+        """Stop waiting for an action, because no episode runs or the environment is taking a step."""
         self._deadline = None
 
     def fall_back(self, reason: str) -> None:
-        """Apply the fallback until the machine rests, if an episode runs. The episode has ended then."""
+        """If the watchdog waits for an action, apply the fallback controller until the machine rests, and end the
+        episode. ``reason`` is the message of the error that ``check`` then raises."""
         if self._deadline is None:
             return
         self._deadline, self._fallen = None, reason
@@ -131,7 +133,7 @@ class Watchdog:
                 return
 
     def close(self, reason: str) -> None:
-        """Fall back, and end the watchdog."""
+        """Apply the fallback controller if the watchdog waits for an action, and end the watchdog."""
         with self:
             self._closed = True
             try:
@@ -146,13 +148,13 @@ class Watchdog:
                     self._changed.wait()
                 elif (left := self._deadline - time.monotonic()) > 0:
                     self._changed.wait(left)
-                elif not self._wanted:  # else the action has come, and waits for this thread
+                elif not self._wanted:  # otherwise the action has come, and its thread waits for this one
                     try:
                         self.fall_back(
                             f"no action came for {self._period:g} s (sampling_period), so the fallback brought the "
                             "machine to rest and the episode ended: reset it, or send actions faster"
                         )
                     except RAISED:
-                        continue  # the environment raised an error: the next call of it shows the same
+                        continue  # the environment raised an error, which its next call will raise again
                 else:
                     self._changed.wait(self._period)

@@ -32,7 +32,8 @@ def guarded(environment: Environment) -> Environment:
 
 
 class GuardedSteps:
-    """Refuses to set an environment to a state within the margin of a limit."""
+    """An environment with limits that can be set to states. States beyond a limit, or within its margin, are
+    refused."""
 
     def __init__(self, environment: OriginalEnvironment) -> None:
         self._environment, self._spec = environment, environment.spec()
@@ -61,14 +62,15 @@ class GuardedSteps:
 
 
 class GuardedRollouts:
-    """Applies the fallback's action in the place of a requested one, shortly before a limit would be left.
+    """An environment with limits that is reset and acted on. Shortly before a limit would be left, the action of the
+    specification's fallback controller replaces the requested one.
 
     If no action comes for a sampling period, or the environment is closed while an episode runs, the fallback brings
     the machine to rest, and the episode ends. Returned steps have the action that was applied.
     """
 
     def __init__(self, environment: RolloutEnvironment) -> None:
-        self._environment: Any = environment  # save and restore need not exist
+        self._environment: Any = environment  # Any, because the methods save and restore are optional
         self._spec = environment.spec()
         self.parallel = runs_in_parallel(environment)
         self._guard = Guard(self._spec)
@@ -82,14 +84,14 @@ class GuardedRollouts:
             return self._started(self._environment.begin(seed))
 
     def act(self, action: Array) -> RealStep:
-        """Apply the action (F,), or the fallback's.
+        """Apply the action (F,), or the fallback controller's shortly before a limit would be left.
 
         Raises:
             StepFailed: the watchdog has ended the episode.
         """
         with self._watchdog:
             self._watchdog.check()
-            self._watchdog.over()  # while the environment steps
+            self._watchdog.over()  # no action is due while the environment takes a step
             return self._acted(self._guard.choose(action)[0])
 
     def save(self) -> bytes:
@@ -124,7 +126,7 @@ class GuardedRollouts:
         return step
 
     def _fall(self, action: Array) -> bool:
-        """Take a step of the fallback, and return whether the episode goes on."""
+        """Apply the fallback controller's action (F,), and return whether the episode continues."""
         step: RealStep = self._environment.act(action)
         self._guard.reached(np.asarray(step.next_coordinates, dtype=np.float64))
         return not (step.terminated or step.truncated)

@@ -148,8 +148,8 @@ class Process(OfParts):
         return self.observe()
 
     def _show_setpoints(self) -> None:
-        """Write the first setpoints of the schedule into the state. After a reset, pc-gym shows those of ``x0``
-        instead, although its reward follows the schedule."""
+        """Write the first setpoints of the schedule into the state. After a reset, pc-gym shows the setpoints in its
+        parameter ``x0`` instead, although its reward follows the schedule."""
         at = self._env.Nx_oracle
         for i, values in enumerate(self._schedule[0].values()):
             self._env.state[at + i] = values[0]
