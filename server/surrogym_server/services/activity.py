@@ -17,7 +17,8 @@ MOST_NAMES = 1_000  # largest number of active callers shown for a surrogate; fu
 
 
 class Alive(Generic[T]):
-    """Time of the last call of each caller, and the status (``T``) that the caller reported with it. Thread-safe."""
+    """Time of the last call of each caller, and the status (``T``) that the caller reported in this call.
+    Thread-safe."""
 
     def __init__(self, clock: Clock = time.monotonic) -> None:
         self._clock = clock
@@ -45,7 +46,7 @@ class Alive(Generic[T]):
         return now - before >= ALIVE_SECONDS
 
     def alive(self) -> list[tuple[str, str, T]]:
-        """Return the surrogate, the name and the report of each active caller, sorted by surrogate and name."""
+        """Return the surrogate, the name and the status of each active caller, sorted by surrogate and name."""
         now = self._clock()
         with self._lock:
             heard = {surrogate: self._active(names, now) for surrogate, names in self._heard.items()}

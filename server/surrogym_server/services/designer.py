@@ -51,7 +51,7 @@ PAUSE_SECONDS = 1.0  # shortest time between two renewals of a fit's lease
 
 
 class _Turn:
-    """A fit's place among the fits that run at a time. After a while, a long fit frees its place for another fit."""
+    """Place of a fit among the fits that run at the same time. A fit that runs long frees its place for another fit."""
 
     def __init__(self, usual: asyncio.Semaphore, passed: asyncio.Semaphore) -> None:
         self._usual, self._passed, self._current = usual, passed, usual
@@ -91,7 +91,8 @@ class DesignerSettings:
 
 
 class Designer:
-    """Fits the surrogates that are due, each under a lease, which only one server can hold at a time."""
+    """Fits each surrogate that is due, which means that a new model has to be fitted. Each fit runs under a lease,
+    which only one server can hold at a time."""
 
     def __init__(  # eight parameters: seven objects of the server that a fit reads or notifies, and the settings
         self,
@@ -169,7 +170,7 @@ class Designer:
                 await self._fit(name, turn)
         except Damaged as error:
             logger.warning("the design of %s waits: %s", name, error)
-        except SurrogymError as error:  # deleted, leased by another server, or without storage
+        except SurrogymError as error:  # the surrogate is deleted or leased by another server, or no storage answers
             logger.debug("%s is not fitted: %s", name, error)
         except Exception:
             logger.exception("the fit of %s could not be started or finished; it is tried again shortly", name)

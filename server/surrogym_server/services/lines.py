@@ -12,17 +12,17 @@ from surrogym_server.services.notices import Listener, Notices
 
 T = TypeVar("T")
 
-FIRST = 4  # claims of a line that may ask the database at a time
+FIRST = 4  # number of claims in a line that may ask the database at the same time
 LOOK_SECONDS = 2.0  # time between two checks whether the caller has closed its connection
 
 Present = Callable[[], Awaitable[None]]  # raises if the caller has closed its connection
 
 
 class _Line(Generic[T]):
-    """Claims that wait for the same work.
+    """Claims (requests for work) that wait for the same kind of work.
 
-    ``answer`` is the last answer without work, and ``version`` the number of the last notice before that answer. The
-    answer is still valid while ``heard.version`` equals ``version``.
+    ``answer`` is the last answer that contained no work, and ``version`` the number of the last notice before that
+    answer. If ``heard.version`` still equals ``version``, no notice has come since, so the answer is still valid.
     """
 
     def __init__(self, listening: ExitStack, heard: Listener) -> None:
@@ -35,10 +35,10 @@ class _Line(Generic[T]):
 
 
 class Lines(Generic[T]):
-    """Claims that wait for work, in one line for each kind of work.
+    """Claims (requests for work) that wait for work, in one queue for each kind of work.
 
     Args:
-        notices: notices of changes of a surrogate. All code that makes work available posts a notice or appends an
+        notices: notices of changes of a surrogate. Code that makes work available must post a notice or append an
             event.
         has_work: returns whether an answer contains work; such an answer belongs to one claim and ends its wait.
         ends: returns whether an answer without work ends the wait; its arguments are the earlier answer and this one.

@@ -160,7 +160,7 @@ class ModelService:
             name: name of the surrogate.
             q: coordinates (C,) at the start.
             u: actions (T, F), one for each step.
-            draws: number of episodes, each along another posterior sample.
+            draws: number of episodes that follow samples of the posterior, in addition to one that follows the mean.
             seed: seed of the posterior samples.
             version: version of the model; None for the newest.
 

@@ -14,7 +14,8 @@ AT_ONCE = 50  # listeners woken in one iteration of the event loop, so that othe
 
 
 class Listener:
-    """A subscriber to notices. A notice that comes between two waits ends the next wait at once."""
+    """A subscriber to notices that a surrogate has changed. If a notice comes between two calls of ``wait``, the second
+    call returns at once."""
 
     def __init__(self, audience: Audience) -> None:
         self._audience = audience
@@ -98,7 +99,7 @@ class Notices:
     def compare(self, newest: dict[str, int]) -> None:
         """Wake the listeners to the surrogates whose newest event has changed since the last comparison.
 
-        This replaces notices of other servers that were lost.
+        So the listeners are woken even if a notice of another server was lost.
 
         Args:
             newest: id of the newest event of each surrogate in ``listened`` that exists.

@@ -127,7 +127,7 @@ class QueryService:
         return [self._storage.queries.get(name, id) for id in ids]
 
     def withdraw_audit(self, name: str, query_ids: Sequence[int]) -> int:
-        """Remove the given queries of an audit, except those of which a sampler may have taken a real step.
+        """Remove queries of an audit, given by their ids. A query stays if a sampler may have taken a real step of it.
 
         Returns the number of removed queries.
         """

@@ -65,8 +65,8 @@ class SampleService:
             sampler: name of the sampler.
             samples: the real steps, with the lease of their query if they answer one.
             key: idempotency key; needed for steps that answer no query and belong to no log.
-            log: the part of a log that the steps are, if they were recorded earlier. With the last part, the initial
-                queries that the log covers are withdrawn.
+            log: position of the steps in a log of earlier steps; None if they come from no log. After the last part of
+                a log, the initial queries that it makes unnecessary are withdrawn.
 
         Raises:
             InvalidInput: a wrong shape, an action out of bounds, or a missing key. The message names the sample by its
@@ -91,7 +91,8 @@ class SampleService:
         return Added(added.ids, added.duplicates, self._storage.ledger.read(name), added.digest, added.restart)
 
     def add_log(self, name: str, samples: Sequence[NewSample], origin: str | None = None) -> AddedLog:
-        """Store all steps of a log, in batches. A repeat stores the steps that an earlier call did not.
+        """Store all steps of a log, in batches. A repeat stores only steps that are not stored yet, for example after
+        an interruption.
 
         ``origin`` names the source of the log: logs of different origins are stored apart even if their numbers are
         equal. Raises the errors of ``add``.
@@ -156,10 +157,12 @@ class SampleService:
 
 
 def check_trajectories(samples: Sequence[NewSample]) -> None:
-    """Check that each step of a rollout begins where its previous step ended, and that none follows an episode's end.
+    """Check that each step of a rollout begins where the previous step ended, and that no step follows the end of an
+    episode.
 
     Raises:
-        InvalidInput: a step breaks this; the message names the sample by its index.
+        InvalidInput: a step begins elsewhere or follows the end of an episode; the message names the sample by its
+            index.
     """
     steps = {(s.query_id, s.lease_token, s.step): s for s in samples}
     for index, sample in enumerate(samples):

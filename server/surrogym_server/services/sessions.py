@@ -48,11 +48,12 @@ class SessionService:
         """Return a session's present state.
 
         Raises:
-            UnknownSession: the session does not exist, or it lost its last replies with its session host.
+            UnknownSession: the session does not exist, or its session host died and the results of its last requests
+                are lost.
             SessionExpired: the session was idle for too long.
         """
         info = await self._engine.describe(id)
-        if info.behind:  # a caller that needs this description has kept no requests that it could repeat
+        if info.behind:  # a client that asks for the description has not kept its requests to repeat them
             raise UnknownSession(f"session {id!r} has lost its last replies with its session host: open a new one")
         return info
 

@@ -196,7 +196,8 @@ class SurrogateService:
         """
         for _ in range(READS):
             left = self._storage.designs.left(name)
-            summary = self._storage.surrogates.summary(name)  # read first, so that the model is not older
+            # The summary is read before the model, so that the model is not older than the summary.
+            summary = self._storage.surrogates.summary(name)
             try:
                 model = self._storage.models.get(name)
             except NoModel:

@@ -186,8 +186,9 @@ class Designs(ABC):
     def unbegun(self) -> list[str]:
         """Return the names of surrogates whose initial queries are missing, oldest first.
 
-        Such a surrogate was created with a budget of 0 and has one now, has no query or sample, is in phase
-        ``collecting``, and is not paused; or a crash interrupted ``Surrogates.create`` at least a minute ago.
+        There are two kinds. The first was created with a budget of 0 and has a larger budget now; it has no query or
+        sample, is in phase ``collecting``, and is not paused. For the second, a crash interrupted ``Surrogates.create``
+        at least a minute ago.
         """
 
     @abstractmethod
@@ -225,8 +226,8 @@ class Designs(ABC):
     def abort(self, lease: FitLease, error: str | None) -> None:
         """End the lease of a fit without a result. Does nothing if the lease has ended.
 
-        With an ``error``, the phase becomes ``failed``, and the next fit is due after a change. With None, as at a
-        shutdown, the fit stays due.
+        With an ``error``, the phase becomes ``failed``, and the next fit is due once the surrogate has changed since
+        the begin of this fit. With None, as at a shutdown, the fit stays due.
         """
 
 
@@ -284,7 +285,7 @@ class Queries(ABC):
             query_id: id of the query.
             token: token of the lease.
             error: description of the failure.
-            begun: whether a real step may have been taken, which then counts as unresolved.
+            begun: whether a real step may have been taken. If so, the steps of the query count as unresolved.
             refused: whether the original environment refused the query before a real step; ``begun`` is then ignored.
 
         Raises:
@@ -295,8 +296,8 @@ class Queries(ABC):
 
     @abstractmethod
     def withdraw(self, name: str, query_ids: Sequence[int]) -> int:
-        """Remove the given queries that are pending and of which no real step may have been taken. Return their
-        number."""
+        """Remove those of the queries with these ids that are pending and of which surely no real step was taken.
+        Return the number removed."""
 
     @abstractmethod
     def get(self, name: str, query_id: int) -> QueryRecord:
@@ -332,19 +333,21 @@ class Samples(ABC):
     ) -> AddedSamples:
         """Store a batch of samples, all or none, and mark the queries that they answer. Committed when this returns.
 
-        A sample gets the purpose of its query, or ``manual``. If its lease has expired or failed, the sample is stored
-        and marked as late; it still answers the query unless the query is leased again. Each lease has one answer: a
-        sample, or the first samples of a rollout, with ``step`` 0, 1, ... below the query's ``steps``. A repeat of an
-        answer adds nothing and gets the same ids.
+        A sample gets the purpose of its query, or ``manual`` without a query. If the lease of its query has expired or
+        failed, the sample is stored and marked as late. It still answers the query, unless the query is leased again.
+
+        All samples under one lease are one answer, and come in one batch. The answer to a query of one step is one
+        sample. The answer to a rollout has the samples with ``step`` 0, 1, ..., without gaps; they may be fewer than
+        the query's ``steps``. A repeat of an answer adds nothing and gets the same ids.
 
         Samples of a ``log`` answer no query, and don't count towards the budget. A logged sample is identified by its
-        values and by all earlier samples of its log, so a repeated or extended log adds only new samples, but equal
-        steps within a log are all stored. A log that differs from a stored one in a later part has to restart, see
-        ``AddedSamples``. No fit is due for a log before its last part.
+        values and by all earlier samples of its log. So a repeated or extended log adds only its new samples, and equal
+        steps within a log are all stored. If a log begins like a stored log and a later part differs, it has to be sent
+        again from its start: see ``AddedSamples.restart``. A fit becomes due only after the last part of a log.
 
         Raises:
             UnknownQuery: the surrogate has no such query.
-            ForeignLease: a lease token is missing, or is not that of a lease of the query.
+            ForeignLease: a lease token is missing, or does not belong to the query.
             InvalidInput: a logged sample names a query, or an answer lacks a step or has more steps than the query.
             IdempotencyConflict: the same lease token or idempotency key came with other samples.
         """

@@ -32,7 +32,8 @@ def _draws(case: ModelCase) -> list[FunctionDraws]:
 
 
 def a_drawn_function_is_one_function(case: ModelCase) -> None:
-    """Check that a sampled function (its weights) gives the same step at the same point, for any other batch rows."""
+    """Check that a sampled function, given by its weights, returns the same step at the same point, whatever the other
+    rows of the batch are."""
     for able in _draws(case):
         noise = case.noise(3, able.path_size)
         paths = able.draw(noise)

@@ -87,8 +87,8 @@ NOW = _Now()  # SQL expression of the database's clock, in seconds since 1970
 
 
 def constant(word: str) -> sa.ColumnElement[str]:
-    """Return SQL text that contains ``word`` as a constant. With a parameter, the query planner would not know that the
-    value is rare."""
+    """Return the SQL expression for ``word`` as a constant in the text of a statement. With a parameter instead, the
+    query planner would not know that this value is rare."""
     return sa.literal_column(f"'{word}'", sa.Text())
 
 
@@ -115,9 +115,10 @@ class Database:
     def hold_open(self) -> None:
         """Keep a connection to the SQLite file open until ``close``, and watch for changes by other programs.
 
-        SQLite deletes its write-ahead log with the last connection. While this connection is open, a missing or
-        different log shows that another program has changed it. The log is merged into the file first, so that the
-        first bytes of the file differ from those of an older copy. Does nothing for PostgreSQL.
+        SQLite deletes its write-ahead log when the last connection is closed. So while this connection is open, a
+        missing or replaced write-ahead log shows that another program has changed the database. The write-ahead log is
+        merged into the file first, so that the first bytes of the file differ from those of an older copy. Does nothing
+        for PostgreSQL.
         """
         if self._lock is None:
             return
@@ -166,12 +167,12 @@ class Database:
             raise Damaged(f"{self._broken}; {self.way_out}")
 
     def _require_own(self) -> None:
-        """Check that no other program has changed or replaced the SQLite file. Raises ``Unavailable``."""
+        """Check that no other program has changed or replaced the SQLite file. Raises ``Unavailable`` if one has."""
         if self._lock is None:
             return
         self._lock.require_in_place()
         if not self._lock.is_as_noted():
-            # With the write lock, no other connection can be merging the log into the file.
+            # With the write lock, no other connection can be merging the write-ahead log into the file.
             with self._take_turn():
                 self._lock.require_own_content()
 

@@ -174,8 +174,8 @@ def _lasting(expires: float, seconds: float) -> dict[str, float]:
 
 
 def _unspoken(connection: Connection, record: SurrogateRecord) -> int:
-    """Return the number of real steps that the budget has left; negative if the budget was lowered or more samples were
-    reported."""
+    """Return the number of real steps that the budget has left; negative if the budget was lowered, or if samplers
+    reported more samples than it allows."""
     return record.budget - surrogate_rows.spoken_for(connection, record.id) - record.extra_queries
 
 

@@ -27,7 +27,8 @@ from surrogym_server.errors import Unavailable
 LOCKED_BYTE = 2**62  # position of the locked byte, beyond any database and far from the bytes that SQLite locks
 # Command of fcntl for an open file description lock; None on systems without such locks.
 WHOLE_DESCRIPTION = getattr(fcntl, "F_OFD_SETLK", None)
-# First byte and number of bytes that SQLite's readers lock as shared, and a program that merges the log as exclusive.
+# First byte, and number of bytes, of a range of the file that SQLite locks: shared for a reader, exclusively for a
+# program that merges the write-ahead log.
 SQLITE_SHARED = (2**30 + 2, 510)
 BUSY = (BlockingIOError, PermissionError)  # errors of fcntl if another process holds the lock
 
@@ -53,7 +54,7 @@ class FileLock:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        resolved = path.resolve()  # SQLite's log lies beside the target of a symbolic link
+        resolved = path.resolve()  # SQLite's write-ahead log lies beside the target of a symbolic link
         self._log, self._index = (resolved.with_name(resolved.name + suffix) for suffix in BESIDE)
         self._beside: dict[Path, Identity | None] = {}
         self._noted: bytes | None = None
@@ -76,25 +77,27 @@ class FileLock:
             raise
 
     def header(self) -> bytes:
-        """Return the header of the SQLite file (its first 100 bytes), without changes that are only in its log."""
+        """Return the header of the SQLite file (its first 100 bytes), without changes that are only in its write-ahead
+        log."""
         return os.pread(self._descriptors[-1], HEADER_BYTES, 0)
 
     def log_is_merged(self) -> bool:
         """Whether the whole write-ahead log is merged into the file, so that the next transaction may begin a new log.
         The caller must hold the write lock."""
         if self._index_descriptor is None:
-            # SQLite has created the index, because the database is open.
+            # The log's index exists, because SQLite creates it when the database is opened.
             self._index_descriptor = os.open(self._index, os.O_RDONLY | os.O_CLOEXEC)
         return is_merged(os.pread(self._index_descriptor, INDEX_BYTES, 0))
 
     def watch(self) -> None:
-        """Remember the file's header and the identity of its log and of the log's index, to notice later changes by
-        other programs."""
+        """Remember the file's header, and which files its write-ahead log and the log's index are, to notice later
+        changes by other programs."""
         self._beside = {path: _identity(path) for path in (self._log, self._index)}
         self._noted = self.header()
 
     def require_in_place(self) -> None:
-        """Check that the path still leads to the locked file, and that its log and index are the remembered files.
+        """Check that the path still leads to the locked file, and that its write-ahead log and the log's index are
+        still the files that ``watch`` saw.
 
         Raises:
             Unavailable: one of these files was moved, replaced or deleted, or the database was overwritten.
@@ -110,16 +113,19 @@ class FileLock:
                 )
 
     def is_as_noted(self) -> bool:
-        """Whether the file's header is the remembered one; if so, no program has written to the file since then."""
+        """Whether the file's header is the one that was remembered last. If so, no program has written to the file
+        since then."""
         return self._noted is None or self.header() == self._noted
 
     def require_own_content(self) -> None:
-        """Check that a changed header of the file comes from its own log, and remember the new header.
+        """Check that a changed header of the file comes from the file's own write-ahead log, and remember the new
+        header.
 
         The caller must hold the write lock.
 
         Raises:
-            Unavailable: another program has overwritten the file. SQLite is then kept from merging the log into it.
+            Unavailable: another program has overwritten the file. SQLite is then kept from merging the write-ahead log
+                into it.
         """
         if self.is_as_noted():
             return
@@ -148,7 +154,8 @@ class FileLock:
             )
 
     def _forbid_merging(self) -> None:
-        """Keep SQLite from merging the log into the overwritten file when its last connection is closed."""
+        """Keep SQLite from merging the write-ahead log into the overwritten file when SQLite's last connection is
+        closed."""
         if WHOLE_DESCRIPTION:
             with contextlib.suppress(OSError):
                 fcntl.fcntl(self._descriptors[-1], WHOLE_DESCRIPTION, _range(fcntl.F_RDLCK, *SQLITE_SHARED))
@@ -224,15 +231,15 @@ def _unavailable(path: Path, error: OSError | None = None) -> Unavailable:
 HEADER_BYTES = 100  # size of the header of a SQLite database
 USER_VERSION, APPLICATION_ID = slice(60, 64), slice(68, 72)  # fields of the header that SQLite leaves to applications
 LOG_HEADER, FRAME_HEADER = struct.Struct(">8I"), struct.Struct(">6I")
-BIG_ENDIAN = 1  # bit of the log's magic number: byte order of the words in its checksums
-INDEX_BYTES = 136  # size of the first part of the log's index: two headers, and the number of merged frames
+BIG_ENDIAN = 1  # bit of a write-ahead log's magic number: byte order of words in its checksums
+INDEX_BYTES = 136  # size of the first part of a write-ahead log's index: two headers, and number of merged frames
 INDEX_VERSION = 3_007_000
 WORD = 0xFFFF_FFFF
 
 
 def marks(header: bytes) -> tuple[str, ...]:
-    """Return the SQL statements by which the first transaction of a log marks the database with this header as its
-    own."""
+    """Return SQL statements that mark the write-ahead log of the database with this header. The first transaction of
+    the log has to execute them."""
     number = 1 + secrets.randbelow(2**31 - 1)
     return f"PRAGMA user_version={number}", f"PRAGMA application_id={_signed(zlib.crc32(header))}"
 
@@ -240,9 +247,9 @@ def marks(header: bytes) -> tuple[str, ...]:
 def belongs(log: Path, header: bytes) -> bool:
     """Whether the write-ahead log ``log`` may belong to the database whose header is ``header``.
 
-    It does if it contains nothing to merge, if it has the mark of this database, or if the header comes from the log
-    because merging has begun. A log without a mark is from an older program, and may belong to a database without a
-    mark.
+    It does if the log contains nothing to merge, if the log has the mark of this database, or if the log contains this
+    header, because merging has begun. A log without a mark is from an older program, and may belong to a database
+    without a mark.
     """
     try:
         file = log.open("rb")
@@ -269,7 +276,7 @@ def is_merged(index: bytes) -> bool:
     lock, so that the index does not change.
     """
     if len(index) < INDEX_BYTES or struct.unpack_from("=I", index)[0] != INDEX_VERSION:
-        return True  # an unknown index counts as merged: a second mark does no harm
+        return True  # with an index of unknown format, the log is marked again, which does no harm
     frames, merged = struct.unpack_from("=I", index, 16)[0], struct.unpack_from("=I", index, 96)[0]
     return bool(frames == merged)
 
@@ -283,7 +290,8 @@ def _signed(number: int) -> int:
 
 
 def _frames(file: BinaryIO) -> Iterator[tuple[tuple[int, ...], int]]:
-    """Yield the header of each frame in the log's present generation, and the position of its page in the file."""
+    """Yield each frame that a write-ahead log contains since its last restart: the frame's header, and the position of
+    its page in the log."""
     file.seek(0)
     begin = file.read(LOG_HEADER.size)
     if len(begin) < LOG_HEADER.size:
@@ -301,7 +309,7 @@ def _frames(file: BinaryIO) -> Iterator[tuple[tuple[int, ...], int]]:
 
 
 def _first_pages(file: BinaryIO) -> Iterator[bytes]:
-    """Yield each version of the database's header (the start of page 1) that the log contains."""
+    """Yield each version of the database's header (the start of page 1) that a write-ahead log contains."""
     for (page, *_), place in _frames(file):
         if page == 1:
             file.seek(place)
@@ -309,7 +317,7 @@ def _first_pages(file: BinaryIO) -> Iterator[bytes]:
 
 
 def _has_a_whole_transaction(file: BinaryIO) -> bool:
-    """Whether the log contains a complete transaction with right checksums, which SQLite would merge."""
+    """Whether a write-ahead log contains a complete transaction with right checksums, which SQLite would merge."""
     file.seek(0)
     begin = file.read(LOG_HEADER.size)
     if len(begin) < LOG_HEADER.size:

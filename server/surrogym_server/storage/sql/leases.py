@@ -146,8 +146,8 @@ def give_back(
 ) -> None:
     """Make queries whose lease has ended pending again, or set them aside after their last attempt or a refusal.
 
-    A lease that ended before a real step does not count as an attempt. A query that people requeue gets all attempts
-    again. The caller has stored the ``outcome`` of the leases.
+    A lease that ended before a real step does not count as an attempt. If a person makes a query pending again that was
+    set aside, it gets all attempts again. The caller must have stored the ``outcome`` of the leases before.
     """
     failures = (
         sa.select(sa.func.count())
@@ -174,7 +174,7 @@ def give_back(
 
 
 def is_unbegun(surrogate_id: int) -> sa.ColumnElement[bool]:
-    """Return the SQL condition that a query of this surrogate is pending and that no real step of it may have been
+    """Return the SQL condition that a query of this surrogate is pending and that surely no real step of it was
     taken."""
     leases_with_steps = sa.select(leases.c.id).where(
         leases.c.query_id == queries.c.id, leases.c.outcome.not_in(BEFORE_A_STEP)
@@ -253,7 +253,8 @@ def read_answered(connection: Connection, surrogate: Row[Any], batch: Sequence[N
 
 
 def settle(connection: Connection, answers: Iterable[Answered]) -> None:
-    """Mark leases and their queries as answered. A query stays leased if the lease has ended and another is open."""
+    """Mark leases and their queries as answered. A query stays leased if its answered lease had ended and another lease
+    of it is open."""
     leases_done = {one.lease_id: one for one in answers}
     if not leases_done:
         return

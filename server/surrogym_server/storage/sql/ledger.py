@@ -111,8 +111,8 @@ def _evaluations() -> sa.Select[Any]:
 def _unresolved() -> sa.Select[Any]:
     """Return the SELECT of the numbers of steps under leases that failed or expired, by surrogate and outcome.
 
-    Expired leases that are still marked as open count too. The conditions use an index, so that answered leases, nearly
-    all, are not read.
+    Expired leases that are still marked as open count too. The conditions use an index, so that answered leases are not
+    read; nearly all leases are answered.
     """
     failed, expired, is_open = constant("failed"), constant("expired"), constant("open")
     unswept = (leases.c.outcome == is_open) & (leases.c.expires <= NOW)
@@ -154,7 +154,8 @@ class SqlLedger(port.Ledger):
 
 
 def ledgers(connection: Connection, span: Span, sampled: Mapping[int, Mapping[str, int]]) -> dict[int, LedgerRecord]:
-    """Return the counts of real steps of each surrogate in a range of ids that has any.
+    """Return the counts of real steps of the surrogates in a range of ids, by id. Surrogates without real steps are
+    left out.
 
     Args:
         connection: connection to the database.

@@ -191,7 +191,8 @@ def _require_room(connection: Connection, surrogate: Row[Any], steps: int) -> No
 
 
 def query_counts(connection: Connection, span: Span) -> dict[int, QueryCounts]:
-    """Return the numbers of queries by status of each surrogate in a range of ids that has any, by id."""
+    """Return the numbers of queries by status of the surrogates in a range of ids, by id. Surrogates without queries
+    are left out."""
     of_surrogates: defaultdict[int, dict[str, int]] = defaultdict(dict)
     statement = sa.select(queries.c.surrogate_id, queries.c.status, sa.func.count()).where(within(queries, span))
     rows = connection.execute(statement.group_by(queries.c.surrogate_id, queries.c.status)).all()
@@ -289,7 +290,7 @@ def _give_up_queries(connection: Connection, surrogate: Row[Any], names: Sequenc
         touch(connection, surrogate, extra_queries=surrogates.c.extra_queries + again)
 
 
-INITIAL, NO_KEY = "initial", ""  # operation and key of the row of ``requests``; clients can't use an empty key
+INITIAL, NO_KEY = "initial", ""  # operation and key of a row of ``requests``; clients can't use an empty key
 _OF_DESIGN = (requests.c.operation == INITIAL) & (requests.c.key == NO_KEY)
 IS_INCOMPLETE = sa.exists(  # condition on a row of surrogates: some of its initial queries are missing
     sa.select(requests.c.key).where(requests.c.surrogate_id == surrogates.c.id, _OF_DESIGN)
@@ -297,8 +298,8 @@ IS_INCOMPLETE = sa.exists(  # condition on a row of surrogates: some of its init
 
 
 def begin_initial(connection: Connection, surrogate: Row[Any], queries: Sequence[Query]) -> None:
-    """Queue the first batch of a surrogate's initial queries. If others are missing, ``requests`` holds the number of
-    queued ones."""
+    """Queue the first batch of a surrogate's initial queries. If further ones are missing, a row of the table
+    ``requests`` has the number of those that are queued."""
     remember(connection, surrogate, INITIAL, NO_KEY, "", 0)
     _ask_some(connection, surrogate, queries)
 

@@ -130,7 +130,8 @@ def _store(
 ) -> AddedSamples:
     """Insert the new samples of a batch, and mark the queries that they answer.
 
-    A sample that repeats the lease and step of a stored one is a duplicate. ``answers`` has the lease of each sample.
+    A sample that repeats the lease and step of a stored one is a duplicate. ``answers`` has the lease of each sample
+    (None: no query).
     """
     identities = [_identity(place, *pair) for place, pair in enumerate(zip(batch, answers, strict=True))]
     leases = [lease for lease in answers if lease]
@@ -238,7 +239,7 @@ def store_logged(
         old = next((place for place, link in enumerate(links) if link not in stored_ids), len(links))
         if old == len(links) or not _continued(connection, surrogate, chain[old]):
             break
-        before = chain[old + 1]  # equal logs that leave the stored log at this sample continue from this digest
+        before = chain[old + 1]  # the start of this log's own digests; a repeat of the log gets the same start
         if after is not None:
             return AddedSamples((), 0, restart=before)
     new = [row | {"fingerprint": link} for row, link in zip(rows[old:], links[old:], strict=True)]

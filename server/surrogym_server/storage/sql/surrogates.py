@@ -269,7 +269,8 @@ class _Named(msgspec.Struct):
 _NAMED = msgspec.json.Decoder(_Named)
 
 
-UNANSWERED = ("pending", "leased", "set_aside", "refused")  # statuses of few queries, which are counted by an index
+# Statuses that only few queries have, so that counting these queries by an index is fast.
+UNANSWERED = ("pending", "leased", "set_aside", "refused")
 OPEN_COUNTS = [
     sa.select(sa.func.count())
     .where(queries.c.surrogate_id == surrogates.c.id, queries.c.status == status)

@@ -140,7 +140,8 @@ def row_id() -> sa.Column[int]:
 
 
 def owner(**options: Any) -> sa.Column[int]:
-    """Return the column ``surrogate_id`` of a table, a foreign key. Rows are deleted with their surrogate."""
+    """Return the column ``surrogate_id`` of a table, a foreign key to the surrogate to which a row belongs. Rows are
+    deleted with their surrogate."""
     key = sa.ForeignKey("surrogates.id", ondelete="CASCADE")
     return sa.Column("surrogate_id", Id, key, nullable=False, **options)
 
@@ -163,7 +164,7 @@ surrogates = sa.Table(
     sa.Column("checkpoint", sa.Text),
     sa.Column("revision", sa.BigInteger, nullable=False),  # increases with each change that makes a fit due
     sa.Column("fitted_revision", sa.BigInteger, nullable=False),  # revision at the last fit
-    # Revision with which the last log was complete.
+    # Revision with which the last log is complete. Until this revision is fitted, open queries don't delay a fit.
     sa.Column("logged_revision", sa.BigInteger, nullable=False, server_default="0"),
     sa.Column("fit_token", sa.Text),
     sa.Column("fit_owner", sa.Text),
@@ -352,7 +353,7 @@ policies = sa.Table(
 
 
 def policy_key() -> sa.ForeignKeyConstraint:
-    """Return the foreign key of a table to the policy of a row. Rows are deleted with their policy."""
+    """Return the foreign key of a table to the policy to which a row belongs. Rows are deleted with their policy."""
     columns = ["surrogate_id", "version"]
     return sa.ForeignKeyConstraint(columns, [f"policies.{name}" for name in columns], ondelete="CASCADE")
 
