@@ -236,7 +236,7 @@ class Design:
         """Write specification, model and samples to one file.
 
         ``surrogym import`` sends the file to a server, and ``load`` continues the design from it. The file's
-        specification contains the target and the budget, less the queries given up.
+        specification contains the target, and the budget less the steps of queries that were given up.
 
         Raises:
             InvalidInput: there is no model yet.

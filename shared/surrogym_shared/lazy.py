@@ -9,7 +9,7 @@ from typing import Any
 
 
 def on_first_use(package: str, names: Mapping[str, str]) -> tuple[Callable[[str], Any], list[str]]:
-    """Return ``__getattr__`` and ``__all__`` of a package (PEP 562).
+    """Return ``__getattr__`` and ``__all__`` of a package (PEP 562), which import a module when a name is first used.
 
     Args:
         package: ``__name__`` of the package.

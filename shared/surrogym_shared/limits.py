@@ -29,8 +29,8 @@ def limits_of(spec: EnvironmentSpec) -> Limits:
 
 
 def room(spec: EnvironmentSpec, coordinates: Array) -> Array:
-    """Return the distances (n, L) from coordinates (n, C) to the nearer end of each limit, in the limit's unit; they
-    are negative beyond the end."""
+    """Return the distances (n, L) from coordinates (n, C) to the nearer end of each of L limits, in the limit's unit.
+    A distance is negative beyond the end."""
     columns = []
     for limit in limits_of(spec).keep:
         value = evaluate(spec, limit.term, coordinates)

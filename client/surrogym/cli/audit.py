@@ -56,7 +56,7 @@ def command(
     service: Service,
     output: Output,
 ) -> None:
-    """Test a policy's promise with a few real steps.
+    """Test a policy's promised return with a few real steps.
 
     Most real steps are taken at states that the policy visits; all are compared with the model. This needs a running
     sampler. With --env, the real steps are whole episodes, whose returns are compared with the promised return too;

@@ -20,8 +20,8 @@ def columns(rows: Sequence[Sequence[object]], width: int | None = None) -> str:
 
     Args:
         rows: the heading and the rows.
-        width: characters in a line; None takes the width of the terminal, without a limit if standard output is not
-            one.
+        width: characters in a line; None takes the width of the terminal, or no limit if standard output is not a
+            terminal.
     """
     heading, *body = [[_cell(value) for value in row] for row in rows]
     width = width or screen_width()

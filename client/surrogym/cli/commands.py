@@ -18,7 +18,7 @@ GROUPS: Mapping[str, tuple[str, ...]] = {
     ),
     "Operate": ("watch", "work", "jobs", "conformance"),
 }
-REST = "More"  # heading in the help of commands outside all groups, such as those of other packages
+REST = "More"  # heading, in the help, of commands that belong to no group, such as those of other packages
 ADVANCED: Mapping[str, frozenset[str]] = {  # options for experts, which the help lists last, by command
     "deploy": frozenset({"--algorithm", "--trust-policy", "--spec", "--episodes"}),
     "evaluate": frozenset(

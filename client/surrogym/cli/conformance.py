@@ -34,7 +34,7 @@ def command(
     service: Service,
     output: Output,
 ) -> None:
-    """Check that a server or a program keeps its protocol.
+    """Check that a server or a program follows its protocol.
 
     Each check prints one line. The exit status is 1 if a check fails. With --quiet, only failed checks are shown. With
     --exec, no server is needed, and the line of a failed check says how to solve it.

@@ -94,8 +94,8 @@ class Checking:
 
     @contextmanager
     def comparison(self, target: Target, controller: Controller, policy: LocalPolicy) -> Iterator[Comparison | None]:
-        """Context with the running controller beside its policy in an environment; None without ``--check``. Its real
-        steps are reported to the server at the end, also after an error.
+        """Context with the running controller beside its policy in an environment; None without ``--check``. The
+        real steps in an environment of ``--env`` are reported to the server at the end, even after an error.
 
         Raises:
             CommandError: the target can't run on this machine, or no environment is given.
@@ -331,8 +331,8 @@ def _local(
 
 
 def _warning(policy: str, card: PolicyCard) -> str:
-    """Return a warning that a policy's promise is not trusted, with the commands that test it. An audit needs a file,
-    so the commands first download a stored policy."""
+    """Return a warning that a policy's promised return is not trusted, with the commands that test it. The test is an
+    audit, which needs the policy's file, so the commands download a stored policy first."""
     from shlex import quote
 
     stored = "@" in policy and not Path(policy).is_file()

@@ -109,7 +109,8 @@ class Differences:
         """Compare the real steps of an evaluation with a surrogate's model, and send steps from which it learns.
 
         With ``--learn-all`` all steps are sent, even if there is no model yet. Returns None if no option requests a
-        comparison and the promise was kept, or if the steps can't be compared and none was sent.
+        comparison and the mean return lies in the promised interval, or if the steps can't be compared and none was
+        sent.
 
         Args:
             surrogate: name of the surrogate; None: there is nothing to compare with.
@@ -117,7 +118,7 @@ class Differences:
             token: bearer token for the server.
             result: the episodes.
             settings: settings of the evaluation.
-            promise: promise of the policy, if the episodes judge it.
+            promise: the policy's promised return; None if these episodes can't test it.
             steps: steps to send; None to send none.
             imagining: imagines episodes of the policy, to find effects of errors on its return.
             quiet: whether remarks are hidden.
@@ -190,8 +191,8 @@ class Imagining:
 
 
 def _compare(api: Api, surrogate: str, result: Evaluation, first_seed: int, imagining: Imagining) -> Differing | None:
-    """Compare the real steps of an evaluation with a surrogate's model. Returns None if there is no model, or if it has
-    other coordinates."""
+    """Compare the real steps of an evaluation with a surrogate's model. Returns None if there is no model, or if its
+    coordinates are not those of the episodes."""
     import numpy as np
 
     from surrogym_trainer.evaluation.comparing import Disagreements, compared, disagreements, steady, steps_of

@@ -137,7 +137,7 @@ def command(
     """Run real episodes with a policy, and report its returns.
 
     The real steps are reported to the server. It stores the policy and the episodes; if it does not
-    answer, they wait beside the policy until surrogym policy push. If the mean return lies outside the promise's
+    answer, they wait beside the policy until surrogym policy push. If the mean return lies outside the promised
     interval, the command compares the steps with the model and shows the states at which the two disagree. With
     --learn, the model learns from these steps; with --learn-all, from every step.
 
@@ -195,8 +195,8 @@ def _named(env: str | None, card: PolicyCard) -> str:
 
 
 def _elsewhere(env: str | None, card: PolicyCard, promise: Promise | None) -> list[str]:
-    """Return a remark if the episodes ran in another environment than the one that the policy was trained for, so that
-    they don't judge its promise; empty if not, or if that environment is not known."""
+    """Return a remark if the episodes ran in another environment than the one that the policy was trained for, because
+    they can't test the promised return then. Empty if it is the same environment, or if one of the two is unknown."""
     from surrogym_shared.environments import is_name, is_same
 
     own = card.spec.environment if card.spec else ""
@@ -210,8 +210,8 @@ def _elsewhere(env: str | None, card: PolicyCard, promise: Promise | None) -> li
 
 
 def _why_not_judged(card: PolicyCard, settings: EvaluationSettings, result: Evaluation) -> list[str]:
-    """Return a remark why the episodes don't judge the promise: actions were changed at random, episodes had another
-    time limit, or constants changed within an episode. Empty if they judge it, or without a promise."""
+    """Return a remark why the episodes can't test the promised return: actions were changed at random, episodes had
+    another time limit, or constants changed within an episode. Empty if they can, or if no return was promised."""
     from surrogym_trainer.evaluation.reporting import has_other_limit
 
     if settings.explore:
@@ -251,7 +251,7 @@ def _repeated(result: Evaluation) -> list[str]:
 
 
 def _judges(episodes: int) -> bool:
-    """Whether this number of episodes is enough to judge a promise."""
+    """Whether this number of episodes is enough to tell whether a promised return was reached."""
     from surrogym_shared.wire import FEWEST_TO_JUDGE
 
     return episodes >= FEWEST_TO_JUDGE

@@ -19,7 +19,7 @@ def opener_for_policy(
 
     Args:
         env: name of the original environment; None takes the one that the policy was trained for.
-        given: specification of the environment from --spec; None takes its own.
+        given: specification of the environment from --spec; None takes the environment's own specification.
         card: card of the policy.
         quiet: whether remarks are hidden.
 

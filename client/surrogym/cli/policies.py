@@ -32,7 +32,7 @@ def command(
 ) -> None:
     """List the policies that the server stores, newest first.
 
-    Each row has the policy's aliases, promise, real return and files.
+    Each row has the policy's aliases, promised return, real return and files.
 
     Example: surrogym policies pendulum
     """

@@ -51,7 +51,7 @@ def register(app: typer.Typer) -> None:
 
 
 def show(context: typer.Context, policy: Named, *, service: Service, output: Output) -> None:
-    """Show a policy's promise, real returns and files.
+    """Show a policy's promised return, real returns and files.
 
     Example: surrogym policy show pendulum@3
     """

@@ -217,7 +217,7 @@ def _sample_here(
                 tell(Line(line_of(query, outcome, error), bool(error)))
 
         def ended(phase: Phase) -> None:
-            if not plan.settings.until_done:  # with --until-done, the command prints its result now
+            if not plan.settings.until_done:  # otherwise the command ends and prints its result
                 say(_words_of_end(plan.surrogate, phase), quiet=output.quiet)
 
         sampler = Sampler(api, plan.surrogate, environment, plan.settings, report, ended, approve)
@@ -285,7 +285,8 @@ def _environment(
 
 
 def _words_of_consent(name: str) -> str:
-    """Return the error message that an environment's name from a server is not opened, with the option to open it."""
+    """Return the error message that an environment is not opened because only the server gave its name, with the option
+    by which the user can give the name."""
     from surrogym_sampler.original.executables import is_executable
     from surrogym_sampler.original.loading import env_option
     from surrogym_shared.environments import is_name

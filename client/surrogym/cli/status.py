@@ -84,7 +84,8 @@ def _one(api: Api, name: str, form: Form) -> str:
 
 
 def _limits(api: Api, view: SurrogateView) -> list[str]:
-    """Return lines on how all real steps kept the limits of the specification; empty without limits or steps."""
+    """Return lines that say how many real steps went beyond each limit of the specification; empty without limits or
+    steps."""
     if view.spec.limits is None:
         return []
     import numpy as np
@@ -110,7 +111,7 @@ def _prior(api: Api, name: str) -> list[str]:
 
 
 def _untrusted(name: str, policies: Sequence[PolicyView]) -> list[str]:
-    """Return a line for the newest policy, and for each policy with an alias, whose promise is not trusted."""
+    """Return a line for each policy whose promised return is not trusted, if it is the newest or has an alias."""
     shown = [one for number, one in enumerate(policies) if one.trusted is False and (one.aliases or number == 0)]
     named = [", ".join([f"{name}@{one.version}", *one.aliases]) for one in shown]
     return [f"policy {words}: not trusted: {one.reason}" for words, one in zip(named, shown, strict=True)]

@@ -151,7 +151,7 @@ class SessionOptions:
 
 @dataclass(frozen=True)
 class StartOptions:
-    """Options for the starts of episodes, for the policy to continue from, and for further cycles."""
+    """Options for starts and lengths of episodes, for a policy to continue from, and for prolonging the training."""
 
     start_box: Annotated[
         float | None,
@@ -249,7 +249,7 @@ class LoopOptions:
 
 @dataclass(frozen=True)
 class LogOptions:
-    """Options for where the curves of the training and the policy are stored."""
+    """Options for where the training's curves are recorded, and whether the policy is stored on the server."""
 
     log: Annotated[
         Log | None,

@@ -59,8 +59,8 @@ def command(
     """Find out whether the machine has changed, from a log.
 
     Each step is compared with the model's prediction. No model learns from it. If the machine has changed, the command
-    says which output differs, by how much and where, and ends with exit status 1. The policy's promise is not trusted
-    from then on. The model should fit the machine at first: surrogym audit tests that.
+    says which output differs, by how much and where, and ends with exit status 1. The policy's promised return is
+    not trusted from then on. The model should fit the machine at first: surrogym audit tests that.
 
     Example: surrogym watch pendulum log.csv --policy production --follow
     """
@@ -150,8 +150,8 @@ def _watched(watcher: Watcher, steps: list[StepOfEpisode], update: Update, rejec
 
 
 def _withdrawn(watcher: Watcher, version: int, alarm: Alarm) -> PolicyView:
-    """Report a drift to the server, which withdraws the policy's promise. If that fails, print the drift, and raise the
-    error."""
+    """Report a drift to the server, after which the policy's promised return is not trusted. If the report fails, print
+    the drift, and raise the error."""
     from surrogym_client.errors import SurrogymClientError
     from surrogym_shared.terminal import say
 

@@ -145,7 +145,7 @@ def _audit_steps(metrics: dict[str, Any]) -> int:
 
 
 def _promise(metrics: dict[str, Any]) -> list[tuple[str, str]]:
-    """Return the rows about the policy's promise; empty if the policy was learned in the original environment."""
+    """Return the rows about the promised return; empty if the policy was learned in the original environment."""
     promise = metrics["promise"]
     if promise is None:
         return []

@@ -23,7 +23,7 @@ def after_import(module: str, function: str) -> None:
 
 
 class _Finder:
-    """Finder that finds one module once, as Python does, and whose loader calls a function after the import."""
+    """Import hook for one module: finds it as Python does, and makes its loader call a function after the import."""
 
     def __init__(self, module: str, function: str) -> None:
         self._module, self._function = module, function

@@ -180,8 +180,8 @@ class Api:
         lease_seconds: float = wire.LEASE_SECONDS,
         retries: Retries | None = None,
     ) -> wire.ClaimedQueries:
-        """Lease up to ``max_queries`` queries for a sampler, and wait up to ``wait_seconds`` for the first one. There
-        may be none. ``retries`` replaces the retry budget of the connection.
+        """Lease up to ``max_queries`` queries for a sampler, and wait up to ``wait_seconds`` for the first one. The
+        reply may have none. ``retries`` replaces the retry budget of the connection.
 
         A claim whose reply is lost is not sent again. Its leases expire, and the queries return to the queue.
 

@@ -62,7 +62,7 @@ def entry(*arguments: Any) -> Callable[[F], F]:
 
 @contextmanager
 def _kept_in(folder: Path) -> Iterator[None]:
-    """Context in which numba caches in this folder. Numba reads the setting when a function is declared."""
+    """Context in which functions are declared whose compiled code numba shall cache in this folder."""
     before, settings.CACHE_DIR = settings.CACHE_DIR, str(folder)
     try:
         yield

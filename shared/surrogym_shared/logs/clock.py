@@ -215,7 +215,7 @@ def ticks_of(rows: Rows, episode: Ints, left_out: Mapping[int, str]) -> Ticks | 
     begins = np.concatenate([[True], ~same])
     moment = np.cumsum(begins) - 1
     at, of, size = time[begins], number[begins], np.bincount(moment)
-    inner = np.zeros(len(size), dtype=np.bool_)  # not the first or last time of an episode, where rows are cut off
+    inner = np.zeros(len(size), dtype=np.bool_)  # excludes an episode's first and last time, which may lack rows
     inner[1:-1] = (of[1:-1] == of[:-2]) & (of[1:-1] == of[2:])
     within = of[1:] == of[:-1]
     if not within.any():

@@ -9,7 +9,7 @@ from surrogym_shared.wire.policies import Count, Text
 
 
 class AddDrift(Request):
-    """Report that real steps no longer agree with the model, so that the policy's promise is not trusted."""
+    """Report that real steps no longer agree with the model, so that the policy's promised return is not trusted."""
 
     output: Text = Field(description="name of the output that differs most")
     error: Measured = Field(
