@@ -338,7 +338,7 @@ def test_an_incomplete_policy_file_is_refused_with_the_missing_entry(tmp_path: P
     entries = read_entries(policy, LIMIT)
     del entries[missing]
     policy.write_bytes(stored(entries))
-    with pytest.raises(UnusablePolicy, match=f"expected an entry '{missing}', got "):
+    with pytest.raises(UnusablePolicy, match=f"expected an entry '{missing}' in the policy's file, got "):
         load_policy(policy)
 
 

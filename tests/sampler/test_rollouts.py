@@ -186,7 +186,7 @@ def test_a_rollout_with_a_jump_or_steps_after_termination_is_refused(api, asked)
 def test_a_rollout_query_of_wrong_kind_or_length_is_refused(api, rail):
     with pytest.raises(InvalidInput, match="can't be set to a state"):
         api.add_queries(rail, [[0.0]], [[0.0]])
-    with pytest.raises(InvalidInput, match="at most 20 actions, got 21"):
+    with pytest.raises(InvalidInput, match="at most 20 actions in each, got 21"):
         api.add_queries(rail, rollouts=[[LEFT] * 21])
     with pytest.raises(InvalidInput, match=r"entry 0 in \[-1, 1\], got 3"):
         api.add_queries(rail, rollouts=[[LEFT], [[3.0]]])
