@@ -157,8 +157,8 @@ class KeptLimit:
 
 @dataclass(frozen=True)
 class Guard:
-    """Limits that the controller keeps: ``fallback`` (F terms) acts in the place of the policy shortly before one would
-    be left, as ``surrogym_shared.limits.falls_back`` defines it."""
+    """Limits that the controller keeps. ``fallback`` (F terms of the coordinates) gives the action instead of the
+    policy if a limit would be left soon, as ``surrogym_shared.limits.falls_back`` defines it."""
 
     limits: tuple[KeptLimit, ...]
     fallback: tuple[Observed, ...]

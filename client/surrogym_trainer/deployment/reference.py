@@ -80,7 +80,8 @@ def decide(controller: Controller, memory: Memory, measurements: Array, age: Arr
 
 
 def _falls_back(guard: Guard, memory: Memory, coordinates: Array) -> Bools:
-    """Whether (N,) the fallback of the limits acts at coordinates (N, C)."""
+    """Return whether (N,) the fallback of the limits acts instead of the policy at coordinates (N, C), because a limit
+    would be left soon."""
     acts = np.zeros(len(coordinates), dtype=np.bool_)
     known = memory.acted & memory.measured
     for limit in guard.limits:

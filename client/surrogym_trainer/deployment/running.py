@@ -47,8 +47,12 @@ class Checked:
     returns: Array  # (N,) returns of the controller
     policy_returns: Array  # (N,) returns of the policy
     steps: int  # number of steps of the controller
-    largest: float  # largest difference of both actions in states of the controller, as a share of the action's range
-    different: int  # number of steps with another choice, or a difference above 1e-6 of the range (1e-4 in float)
+    # largest difference between the actions of controller and policy in the controller's states, as a share of the
+    # range
+    largest: float
+    # number of steps with a discrete choice that is not the policy's, or a difference above 1e-6 of the range (1e-4 in
+    # float)
+    different: int
     faults: int  # number of steps in which the controller took its fallback action
     microseconds: float | None
 
@@ -64,8 +68,8 @@ class Comparison:
     """
 
     def __init__(self, controller: Controller, running: Running, policy: Predict, episode: Episode) -> None:
-        self.begun = 0  # number of steps of the environment, of both together
-        self.ended = 0  # number of finished episodes, of both together
+        self.begun = 0  # number of begun steps of the environment, those of controller and policy together
+        self.ended = 0  # number of finished episodes, those of controller and policy together
         self._running, self._policy, self._episode = running, policy, episode
         self._places = [m.place for m in controller.measurements]
         self._width = controller.high - controller.low

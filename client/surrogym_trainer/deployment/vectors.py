@@ -81,8 +81,8 @@ def sensors_of(controller: Controller) -> tuple[Array, Array]:
 
 
 def _walked(controller: Controller) -> tuple[Array, Array]:
-    """Return the range (R,) of random walks: that of the sensor, or a few turns of an angle whose sensor
-    counts many."""
+    """Return the range (R,) of the random walk of each measurement: the range of its sensor. For an angle whose sensor
+    counts many turns, it is a few turns only."""
     low, high = sensors_of(controller)
     near = np.clip(0.0, low, high)
     angle = np.array([m.angle for m in controller.measurements])

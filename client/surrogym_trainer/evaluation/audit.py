@@ -23,11 +23,14 @@ from surrogym_trainer.policies.evidence import Audit, Promise
 AUDIT_STEPS = 8
 MOST_STEPS = 40  # largest number of steps of an audit that is undecided
 ALARM = 0.01  # probability that the test of output errors fails for a right model
-SHIFT_ALARM = 0.05  # probability that the errors of a right model ever count as shifted, at any number of steps
-# probability that the return leaves the promise above which an audit takes more steps, and the promise widens
+# probability that the errors of a right model ever seem to have a part that all steps share, however many steps are
+# taken
+SHIFT_ALARM = 0.05
+# if the return leaves the promised interval with a larger probability, an audit takes more steps and widens the
+# interval
 UNDECIDED = 0.05
 MISPLACED_ENDS = 2  # an audit fails if the model predicted the termination of this many steps wrongly
-# share of the gain over an untrained policy by which a new promise may leave the interval of the former one
+# share of the gain over an untrained policy by which a new promise may leave the interval of the previous promise
 SLACK = 0.1
 # distance at which states count as far apart, in standard deviations of a coordinate over the policy's states
 FAR = 1.0
@@ -47,14 +50,15 @@ class Compared:
     Attributes:
         names: names of the outputs, (O,).
         errors: real minus predicted values (n, O), in each output's unit.
-        deviations: predicted standard deviations of the function (n, O), without noise.
-        expected: error (O,) that the model allows in addition: its tolerance, or its leave-one-out error if that is
-            larger, which includes the noise; for the reward at least the error that matters for the return.
+        deviations: standard deviations (n, O) of the model's predictions, without noise.
+        expected: error (O,) that is allowed in addition to ``deviations``: the larger of the model's tolerance and its
+            error on left-out samples, which includes the noise. For the reward, it is at least the error that matters
+            for the return.
         misplaced: number of steps whose termination was predicted wrongly.
         cut_short: whether the steps are one rollout that ended earlier than the model predicted.
         unanswered: number of chosen states at which the original environment failed to take the step.
         elsewhere: number of steps in states that the policy does not visit; they come last.
-        claimed_alone: error (O,) of the model on left-out samples, without any tolerance.
+        claimed_alone: error (O,) of the model on left-out samples. A tolerance does not enlarge it.
         states: states (n, C) at which the steps began.
         actions: actions (n, F) of the steps.
     """
@@ -79,8 +83,8 @@ class Compared:
 
     @property
     def surprising(self) -> Bools:
-        """Which outputs (O,) have larger errors in states that the policy visits than the model predicts without any
-        tolerance, beyond chance."""
+        """Which outputs (O,) have larger errors than chance explains, in states that the policy visits. The errors are
+        compared with those that the model itself expects, without any tolerance."""
         on_way = slice(len(self.errors) - self.elsewhere)
         errors, deviations = self.errors[on_way], self.deviations[on_way]
         sums = (errors**2 / (deviations**2 + self.claimed_alone**2)).sum(0)
@@ -102,13 +106,14 @@ class Compared:
 
 @dataclass(frozen=True)
 class Consequence:
-    """The change of a policy's return that the errors common to all steps of an audit would cause.
+    """The change of a policy's return that would be caused by the part of the model's errors that all steps of an audit
+    share.
 
     Attributes:
-        shifted: the joint test of the errors.
-        changes: changes (K,) of the mean return, each under one sample of the errors that the steps support.
-        before: the promise without these errors.
-        slack: distance by which a return may leave the promise.
+        shifted: the test for such a shared part.
+        changes: changes (K,) of the mean return, each caused by one sampled error that agrees with the steps.
+        before: promise (interval of the return) before the errors were known.
+        slack: distance from the promised interval at which a return still counts as inside.
     """
 
     shifted: Systematic
@@ -118,7 +123,7 @@ class Consequence:
 
     @property
     def beyond(self) -> Bools:
-        """Which of the sampled errors (K,) move the return out of the promise."""
+        """Which of the K sampled errors would move the return out of the promised interval by more than ``slack``."""
         returns = self.before.median + self.changes
         outside: Bools = (returns < self.before.low - self.slack) | (returns > self.before.high + self.slack)
         return outside
@@ -130,8 +135,8 @@ class Consequence:
 
     @property
     def proven(self) -> bool:
-        """Whether the model is shifted almost certainly, and the return more likely outside of the promise
-        than inside."""
+        """Whether the model's errors almost certainly have a part that all steps share, and the return with this part
+        lies more likely outside of the promised interval than inside."""
         moved = self.changes[self.changes != 0]
         return self.shifted.evidence >= 1 / SHIFT_ALARM and len(moved) > 0 and self.beyond.sum() > len(moved) / 2
 
@@ -148,10 +153,10 @@ class Consequence:
         )
 
     def widened(self, promise: Promise) -> Promise:
-        """Return the promise of a model that has learned from the steps, widened by the returns that the errors make
-        likely.
+        """Return the promise of a model that has learned from the audit's steps, widened to the returns that the shared
+        errors make likely.
 
-        It is unchanged if the errors hardly matter.
+        The promise is unchanged if these errors hardly matter for the return.
         """
         if float(self.beyond.mean()) <= UNDECIDED:
             return promise
@@ -173,11 +178,12 @@ def judge(
 
     An output is at fault in either of two cases:
 
-    - The sum of its squared errors, each divided by its predicted deviation, is larger than chance explains: beyond the
-      1 % quantile of the chi-squared distribution, shared between the outputs. Single errors within the tolerance are
-      never a fault.
-    - The errors have a part that all steps share, beyond chance, and with it in the model the policy's return leaves
-      the promise, see ``Consequence``. A shared part without an effect on the return is not a fault.
+    - The sum of its squared errors, each divided by the predicted variance, is larger than chance explains. The bound
+      is a quantile of the chi-squared distribution, which any output of a right model exceeds with a probability of
+      about 1 %. Single errors within the tolerance are never a fault.
+    - The errors have a part that all steps share, more than chance explains. If this part is added to the model, the
+      policy's return leaves the promised interval, see ``Consequence``. A shared part without an effect on the return
+      is not a fault.
 
     A rollout has at most one end, so a single one that was not predicted is a fault. A step that the original
     environment fails to take is a fault, because the policy would need it.
@@ -225,10 +231,11 @@ def judge(
 
 
 def missed(audit: Audit, returns: Array, floor: float | None) -> Audit:
-    """Add a fault to an audit if the returns (k,) of whole real episodes miss the promise, and return the audit.
+    """Add a fault to an audit if the returns (k,) of whole real episodes miss the promised interval, and return the
+    audit.
 
-    Their mean may leave the promise by ``SLACK`` of the gain over the return ``floor`` of an untrained policy, and by
-    two of its standard errors.
+    The mean of the returns may lie outside of the interval by two of its standard errors, plus ``SLACK`` times the
+    policy's gain over an untrained policy, whose return is ``floor``.
     """
     mean, before = float(returns.mean()), audit.before
     chance = 2 * float(returns.std(ddof=1)) / sqrt(len(returns)) if len(returns) > 1 else 0.0
@@ -265,8 +272,9 @@ def disappointed(audit: Audit, floor: float | None, imagined: float | None = Non
     """Return whether the model that has learned from an audit promises clearly less than the model that chose the
     policy.
 
-    The policy was chosen by its imagined return. The promise is lower than that from the beginning if the imagined
-    return depends on what the model does not know. So the new promise is compared with the larger of the two.
+    The policy was chosen by its imagined return, the mean return in the model. If this depends on what the model does
+    not know, the promise before the audit is already lower. So the promise after the audit is compared with the larger
+    one of the imagined return and the promise before.
 
     Args:
         audit: the audit.
@@ -279,14 +287,14 @@ def disappointed(audit: Audit, floor: float | None, imagined: float | None = Non
 
 
 def wider(promise: Promise, share: float, floor: float | None) -> bool:
-    """Return whether the lower half of a promise is wider than ``share`` of the gain over an untrained policy of return
-    ``floor``."""
+    """Return whether the lower half of a promised interval, from its lower end to its median, is wider than ``share``
+    of the policy's gain over an untrained policy, whose return is ``floor``."""
     return not promise.median - promise.low <= share * earned(promise, floor)
 
 
 def earned(promise: Promise, floor: float | None) -> float:
-    """Return the gain of a policy over an untrained one of return ``floor``. Without ``floor``, it is the policy's
-    whole return."""
+    """Return the gain of a policy: the distance of its promised median return from ``floor``, the return of an
+    untrained policy. Without ``floor``, it is the distance from 0."""
     return abs(promise.median - (floor or 0.0))
 
 
@@ -300,8 +308,9 @@ def places(spec: EnvironmentSpec, q: Array, u: Array, count: int, rng: np.random
     """Choose at most ``count`` of the visited states q (m, C) and their actions u (m, F) for an audit, and return their
     indices.
 
-    Half of them are drawn at random, so that they represent the policy's time. Each other one is the farthest from all
-    chosen before, so that they cover all visited states. Distances are in standard deviations of the visited states.
+    Half of the chosen states are drawn at random, so that states where the policy spends much time are chosen often.
+    Each further state is the one that is farthest from all chosen so far, so that the choice covers all visited states.
+    Distances are in standard deviations of the visited states.
     """
     settable = np.flatnonzero(_settable(spec, q))
     count = min(count, len(settable))
@@ -333,7 +342,8 @@ def gaps(spec: EnvironmentSpec, q: Array, u: Array, samples: tuple[Array, Array]
     ranges[ranges == 0] = np.inf
 
     def away(states: Array, actions: Array) -> Array:
-        """Return the distance (m, C + F) of each input from the nearest of these points."""
+        """Return the distance (m, C + F) of each coordinate and action entry in q and u from the nearest value of the
+        same entry in the given states (n, C) and actions (n, F)."""
         off = differences(spec, q[:, None], states[None]), u[:, None] - actions[None]
         nearest: Array = np.abs(np.concatenate(off, 2)).min(1)
         return nearest

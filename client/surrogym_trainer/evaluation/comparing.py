@@ -49,7 +49,7 @@ def compared(
         spec: the specification.
         view: the surrogate, with its model version.
         samples: the real steps.
-        matters: largest error of the reward that does not matter for the return.
+        matters: error of the reward up to which the return hardly changes.
     """
     q, u = [list(sample.coordinates) for sample in samples], [list(sample.action) for sample in samples]
     predicted = api.predict(view.name, q, u, model=view.model_version)
@@ -77,8 +77,8 @@ def compared(
 
 
 def _expected(claim: OutputFidelity, matters: float) -> float:
-    """Return the error of an output that the model allows: the largest of its tolerance, its error on left-out samples,
-    and ``matters``."""
+    """Return the error of an output that is allowed besides the predicted deviation: the largest of its tolerance, its
+    error on left-out samples, and ``matters``."""
     return max(claim.tolerance, claim.leave_one_out_error or 0.0, matters)
 
 

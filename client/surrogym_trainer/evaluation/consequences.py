@@ -22,7 +22,7 @@ from surrogym_trainer.policies.predict import Predict
 
 DRAWS = 64  # number of sampled errors that agree with the steps
 STARTS = 4  # number of virtual episodes under each sampled error
-CERTAIN = 0.9  # probability above which an output counts as shifted
+CERTAIN = 0.9  # probability above which an output's errors count as having a part that all steps share
 EFFECT_STARTS = 32  # number of virtual episodes under the errors of a single output
 
 Array = NDArray[np.float64]
@@ -38,7 +38,8 @@ def changes_of(
     weights: Array,
     starts: int = STARTS,
 ) -> Array:
-    """Return the changes (K,) of the policy's mean return if the model errs by ``weights`` (K, O, 1 + P).
+    """Return the changes (K,) of the policy's mean return in the model if each of K errors is added to the model's
+    outputs.
 
     The episodes with and without the errors have the same starts and the same noise, and follow the model's mean.
 
@@ -48,8 +49,8 @@ def changes_of(
         seed: seed of the starts and the noise.
         session: fields of ``OpenSession`` that the policy was trained with.
         version: version of the model that was compared with the real steps.
-        shifted: the joint test of the errors.
-        weights: errors of its outputs.
+        shifted: the test for errors that all steps share, which names the outputs and standardises the inputs.
+        weights: the K errors (K, O, 1 + P): for each output, a constant and a factor for each of P standardised inputs.
         starts: number of virtual episodes for each row of weights.
     """
     if not weights.any():
@@ -96,17 +97,18 @@ class Effect:
 def effects_of(
     spec: EnvironmentSpec, compared: Compared, change: Callable[[Systematic, Array], Array] | None
 ) -> tuple[list[Effect], Array]:
-    """Find the outputs whose errors have a part that all steps share, those with the largest effect on the return
-    first.
+    """Find the outputs whose errors have a part that all steps share. The output whose error has the largest effect on
+    the return comes first.
 
     Args:
         spec: specification of the environment.
         compared: the real steps with their predictions.
-        change: computes the changes (K,) of the return by weights (K, O, 1 + P); None leaves the changes out.
+        change: computes the changes (K,) of the return that K errors cause, each given by weights (O, 1 + P); None
+            leaves the changes out.
 
     Returns:
-        The effects, and the contribution of each step to them (n,): the sum of its errors that they explain, each
-        divided by the error on left-out samples.
+        The effects, and the contribution of each step to them (n,): the sum of its errors that the effects explain,
+        each divided by the model's error on left-out samples.
     """
     shifted = compared.together(spec, Inputs.over(spec, compared.states, compared.actions))
     weights, outputs = shifted.expected(), np.flatnonzero(shifted.chances > CERTAIN).tolist()

@@ -114,7 +114,8 @@ class Evaluation:
 
     @property
     def equal(self) -> bool:
-        """Whether all of several episodes are equal in every number, so that one would have been enough."""
+        """Whether the evaluation has several episodes and all of them are equal in every number, so that one episode
+        would have been enough."""
         return len(self.traces) > 1 and all(_is_equal(self.trace, other) for other in self.traces[1:])
 
     @property
@@ -374,8 +375,8 @@ def _start(episode: Episode, settings: EvaluationSettings, index: int) -> Moment
 
 
 def _reset(episode: Episode, settings: EvaluationSettings) -> Array | None:
-    """Reset once more than there are episodes, with the first seed, and return the coordinates (C,); None if the starts
-    are not chosen by a reset."""
+    """Reset once more than there are episodes: before the first one, with its seed. Return the coordinates (C,); if the
+    first episode starts elsewhere, the environment ignores its seed. None if the starts are not chosen by a reset."""
     if settings.wide or settings.start_scale != 1:
         return None
     return episode.reset(settings.first_seed).coordinates

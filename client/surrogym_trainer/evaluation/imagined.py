@@ -20,8 +20,8 @@ DECLARED = {"start_box": 0.0, "start_visited": 0.0}  # session options with whic
 # session options of whole episodes, without a trust limit, because a shortened episode would earn more if rewards are
 # costs
 WHOLE = {**DECLARED, "trust": None}
-# session options if the specification pays for leaving the trusted range: an episode then gets a penalty for its
-# missing steps, so the trust limit stays
+# session options if the specification penalises leaving the trusted states: an episode that ends there
+# gets a penalty for its missing steps, so the trust limit stays
 PAID_OUTSIDE = DECLARED
 STATISTICS_LANES = 1_024
 STEPS_AT_ONCE = 1_000  # largest number of steps in one reply; an episode may be longer
@@ -108,7 +108,8 @@ class _Sums:
 
 
 class _Rewards(NamedTuple):
-    """The rewards of T steps in N lanes (T, N): as paid, without a penalty, and whether the episode ended."""
+    """The results of T steps in N lanes, (T, N) each: rewards less the penalty, rewards without the penalty, and
+    whether the step ended its episode."""
 
     reward: NDArray[np.floating[Any]]
     mean: NDArray[np.floating[Any]]
@@ -141,8 +142,8 @@ def _rolled(lanes: Lanes, policy: ActingPolicy, seed: int | Sequence[int], sums:
 
 
 def _as_arrays(predict: Callable[[NDArray[Any]], NDArray[Any]], port: SurrogatePort) -> ActingPolicy | None:
-    """Return the policy in the form of arrays, so that it can act inside the surrogate; None if it has no such form or
-    acts within other bounds."""
+    """Return the policy in the form of arrays, so that it can act inside the surrogate. None if the policy has no such
+    form, or if its action bounds are not those of the surrogate."""
     if not isinstance(predict, Network) or not isinstance(port, PolicyPort):
         return None
     spec = port.spec()

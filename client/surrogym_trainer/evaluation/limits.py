@@ -13,7 +13,7 @@ from scipy.stats import binomtest
 from surrogym_shared.limits import limits_of, past, room
 from surrogym_shared.spec import EnvironmentSpec
 
-LEVEL = 0.05  # probability that kept limits count as broken
+LEVEL = 0.05  # probability that limits count as broken although they are kept as declared
 
 
 @dataclass(frozen=True)

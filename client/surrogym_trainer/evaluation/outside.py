@@ -29,8 +29,8 @@ class Outside:
     Attributes:
         share: share of the policy's steps that are far from every logged one.
         name: the coordinate that leaves the range of the log in at least half of these steps; empty if there is none.
-        way: its smallest and largest value in these steps.
-        log: its smallest and largest logged value.
+        way: smallest and largest value of this coordinate in these steps of the policy.
+        log: smallest and largest value of this coordinate in the log.
     """
 
     share: float
@@ -59,7 +59,7 @@ def outside_of(spec: EnvironmentSpec, q: Array, u: Array, way_q: Array, way_u: A
     Args:
         spec: specification of the environment.
         q, u: logged states (n, C) and actions (n, F).
-        way_q, way_u: states (m, C) and actions (m, F) of the policy.
+        way_q, way_u: states (m, C) that the policy visits, and its actions (m, F) there.
     """
     kept, walked = _thinned(len(q)), _thinned(len(way_q))
     logged_q, passed_q = q[kept], way_q[walked]

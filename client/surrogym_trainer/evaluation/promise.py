@@ -33,15 +33,15 @@ def promise_of(
     session: Mapping[str, Any] | None = None,
     floor: float | None = None,
 ) -> Promise:
-    """Compute a policy's promise along functions sampled from the posterior, each from several starts, without any
-    penalty.
+    """Compute a policy's promise: the interval of its mean return over functions drawn from the model's posterior.
+    Episodes follow each function from several starts, without any penalty.
 
     Args:
         port: the surrogate.
         predict: the policy; function from observations (N, D) to actions.
         seed: seed of functions and starts.
-        session: fields of ``OpenSession`` that the policy was trained with. Its variant with its options, penalty and
-            caution are ignored.
+        session: fields of ``OpenSession`` that the policy was trained with. The fields of the variant, the penalty and
+            the caution are ignored.
         floor: return of an untrained policy; None if it was not measured.
     """
     left_out = {"variant", "penalty", "caution", *OF_PARTICLES}
@@ -55,13 +55,14 @@ def promise_of(
 def interval(returns: Array, floor: float | None = None) -> Promise:
     """Compute the promise from the returns (starts, functions) of virtual episodes.
 
-    The functions' mean returns also differ by chance, because each is over a few starts. So they are shrunk towards
-    their common mean until their variance is what the functions alone explain (one-way analysis of variance). Then the
-    uncertainty of 100 real starts, and that of the virtual starts, is added.
+    The mean returns of the functions also differ by chance, because each is the mean over a few starts. So they are
+    shrunk towards their common mean, until their variance is the part that the functions alone explain (one-way
+    analysis of variance). Then the uncertainty of 100 real starts, and that of the virtual starts, is added.
 
-    All functions share the errors of the model's form: for example, a kink is smooth in each of them. So an error of
-    the return that an audit does not notice is added: ``UNNOTICED`` of the gain over ``floor``, as the 5 % and 95 %
-    quantiles of a normal distribution. The mean return is limited to the range of the single episodes' returns.
+    All functions share the errors of the model's form: for example, a kink is smooth in each of them. So the interval
+    also contains an error of the return that is too small for an audit to notice. It is normally distributed; its 95 %
+    quantile is ``UNNOTICED`` times the gain over ``floor``, the return of an untrained policy. The mean return is
+    limited to the range of the single episodes' returns.
     """
     parts = _parts(returns)
     starts, functions = returns.shape

@@ -39,7 +39,8 @@ from surrogym_shared.wire import Residual
 # possible sizes of a shared error, in standard deviations of the other errors
 SIZES = tuple(2.0**i for i in range(-1, 6))
 DEGREES = 0.1  # degrees of freedom of the prior of the errors' scale; so few leave the scale almost unknown
-FARTHEST = 3.0  # standard deviations to which a standardised input is clipped, as in a session
+# standard deviations to which a standardised input is clipped; sessions that add an error to the model clip it likewise
+FARTHEST = 3.0
 LEAST = 1e-3  # smallest error on left-out samples that a model may have in the test, as a share of the tolerance
 PARTS = 3  # number of ranges of an input, with equal numbers of steps, whose mean errors are compared
 
@@ -93,9 +94,9 @@ class _Form(NamedTuple):
     def of(cls, errors: Array, x: Array, variances: Array) -> Self:
         """Explain errors (n,) by inputs x (n, 1 + P) with weights of these prior variances.
 
-        Both are whitened: without a shared part, the covariance of the errors is the identity, times an unknown factor.
-        With one it is I + x diag(variances) x', whose inverse and determinant follow from matrices of the size of the
-        weights (Woodbury).
+        Errors and inputs are whitened: without a shared part, the covariance of the errors is the identity, times an
+        unknown factor. With a shared part, it is I + x diag(variances) x', whose inverse and determinant follow from
+        matrices of the size of the weights (Woodbury).
         """
         scales, n = np.sqrt(variances), len(errors)
         precision = np.eye(len(scales)) + scales[:, None] * (x.T @ x) * scales
@@ -127,7 +128,8 @@ class Systematic:
 
     @property
     def evidence(self) -> float:
-        """The evidence against a right model; for a share of at most 1 / a of right models it ever exceeds a."""
+        """The evidence that the errors have a shared part, against the hypothesis that the model is right. If the model
+        is right, the probability that the evidence ever exceeds a is at most 1 / a."""
         return float(np.mean(self._by_output))
 
     @cached_property
@@ -136,16 +138,17 @@ class Systematic:
 
     @cached_property
     def chances(self) -> Array:
-        """The probability (O,) that each output is shifted, if a priori every second model has a single
-        shifted output."""
+        """The probability (O,) that the errors of each output have a shared part (it is shifted). A priori, half of all
+        models are right, and each of the others has one shifted output."""
         odds: Array = self._by_output / len(self.names)
         return odds / (1 + odds)
 
     def draws(self, count: int, rng: np.random.Generator, wrong: NDArray[np.bool_] | None = None) -> Array:
-        """Draw weights (count, O, 1 + P) of the shared error from their posterior; those of an output that is right are
-        0.
+        """Draw ``count`` shared errors from their posterior distribution, as weights (count, O, 1 + P). The weights of
+        an output are 0 in those draws in which it has no shared error.
 
-        Outputs that are ``wrong`` (O,) are always shifted, because the size of their errors has shown it.
+        The outputs in ``wrong`` (O,) have a shared error in all draws, because the size of their errors has shown that
+        the model is wrong.
         """
         size = len(self.inputs.centre) + 1
         weights = np.zeros((count, len(self.names), size))
@@ -158,8 +161,8 @@ class Systematic:
         return weights
 
     def expected(self) -> Array:
-        """Return the mean weights (O, 1 + P) of the outputs that are more likely shifted than not; the
-        others' are 0."""
+        """Return the posterior mean of the weights (O, 1 + P) of the shared errors; 0 for an output that more likely
+        has no shared error."""
         size = len(self.inputs.centre) + 1
         weights = np.zeros((len(self.names), size))
         for o in np.flatnonzero(self.chances > 0.5).tolist():

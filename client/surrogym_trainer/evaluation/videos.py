@@ -80,7 +80,8 @@ def record(spec: EnvironmentSpec, original: str | None, result: Evaluation, capt
 
 
 def _frames(renderer: Renderer, panels: list[_Panel], caption: str, every: int) -> Iterator[Image]:
-    """Yield frames with all episodes side by side, one for each ``every`` steps, or fewer in long episodes."""
+    """Yield frames with all episodes side by side: one frame for each ``every`` steps, or fewer frames in long
+    episodes."""
     steps = max(len(panel.trace.coordinates) for panel in panels)
     faster = math.ceil(steps / MOST_FRAMES)
     words = caption if faster == 1 else f"{caption}; one of {faster} steps is shown"

@@ -29,8 +29,8 @@ LOG_10 = math.log(10)
 
 
 def draw_fidelity(models: Sequence[ModelView], target: float) -> Figure:
-    """Draw the confidence index of every output, and its leave-one-out error in tolerances, against the number of real
-    samples."""
+    """Draw the confidence index of every output, and its leave-one-out error as a multiple of its tolerance, against
+    the number of real samples."""
     figure = Figure(figsize=(WIDTH, WIDTH), layout="constrained")
     sure, wrong = figure.subplots(2, 1, sharex=True)
     names = [output.name for output in models[-1].fidelity.outputs] if models else []
@@ -49,8 +49,8 @@ def draw_fidelity(models: Sequence[ModelView], target: float) -> Figure:
 
 
 def _in_tolerances(output: OutputFidelity) -> float:
-    """Return the leave-one-out error of an output in tolerances; NaN, which is not drawn, if the family of models can't
-    compute it."""
+    """Return the leave-one-out error of an output as a multiple of its tolerance. It is NaN, which is not drawn, if the
+    family of models can't compute it."""
     error = output.leave_one_out_error
     return math.nan if error is None else max(error / output.tolerance, SMALLEST)
 
@@ -107,7 +107,8 @@ def draw_coverage(coverage: Coverage) -> Figure:
 
 
 def draw_maps(view: SurrogateView, cuts: Sequence[Cut]) -> Figure:
-    """Draw uncertainty, occupancy and the design's index over two coordinates, one row for each cut."""
+    """Draw three maps over two coordinates for each cut: the model's uncertainty, how often policies visit a state
+    (occupancy), and the index by which the design chooses queries."""
     figure = Figure(figsize=(1.5 * WIDTH, 0.45 * WIDTH * len(cuts)), layout="constrained")
     rows = figure.subplots(len(cuts), 3, squeeze=False)
     for row, cut in zip(rows, cuts, strict=True):

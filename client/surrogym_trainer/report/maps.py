@@ -23,7 +23,8 @@ SIDE = 33
 
 @dataclass(frozen=True)
 class Cut:
-    """A map over the coordinates with the indices ``across`` and ``up``. Each value is the largest over the outputs."""
+    """Maps of the model over two coordinates, whose indices are ``across`` and ``up``. The uncertainty and the index
+    are the largest over the outputs."""
 
     across: int
     up: int

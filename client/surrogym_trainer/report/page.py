@@ -181,7 +181,8 @@ def _structure(model: ModelView, spec: EnvironmentSpec) -> str:
 
 
 def _without_angles(described: Any) -> Any:
-    """Return a description whose input maps are not called ``cos_sin``, for an environment without angles."""
+    """Return a model's description in which the input map ``cos_sin`` is called ``coordinates``, for an environment
+    without angles."""
     if isinstance(described, str):
         return described.replace("cos_sin", "coordinates")
     if isinstance(described, dict):

@@ -33,12 +33,15 @@ from surrogym_trainer.training.trainer import train
 class AuditedTraining:
     """Train a policy, audit it, and hand it over.
 
-    If an audit fails, further steps are taken in states that the policy visits, as far as the budget or unused rounds
-    of the closed loop allow; then the training continues, and the policy is audited again. Such a round is also taken
-    after a passed audit if the promise is wide, or if the model that has learned from it is no longer certain there.
-    The training also continues if the model that has learned from an audit promises clearly less than the training
-    imagined, or than the model before, unless the user limited the virtual steps. This takes no step of the budget. In
-    all other cases the policy is handed over, also with a failed audit.
+    After each audit, one of these things happens.
+
+    - If the audit failed, real steps are taken in states that the policy visits, as far as the budget or unused rounds
+      of the closed loop allow. Then the training continues, and the policy is audited again.
+    - The same happens after a passed audit if a round of the closed loop is unused and the promised interval is wide,
+      or the model, which has learned from the audit, is no longer certain in these states.
+    - The training also continues if the promise after the audit is clearly lower than the one before it, or than the
+      imagined return of the training, unless the user limited the virtual steps. This takes no step of the budget.
+    - In all other cases the policy is handed over, even if the audit failed.
 
     Attributes:
         api: the connection to the server.
@@ -129,9 +132,9 @@ class AuditedTraining:
         """Take the remaining steps of the budget, or an unused round of the closed loop, in states that the policy
         visits.
 
-        Unless they are ``needed`` anyway, the steps are only taken if the model is not certain in these states. Only a
-        token of the role admin may raise the budget for such a round. Returns whether the number of real steps in the
-        budget is now larger than ``taken``.
+        If ``needed`` is false, the steps are only taken if the model is not certain in these states. Only a token of
+        the role admin may raise the budget for such a round. Returns whether more than ``taken`` real steps have been
+        counted by now.
         """
         view = self.api.surrogate(self.name)
         if not needed and view.phase == "ready" and (view.confidence_index or 0.0) >= view.target:

@@ -36,11 +36,12 @@ class Checks:
         self.latest: float | None = None  # imagined return of the last check
         self.returns_of_best: Returns | None = None  # (episodes,) returns of the best policy so far
         self._half_way = self.untrained if saved is None else (self.untrained + float(saved.mean())) / 2
-        # returns that the best quarter exceeds: untrained, and the highest so far
+        # the return that the best quarter of the episodes reaches: of an untrained network (few), and the highest so
+        # far (many)
         self._few = self._many = _of_many(untrained)
         self._seen = self.untrained  # highest return of a training episode
         self._most = float(untrained.max())  # highest return of an episode of a check
-        self._full = 0  # number of checks in a row with the highest possible return
+        self._full = 0  # number of checks in a row in which every episode had the highest return so far
 
     @property
     def best(self) -> float | None:
@@ -84,7 +85,8 @@ class Checks:
 
     def gained(self, before: Returns | None) -> bool:
         """Return whether the best policy gains clearly over an earlier one, from the same starts: the mean of the
-        paired differences exceeds twice its standard error, and ``GAIN`` of the gain over an untrained network.
+        paired differences exceeds twice its standard error, and also ``GAIN`` times the best policy's gain over an
+        untrained network.
 
         Args:
             before: returns (episodes,) of the earlier policy; None stands for an untrained network.

@@ -27,7 +27,7 @@ from surrogym_trainer.training.trainer import train
 
 ROUND_SHARE = 0.25  # virtual steps of each round before the last, as a share of a whole training
 VISIT_LANES = 32
-VISIT_STEPS = 1_000  # number of steps of a visit if the specification has no time limit
+VISIT_STEPS = 1_000  # number of steps in which a round collects visited states, if the specification has no time limit
 
 
 @dataclass(frozen=True)

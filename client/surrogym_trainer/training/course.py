@@ -10,8 +10,8 @@ from surrogym_trainer.training.settings import TrainProgress
 class Course:
     """The share of a training that is done.
 
-    A training may be extended: by a round, after an audit, or because it still gains. The rest of the bar then stands
-    for the steps that are left, so that the share never falls.
+    A training may be extended: by a round, after an audit, or because it still gains. The part that is not done then
+    stands for all steps that are left, so that the share never falls.
     """
 
     def __init__(self) -> None:

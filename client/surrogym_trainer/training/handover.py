@@ -154,8 +154,8 @@ def take(
 ) -> Audit | None:
     """Take the real steps of an audit, fit the model to them, and judge the model.
 
-    More steps are taken, up to ``MOST_STEPS``, as long as no test has failed but the errors so far may have a part that
-    all steps share and that moves the return out of the promise. Returns None if there was no step to take. If the
+    If no test has failed, but the errors may have a part that all steps share and that moves the return out of the
+    promised interval, more steps are taken, up to ``MOST_STEPS``. Returns None if there was no step to take. If the
     original environment failed to take all steps, the audit has failed.
 
     Args:
@@ -196,8 +196,8 @@ def take(
 def judge_episodes(subject: Subject, result: Evaluation) -> Handover:
     """Judge a policy's promise by whole real episodes: by their steps, and by their returns.
 
-    If no state can be set, this tests what single steps can't reach: the goal, and what happens on the way to it. The
-    model does not learn from the steps.
+    If the environment can't be set to states, the single steps of an audit don't reach the goal, nor all states on the
+    way to it. Whole episodes test these too. The model does not learn from the steps.
 
     Raises:
         SurrogymClientError: the server refused a request, or has no model yet.
@@ -272,10 +272,10 @@ def _asked_more(subject: Subject, settings: AuditSettings, q: Array, u: Array) -
 def _asked(subject: Subject, settings: AuditSettings, q: Array, u: Array, *, claims: bool) -> tuple[set[int], set[int]]:
     """Add the queries of an audit, in some of the states q (m, C) that the policy visits, with its actions u (m, F).
 
-    If the design ``claims`` to know the whole sampling range, one query in ``ELSEWHERE`` is in a gap of its samples
-    instead, because an error of the model there may have kept the policy away. If the environment can't be set to a
-    state, the query is the sequence of actions of one imagined episode, which is whole if the surrogate's audits may
-    take that many steps. Returns the queries' ids, and the ids of those in gaps.
+    If the design ``claims`` to know the whole sampling range, one of every ``ELSEWHERE`` queries is in a gap between
+    its samples instead, because an error of the model in the gap may have kept the policy away. If the environment
+    can't be set to a state, there is one query: the actions of one virtual episode. The episode is whole if the
+    surrogate's audits may take that many steps. Returns the queries' ids, and the ids of those in gaps.
     """
     spec, rng = subject.port.spec(), np.random.default_rng(settings.seed)
     if spec.query == "rollout":
@@ -297,8 +297,8 @@ def _asked(subject: Subject, settings: AuditSettings, q: Array, u: Array, *, cla
 
 
 def length_of_rollout(view: SurrogateView, steps: int) -> int:
-    """Return the number of real steps of an audit from a reset: those of a whole episode, or its share of what audits
-    may take, at least ``steps``."""
+    """Return the number of real steps of an audit that begins with a reset: a whole episode or, if that is shorter, one
+    audit's share of the steps that all audits may take. It is at least ``steps``, unless an episode is shorter."""
     spec = view.spec
     longest = min(spec.time_limit or LONGEST_EPISODE, spec.max_rollout or LONGEST_EPISODE)
     share = max(view.budget, LEAST_AUDITED) // MOST_AUDITS
@@ -311,7 +311,8 @@ def _left_for_audits(view: SurrogateView) -> int:
 
 
 def _in_gaps(subject: Subject, count: int) -> tuple[Array, Array]:
-    """Return states (count, C) and actions (count, F) of the ranges, in the widest gaps of the samples."""
+    """Return states (count, C) and actions (count, F) within the sampling ranges that are in the widest gaps between
+    the samples."""
     spec = subject.port.spec()
     random = replace(subject, predict=baseline(spec, "random", subject.seed))
     q, u = way_of(random, ANYWHERE, 1, start_box=1.0)

@@ -76,7 +76,7 @@ class Found:
 
 
 class PolicySearch(ABC):
-    """A method to find a policy. Its hyperparameters are the arguments of its class.
+    """A method to find a policy. The constructor's arguments are the hyperparameters of the method.
 
     Examples:
         >>> @dataclass(frozen=True)

@@ -53,7 +53,8 @@ class TrainSettings:
     # folder of TensorBoard's files; None takes one beside the policy, if the tracker has such files
     tensorboard: Path | None = None
     session: dict[str, Any] = field(default_factory=dict)
-    judge: dict[str, Any] | None = None  # session fields for comparing policies; None takes those of the training
+    # session fields of the episodes that compare policies; None takes those of the training
+    judge: dict[str, Any] | None = None
     hyperparameters: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -62,8 +63,8 @@ class TrainSettings:
 
     @property
     def learning(self) -> dict[str, Any]:
-        """The session fields of the lanes in which a policy learns. If a share of the episodes starts at visited
-        states, none starts anywhere in the range by default."""
+        """The session fields of the lanes in which a policy learns. By default, a share of the episodes starts anywhere
+        in the sampling range, or none if some episodes start at the states of real steps."""
         usual = START_BOX if self.start_visited is None else 0.0
         fields: dict[str, Any] = {"seed": self.seed, "start_box": usual if self.start_box is None else self.start_box}
         if self.start_visited is not None:

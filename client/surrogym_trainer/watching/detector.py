@@ -34,15 +34,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 FALSE_ALARM_STEPS = 10_000  # average number of steps until a false alarm
-SHIFTS = (0.5, 1.0, 2.0)  # sizes of a shift of the errors, in standard deviations
-SPREADS = (0.25, 0.5)  # parameters g of a spread; the evidence grows most if the errors' variance is 1 / (1 - g)
+SHIFTS = (0.5, 1.0, 2.0)  # sizes of a change of the mean error that are tested, in standard deviations
+SPREADS = (0.25, 0.5)  # tested increases of the errors' variance: by a factor of 1 / (1 - g) for each g
 BIAS = 3.0  # standard deviations of the model up to which a mean error counts as the model's own
-SHARE = 1.5  # factor on the model's standard deviation in that of the error
+SHARE = 1.5  # factor on the model's standard deviation, which together with the noise gives that of an error
 MOST = 4.0  # standard deviations to which an error is limited, so that one spike gives no alarm
 OUTLYING = 3.0  # standard deviations to which an error is limited before mean and noise are learned from it
-NOISE_STEPS = 20.0  # weight of the error on left-out samples in the noise, in steps
-PAID_STEPS = 100.0  # weight of the prior that a bet pays 1 on average, in steps
-MOST_PAID = 1.5  # largest average payment of a bet by a stream without a change
+NOISE_STEPS = 20.0  # for the noise, the model's error on left-out samples counts as much as this number of steps
+PAID_STEPS = 100.0  # a bet's average factor on the evidence begins as if it had been 1 in this number of steps
+# largest average factor of a bet on the evidence that is attributed to heavy tails of the noise, not to a change
+MOST_PAID = 1.5
 NEGLIGIBLE = 0.1  # share of the tolerance below which an error is negligible
 
 Array = NDArray[np.float64]
@@ -53,7 +54,7 @@ class Drift(NamedTuple):
 
     Attributes:
         output: index of the output with the largest evidence.
-        shifted: whether its errors have a new mean; otherwise they are only larger than before.
+        shifted: whether the errors of this output have a new mean; otherwise they are only larger than before.
         steps: number of latest steps that show the change.
     """
 
@@ -71,7 +72,7 @@ class Detector:
         Args:
             claimed: error (O,) of the model on left-out samples, which includes the noise.
             tolerance: error (O,) that is too small to matter.
-            false_alarm_steps: smallest average number of steps until a false alarm.
+            false_alarm_steps: the average number of steps until a false alarm is at least this.
         """
         self._least = NEGLIGIBLE * tolerance
         self._alarm = false_alarm_steps
@@ -79,16 +80,21 @@ class Detector:
         self._squares = NOISE_STEPS * np.maximum(claimed, self._least) ** 2
         count = 2 * len(SHIFTS) + len(SPREADS)
         half = [1 / (4 * len(SHIFTS))] * (2 * len(SHIFTS)) + [1 / (2 * len(SPREADS))] * len(SPREADS)
-        self._weights = np.array(half) / len(claimed)  # (B,) weights of the bets: half on shifts, half on spreads
-        self._evidence = np.zeros((len(claimed), count))  # (O, B) evidence M of each bet
-        self._paid = np.full((len(claimed), count), PAID_STEPS)  # (O, B) sum of what each bet has paid
-        self._run = np.zeros((len(claimed), count))  # (O, B) logarithm of the evidence since the likeliest change
-        self._begun = np.zeros((len(claimed), count), dtype=np.int64)  # (O, B) step of that change
+        # (B,) weights of the bets: half on a changed mean, half on a larger variance
+        self._weights = np.array(half) / len(claimed)
+        self._evidence = np.zeros((len(claimed), count))  # (O, B) evidence of each bet for a change at any step so far
+        # (O, B) sum over the steps of each bet's factor on the evidence
+        self._paid = np.full((len(claimed), count), PAID_STEPS)
+        # (O, B) logarithm of the evidence since the step at which a change most likely began
+        self._run = np.zeros((len(claimed), count))
+        # (O, B) the step at which a change most likely began
+        self._begun = np.zeros((len(claimed), count), dtype=np.int64)
         self.steps = 0
 
     @property
     def evidence(self) -> float:
-        """The evidence for a change at any step so far; the alarm is at ``false_alarm_steps``."""
+        """The evidence that the errors have changed at any of the steps so far. There is an alarm once it reaches
+        ``false_alarm_steps``."""
         return float((self._evidence * self._weights).sum())
 
     def step(self, error: Array, deviation: Array) -> Drift | None:
@@ -101,7 +107,7 @@ class Detector:
         known = np.isfinite(error)
         uncertain = np.hypot(deviation, self._least)
         noise = np.sqrt(self._squares / (NOISE_STEPS + self._known_steps))
-        # posterior mean given the errors, with the prior N(0, d^2)
+        # posterior mean of the errors, with the prior N(0, d^2), where d is the model's standard deviation
         mean = self._sum / (self._known_steps + (noise / uncertain) ** 2)
         mean = mean.clip(-BIAS * uncertain, BIAS * uncertain)
         beyond = np.where(known, error - mean, 0.0)
@@ -117,7 +123,8 @@ class Detector:
         return self._found() if self.evidence >= self._alarm else None
 
     def _learn(self, known: NDArray[np.bool_], mean: Array, beyond: Array, noise: Array) -> None:
-        """Update the estimated mean and noise of the errors. Outliers, such as after a change, are limited."""
+        """Update the estimated mean and noise of the errors. Large errors are limited before, so that a change or an
+        outlier does not count as noise."""
         limited = beyond.clip(-OUTLYING * noise, OUTLYING * noise)
         self._sum += np.where(known, mean + limited, 0.0)
         self._squares += np.where(known, limited**2, 0.0)
@@ -130,7 +137,8 @@ class Detector:
 
 
 def _log_bets(z: Array) -> Array:
-    """Return the logarithms (O, B) of the evidence in standardised errors z (O,)."""
+    """Return the logarithms (O, B) of the evidence that standardised errors z (O,) of one step give for each of B kinds
+    of change, such as a shift of a certain size (a bet)."""
     z = z.clip(-MOST, MOST)[:, None]
     shifts, spreads = np.array([sign * size for sign in (1, -1) for size in SHIFTS]), np.array(SPREADS)
     return np.concatenate([shifts * z - shifts**2 / 2, 0.5 * np.log(1 - spreads) + spreads * z**2 / 2], 1)

@@ -101,7 +101,7 @@ class Watcher:
         Args:
             api: the connection to the server.
             view: the surrogate, which has a model.
-            false_alarm_steps: smallest average number of real steps until a false alarm.
+            false_alarm_steps: the average number of real steps until a false alarm is at least this.
         """
         self._api, self._view = api, view
         self._false_alarm_steps = false_alarm_steps
@@ -119,7 +119,8 @@ class Watcher:
 
     @property
     def evidence(self) -> float:
-        """The evidence for a drift now; the alarm is at ``false_alarm_steps``."""
+        """The evidence so far that the real steps have drifted from the model. There is an alarm once it reaches
+        ``false_alarm_steps``."""
         return 0.0 if self._detector is None else self._detector.evidence
 
     def take(self, steps: Sequence[StepOfEpisode]) -> Alarm | None:
@@ -180,8 +181,9 @@ class Watcher:
         )
 
     def _region(self, errors: Array, inputs: Array) -> Region | None:
-        """Return the quarter of an input's range in which the squared errors (n,) are concentrated more than the
-        stream's steps; if there is none, the quarter with most of the squared errors."""
+        """Return the quarter of an input's range that most likely explains the errors (n,). It is the quarter where the
+        squared errors are concentrated most, compared with the steps of the whole stream. If no quarter stands out, it
+        is the one with most of the squared errors."""
         if not self._inputs:
             return None
         quarters, weight = self._quarters(inputs), errors**2 / max(float((errors**2).sum()), 1e-300)
@@ -197,8 +199,8 @@ class Watcher:
         )
 
     def _quarters(self, inputs: Array) -> NDArray[np.intp]:
-        """Return the quarters (n, K), from 0, of the K inputs with a range in inputs (n, C + F). Values outside count
-        to the outer quarters."""
+        """Return in which quarter of its range, from 0, each of the K inputs with a range is, (n, K), for inputs (n, C
+        + F). Values outside of a range count as in its first or last quarter."""
         names = [*self._view.spec.coordinate_names, *_actions(self._view.spec)]
         columns = inputs[:, [names.index(name) for name, _, _ in self._inputs]]
         low, high = (np.array([one[end] for one in self._inputs]) for end in (1, 2))

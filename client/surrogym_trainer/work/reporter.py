@@ -31,7 +31,7 @@ class Stand:
     share: float = 0.0
     now: TrainProgress | None = None
     curve: tuple[wire.CurvePoint, ...] = ()
-    # progress of the training, shared by all stands of a job
+    # progress of the training; all stands (states of progress) of a job share this object
     course: Course = field(default_factory=Course, compare=False)
 
     def trained(self, now: TrainProgress, seconds: float) -> Stand:

@@ -40,7 +40,7 @@ class Environment:
         spec: its specification.
         opener: opens an episode in it.
         most_episodes: largest number of real episodes in one job.
-        name: name by which its states are drawn; empty if there are no pictures.
+        name: name of the environment that draws pictures of its states; empty if there are no pictures.
         reference: loads the reference controller for one job; None if there is none.
     """
 

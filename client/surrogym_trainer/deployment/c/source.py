@@ -78,7 +78,7 @@ def stack_of(controller: Controller) -> int:
 
 
 def parts_of(controller: Controller, prefix: str) -> dict[str, str]:
-    """Return the parts of the C source, by their names in the template. ``prefix``: of all C names."""
+    """Return the parts of the C source, by their names in the template. All C names begin with ``prefix``."""
     body = {
         "observation": _observation(controller.observation),
         "place": _place(controller),

@@ -163,7 +163,8 @@ def add(total: Floats, more: Floats) -> None:
 
 @inlined
 def slope_of(log: np.float32, before: np.float32, advantage: np.float32, clip: np.float32) -> np.float32:
-    """Return the derivative of a row's loss by its log probability; it is zero if the ratio is clipped."""
+    """Return the derivative of a row's loss with respect to its log probability; 0 if the probability ratio is
+    clipped."""
     ratio = np.float32(math.exp(log - before))
     free = ratio <= ONE + clip if advantage > NONE else ratio >= ONE - clip
     return -advantage * ratio if free else NONE
@@ -181,8 +182,8 @@ def bounded(
     further: Floats,
     by_further: Floats,
 ) -> None:
-    """Replace the outputs y (n, F) for continuous actions by the loss's derivatives by them, and add its derivatives by
-    the log deviations to ``by_further`` (F,)."""
+    """Replace the outputs y (n, F) for continuous actions by the derivatives of the loss with respect to these outputs.
+    Add its derivatives with respect to the logarithms of the standard deviations to ``by_further`` (F,)."""
     inverse = np.empty_like(further)
     for j in range(further.size):
         inverse[j] = math.exp(-further[j])
@@ -214,7 +215,8 @@ def log_softmax(scores: Floats) -> None:
 
 @compiled
 def choices(y: Floats, actions: Floats, logs: Floats, advantages: Floats, clip: np.float32, counts: Ints) -> None:
-    """Replace the outputs y (n, A) for discrete actions by the loss's derivatives by them."""
+    """Replace the outputs y (n, A) for discrete actions by the derivatives of the loss with respect to these
+    outputs."""
     for i in range(len(y)):
         log, begin = NONE, 0
         for k in range(counts.size):

@@ -70,7 +70,7 @@ class Batch:
 
     observations: Array  # (B, D) standardised observations
     actions: Array  # (B, F) actions taken
-    log_probabilities: Array  # (B,) of the actions when they were taken
+    log_probabilities: Array  # (B,) log probabilities of the actions when they were taken
     advantages: Array  # (B,) estimated advantages
     returns: Array  # (B,) targets of the critic, from scaled rewards
 
@@ -163,8 +163,8 @@ class Learner:
         self._adam(objective.max_grad_norm, rate)
 
     def limit_noise(self, logarithms: Array, share: float) -> None:
-        """Lower the standard deviations of continuous actions to at most ``share`` of other ones, whose ``logarithms``
-        (F,) are given."""
+        """Lower the standard deviations of continuous actions to at most ``share`` times given standard deviations,
+        whose ``logarithms`` (F,) are passed."""
         np.minimum(self.further, logarithms + np.float32(np.log(share)), out=self.further)
 
     def _adam(self, largest: float, rate: float) -> None:
@@ -188,13 +188,14 @@ class Learner:
         self.restore(learned.state)
 
     def standardise_anew(self, x: Array, rng: np.random.Generator) -> None:
-        """Standardise inputs by other observations, without a change of the actor's outputs.
+        """Standardise inputs by the mean and the standard deviation of other observations. The actor's outputs don't
+        change.
 
         The critic and Adam's moments start afresh.
 
         Args:
-            x: these observations (B, D), standardised as before. Each new deviation is at least ``NARROWEST`` of the
-                previous one.
+            x: the other observations (B, D), standardised by the previous mean and standard deviation. Each new
+                deviation is at least ``NARROWEST`` of the previous one.
             rng: generator of the critic's initial parameters.
         """
         middle, spread = x.mean(0), np.maximum(x.std(0), NARROWEST)

@@ -66,7 +66,8 @@ class Mlp:
                 slope = self._through(before, x, number)
 
     def _through(self, slope: Array, y: Array, number: int) -> Array:
-        """Return the derivative by the activation's input, given that by its output y."""
+        """Return the derivative of a loss with respect to the input of a layer's activation. ``slope`` is its
+        derivative with respect to the activation's output y."""
         if self.activation == "relu":
             slope *= y > 0
             return slope
