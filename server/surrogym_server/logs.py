@@ -40,7 +40,8 @@ class _JsonFormatter(logging.Formatter):
 
 
 def configure(level: str, form: LogFormat) -> None:
-    """Send all log records of this process to standard error, from ``level`` on, as text or JSON."""
+    """Send all log records of this process that have at least the level ``level`` to standard error, as text or
+    JSON."""
     handler = logging.StreamHandler()
     handler.setFormatter(_JsonFormatter() if form == "json" else _TextFormatter())
     root = logging.getLogger()

@@ -109,8 +109,8 @@ def in_one_line(error: BaseException) -> str:
 
 
 def _check_settings(kind: type, settings: dict[str, float | bool | str]) -> None:
-    """Check settings against the fields of a class. Raises ``ValueError`` for an unknown, missing or wrongly
-    typed one."""
+    """Check settings against the fields of a class. Raises ``ValueError`` if a setting is unknown, is missing, or has a
+    wrong type."""
     fields = [field for field in dataclasses.fields(kind) if field.init] if dataclasses.is_dataclass(kind) else []
     names = ", ".join(field.name for field in fields)
     if unknown := sorted(set(settings) - {field.name for field in fields}):

@@ -69,12 +69,13 @@ async def events(
 
 
 def _stream(request: Request, lines: AsyncIterator[str]) -> StreamingResponse:
-    """Return a streaming response of these lines. Raises ``Overloaded`` if the token has too many open streams."""
+    """Return a streaming response of text lines. Raises ``Overloaded`` if the token of the request has too many open
+    streams."""
     streams: Waiting = request.app.state.streams
     streams.require_room(request)
 
     async def counted() -> AsyncIterator[str]:
-        with streams.count(request):  # counted here, so that only a stream that has begun counts
+        with streams.count(request):  # inside the generator, so that only a stream that has begun counts
             yield CONNECTED
             async for text in lines:
                 yield text
@@ -94,7 +95,8 @@ async def _lines(pages: AsyncIterator[Page | None]) -> AsyncIterator[str]:
 
 @lru_cache(maxsize=8)
 def _text(page: Page) -> str:
-    """Return a page of events as text of a stream; cached, because all streams of a surrogate send the same page."""
+    """Return a page of events as the text of an event stream. It is cached, because all streams of a surrogate send the
+    same page."""
     return "".join(
         f"id: {record.id}\nevent: {record.kind}\ndata: {resources.event(record).model_dump_json()}\n\n"
         for record in page.events

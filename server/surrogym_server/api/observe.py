@@ -61,7 +61,8 @@ class Observed:
             await self._app(scope, receive, send)
             return
         id = _id_of(scope)
-        # The id need not be reset, because each request has its own task. The handler of unexpected errors reads it.
+        # The id need not be reset, because each request has its own task. The handler of unexpected errors reads the
+        # id later.
         REQUEST_ID.set(id)
         started, status = time.perf_counter(), FAILED
         headers = (*_FOR_BROWSERS, (_HEADER, id.encode()))

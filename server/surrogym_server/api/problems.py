@@ -85,7 +85,8 @@ async def answer_to(request: Request, error: Exception) -> Response:
 
 
 def code_of(error: errors.SurrogymError) -> Code:
-    """Return the error code of an exception: that of its class, or else of its nearest base class in ``CODES``."""
+    """Return the error code of an exception: the code of its class, or else the code of its nearest base class that is
+    in ``CODES``."""
     return next(CODES[cls] for cls in type(error).__mro__ if cls in CODES)
 
 

@@ -78,7 +78,7 @@ def renew(name: str, query_id: int, body: Annotated[RenewLease, example(examples
 @router.post("/queries/{query_id}:fail", summary="Give a query back", dependencies=[SAMPLE], responses=LEASE_ERRORS)
 def fail(name: str, query_id: int, body: Annotated[FailQuery, example(examples.FAIL)], use: Use) -> QueryView:
     """End the lease of a query that could not be answered, with an error. Another sampler may then claim the query. A
-    query that fails repeatedly is set aside, and the design continues without it."""
+    query that fails repeatedly is set aside (not leased again), and the design continues without it."""
     return resources.query_view(
         use.queries.fail(name, query_id, body.lease_token, body.error, begun=body.begun, refused=body.refused)
     )

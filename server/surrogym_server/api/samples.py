@@ -112,8 +112,8 @@ def drop_snapshots(
     responses=documented(Code.UNKNOWN_SURROGATE, Code.IDEMPOTENCY_CONFLICT, Code.INVALID_REQUEST),
 )
 def report(name: str, body: Annotated[ReportSteps, example(examples.LEDGER)], use: Use) -> Ledger:
-    """Report real steps of an evaluation, which are counted separately from those of the design. Each idempotency key
-    counts once."""
+    """Report real steps of an evaluation, which are counted separately from those of the design. Reports with the same
+    idempotency key count once."""
     return resources.ledger(use.samples.report_steps(name, body.steps, body.episodes, body.note, body.idempotency_key))
 
 

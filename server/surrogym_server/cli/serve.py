@@ -152,7 +152,7 @@ def serve(
 
 
 def _refuse_options_of_ray(given: Mapping[str, Any]) -> None:
-    """Raise ``InvalidInput`` if an option for Ray is given, but the engine is another. Environment variables for Ray
+    """Raise ``InvalidInput`` if an option for Ray is given, but another engine is chosen. Environment variables for Ray
     are ignored."""
     for name in ("ray_address", "ray_hosts"):
         if given[name] is not None:

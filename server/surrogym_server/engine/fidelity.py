@@ -52,7 +52,7 @@ def fidelity_of(model: DynamicsModel, defaults: Sequence[float], target: float) 
     Args:
         model: the model.
         defaults: (O,) tolerances for outputs without a declared one. If empty, as before the first round of a design,
-            they are computed from the model's own scales.
+            they are computed from the scales of the model's outputs.
         target: confidence index that the design aims at.
     """
     defaults = defaults or default_tolerances(model.definition, model.scales.tolist())

@@ -126,7 +126,7 @@ class SessionEngine(ABC):
 
         Raises:
             InvalidInput: the session was saved by another version of this program.
-            UnknownSession: the session's surrogate was deleted, and another one has its name.
+            UnknownSession: the session's surrogate was deleted, and another surrogate now has the same name.
             Damaged: the saved bytes have changed.
             TooLarge, Overloaded: the session exceeds a limit of the engine.
         """

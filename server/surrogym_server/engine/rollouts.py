@@ -54,8 +54,8 @@ def roll_policy(session: Session, run: PolicyRun, step: OneStep) -> tuple[Sessio
     """Take steps with the actions of a policy; either all steps are taken or none. ``step`` takes one step.
 
     Raises:
-        InvalidInput: the policy's observation or action size differs from the session's, ``until`` has not one entry
-            for each lane, or actions are not finite.
+        InvalidInput: the policy's observation or action size differs from the session's, ``run.until`` does not have
+            one entry for each lane, or actions are not finite.
         TooLarge: the number of steps times lanes, or of a layer's units times lanes, is too large.
     """
     definition, lanes = session.definition, session.settings.num_envs

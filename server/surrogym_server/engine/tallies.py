@@ -86,7 +86,7 @@ class Tally:
         self._seq = 0
         self._pending: list[StepResult | PolicyRollout] = []
         self._unfolded = 0  # number of steps in ``_pending``
-        self._sums: NDArray[np.float64] | None = None  # (2, N) reward and penalty of the running episodes
+        self._sums: NDArray[np.float64] | None = None  # (2, N) sums of reward and of penalty in the running episodes
         self._steps = 0
         self._episodes = 0
         self._recent: deque[Episode] = deque(maxlen=KEPT_EPISODES)

@@ -96,7 +96,8 @@ def _require(name: str, lack: str | None) -> None:
 
 
 def check_coordinates(definition: EnvironmentDefinition, what: str, rows: Array) -> Array:
-    """Return ``rows`` if they are coordinates of shape (n, C), else raise ``InvalidInput``; ``what`` names them."""
+    """Return ``rows`` if they are coordinates of shape (n, C), else raise ``InvalidInput``; ``what`` is their name in
+    the message."""
     names = definition.coordinate_names
     if rows.ndim != 2 or rows.shape[1] != len(names):
         raise InvalidInput(f"{what}: expected (n, {len(names)}), one entry for each of {list(names)}, got {rows.shape}")

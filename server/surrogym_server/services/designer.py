@@ -185,7 +185,8 @@ class Designer:
         Args:
             name: name of the surrogate.
             queries: number of real steps of these queries.
-            checkpoint: name of the submitted occupancy that weights the queries; None for the latest one, if any.
+            checkpoint: name of the submitted occupancy (visited states) that weights the queries; None for the latest
+                one, if any.
             key: idempotency key of the request.
             raise_budget: whether to raise the budget as far as the queries need.
 

@@ -29,13 +29,14 @@ class Page:
 
 
 class EventService:
-    """Streams of events. When new events come, one read serves all streams that wait for the same surrogate."""
+    """Streams of events. When new events come, they are read once from the database for all streams that wait for the
+    same surrogate."""
 
     def __init__(self, storage: Storage, notices: Notices) -> None:
         self._storage = storage
         self._notices = notices
         self._turn = asyncio.Semaphore(READING)
-        self._shared: dict[str, tuple[tuple[int, int], asyncio.Task[Page]]] = {}  # last page by surrogate
+        self._shared: dict[str, tuple[tuple[int, int], asyncio.Task[Page]]] = {}  # last page of each surrogate
 
     async def newest(self, name: str) -> int:
         """Return the id of a surrogate's last event, 0 if it has none. Raises ``UnknownSurrogate``."""

@@ -67,7 +67,8 @@ class Notices:
         self._announcements.listen(self._hear)
 
     def post(self, surrogate: str) -> None:
-        """Wake the listeners to this surrogate and those to all surrogates, in every server of the database."""
+        """Wake the listeners to this surrogate and the listeners to all surrogates, in every server that uses the
+        database."""
         self._hear(surrogate)
         self._announcements.announce(surrogate)
 

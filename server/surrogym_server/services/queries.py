@@ -104,7 +104,8 @@ class QueryService:
             InvalidInput: a wrong shape, a value out of bounds, or a kind of query that the original environment can't
                 answer.
             IdempotencyConflict: the same key came with other queries.
-            BeyondBudget: all audits of the surrogate together would take more real steps than its budget.
+            BeyondBudget: all audits of the surrogate together would take more real steps than its budget, and more than
+                128.
         """
         definition = self._definitions.get(name)
         kinds = {query.kind for query in queries}

@@ -429,7 +429,8 @@ class Models(ABC):
     def set_aside(self, name: str, version: int, damage: str) -> bool:
         """Mark a model version as damaged, so that the version before it is used instead, and a fit becomes due.
 
-        ``damage`` describes the damage. Returns False if the version was marked before. Its number is not used again.
+        ``damage`` describes the damage. Returns False if the version was marked before. The number of the version is
+        not used again.
         """
 
     @abstractmethod

@@ -103,7 +103,7 @@ class PromptMessages(WebSocketsSansIOProtocol):
         if self.close_sent:  # an invalid frame has closed the connection while the app answered an earlier message
             raise ClientDisconnected
         await super().send(message)
-        self.handshake_complete |= self.close_sent  # else uvicorn would log an error after a refusal
+        self.handshake_complete |= self.close_sent  # else uvicorn would log that a refused handshake is incomplete
 
     def _refuse_handshake(self) -> None:
         """Answer a WebSocket handshake that can't be read. uvicorn would leave the connection open without a reply."""

@@ -48,7 +48,7 @@ class StepStream:
             return
         await send({"type": "websocket.accept"})
         if (offered := scope.get("extensions", {}).get(EXTENSION)) is not None:
-            within = copy_context()  # log lines carry the id of the connection's request
+            within = copy_context()  # so that log lines have the id of the connection's request
             offered(lambda content: within.run(_at_once, engine, limit, id, shape, content))
         while (message := await receive())["type"] == "websocket.receive":
             reply = await _reply(engine, limit, id, shape, message.get("bytes"))
@@ -64,7 +64,11 @@ def _admit(scope: Scope) -> None:
 
 
 def _at_once(engine: SessionEngine, limit: float | None, id: str, shape: frames.Shape, content: bytes) -> bytes | None:
-    """Answer one message if that needs no waiting; otherwise do nothing and return None."""
+    """Answer one message if that needs no waiting; otherwise do nothing and return None.
+
+    ``limit`` is how long the client waits for a reply, in seconds (None: without limit). ``shape`` has the sizes of the
+    session's arrays.
+    """
     try:
         frame = frames.read_request(content)
     except frames.FrameError:

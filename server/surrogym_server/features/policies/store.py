@@ -251,7 +251,7 @@ def _without_owner(card: JSON) -> JSON:
 
 
 def _make_place(connection: Connection, surrogate: int, version: int, name: str) -> Freed:
-    """Remove policies without an alias, except ``version``, until the surrogate has ``MAX_POLICIES``.
+    """Remove policies without an alias, except ``version``, until the surrogate has at most ``MAX_POLICIES`` policies.
 
     Returns the names of blobs that are no longer needed. Raises ``TooLarge`` if too many policies have aliases.
     """

@@ -299,12 +299,12 @@ class RayEngine(SessionEngine):
 
 
 def _number(owner: str) -> int:
-    """Return the number of a session host, given its name as an owner of leases."""
+    """Return the number of a session host, given the name under which it owns leases."""
     return int(owner.split()[0])
 
 
 def _pool(owner: str) -> str:
-    """Return the pool of a session host, given its name as an owner of leases."""
+    """Return the id of the pool of a session host, given the name under which the host owns leases."""
     return owner.split()[1]
 
 

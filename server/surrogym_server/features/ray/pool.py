@@ -62,7 +62,7 @@ def connect(settings: Settings, storage: Storage) -> SessionEngine:
         ray.init(settings.ray_address, namespace=NAMESPACE, ignore_reinit_error=True, **quiet)
     except ConnectionError as error:
         raise InvalidInput(f"engine ray: {no_cluster(settings.ray_address)}") from error
-    except RuntimeError as error:  # among others, the versions of Ray or Python differ
+    except RuntimeError as error:  # for example, the versions of Ray or Python differ
         said = " ".join(str(error).split())
         if "ersion mismatch" in said:
             raise InvalidInput(f"engine ray: expected a cluster of the same versions: {said}") from error

@@ -20,7 +20,8 @@ class SessionLease:
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """State of a session after the request with the sequence number ``seq``, as bytes; None if it is too large."""
+    """State of a session after the request with the sequence number ``seq``. ``data`` is this state as bytes; None if
+    it is too large to store."""
 
     seq: int
     data: bytes | None = field(repr=False)

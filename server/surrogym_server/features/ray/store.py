@@ -112,8 +112,8 @@ class LiveSessions:
             return connection.execute(update).rowcount == 1
 
     def take(self, id: str, owner: str, seconds: float) -> TakenSession:
-        """Give ``owner`` a new lease of a session whose lease has expired or is the owner's own, and return the
-        session.
+        """Give ``owner`` a new lease of a session, and return the session. Its present lease must have expired or
+        belong to ``owner``.
 
         Raises:
             UnknownSession: there is no such session.

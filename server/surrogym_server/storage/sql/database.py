@@ -340,7 +340,8 @@ UNSTORABLE = (sa.exc.DataError, OverflowError, UnicodeEncodeError)
 
 
 def never_connected(error: BaseException | None) -> bool:
-    """Whether an error of PostgreSQL comes from the connection. Errors of statements have a code, others have none."""
+    """Whether an error of PostgreSQL comes from the connection instead of a statement. Only errors of statements have a
+    code."""
     return isinstance(error, sa.exc.OperationalError) and getattr(error.orig, "sqlstate", None) is None
 
 

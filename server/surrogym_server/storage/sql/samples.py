@@ -164,7 +164,8 @@ def _identity(place: int, sample: NewSample, lease: Answered | None) -> Identity
 
 
 def _raw_arrays(surrogate_id: int) -> sa.Select[Any]:
-    """Return the SELECT of all samples of a surrogate, with vectors as bytes, which is faster than as Python floats."""
+    """Return the SELECT of all samples of a surrogate. Vectors are selected as bytes, which is faster than as Python
+    floats."""
     vectors = (samples.c.coordinates, samples.c.action, samples.c.next_coordinates)
     raw: list[Any] = [sa.type_coerce(column, sa.LargeBinary()) for column in vectors]
     statement = sa.select(*raw, samples.c.reward, samples.c.terminated, samples.c.purpose)

@@ -201,9 +201,9 @@ def _set_or_taken_back(before: dict[str, float], changes: dict[str, float | None
 def withdraw_unbegun(
     connection: Connection, surrogate: Row[Any], before: SurrogateRecord, budget: int | None
 ) -> dict[str, Any]:
-    """Withdraw the adaptive queries of a design without a real step so far, and the lease of a running fit.
+    """Withdraw those adaptive queries of a design that have no real step so far, and the lease of a running fit.
 
-    This follows a change of target, tolerance, prior or budget. ``budget`` is the new budget if it is lower, else None.
+    A change of target, tolerance, prior or budget needs this. ``budget`` is the new budget if it is lower, else None.
     With a lower budget, initial queries beyond it are withdrawn too; otherwise, steps that ``improve`` requested are
     requested again. Returns the columns of the surrogate that the caller has to change.
     """
