@@ -15,7 +15,7 @@ MOST_THREADS = 4
 
 
 class Prior(SimulatorPrior):
-    """Prior of a design: a simulator whose model is learned in this process. Arguments and errors are those of
+    """Prior of a design: a model of a simulator, which is learned in this process. Arguments and errors are those of
     ``SimulatorPrior``.
 
     Examples:

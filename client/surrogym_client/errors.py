@@ -207,7 +207,7 @@ class NotInstalled(ProblemError):
 
 
 class ServerFailure(ProblemError):
-    """The server has a defect. Its log says more."""
+    """The server has a defect. The server's log says more."""
 
 
 BY_CODE: dict[Code, type[ProblemError]] = {

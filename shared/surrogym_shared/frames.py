@@ -237,8 +237,8 @@ def rollout_request(seq: int | None, actions: Array) -> RolloutRequest:
 def policy_request(
     seq: int | None, policy: ActingPolicy, steps: int, noise: NoiseKey | None, until: Bools | None
 ) -> PolicyRequest:
-    """Build the request of a policy's rollout of at most ``steps`` steps. It stops once an episode has ended in each
-    lane of the mask ``until`` (N,). A ``noise`` of None takes the most probable actions."""
+    """Build the request of a policy's rollout of at most ``steps`` steps. The rollout stops once an episode has ended
+    in each lane of the mask ``until`` (N,). A ``noise`` of None takes the most probable actions."""
     dtype = FLOAT32 if policy.dtype == np.float32 else FLOAT64
     return PolicyRequest(
         seq=seq,

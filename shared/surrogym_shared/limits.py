@@ -139,7 +139,7 @@ def _check_term(spec: EnvironmentSpec, limit: Limit) -> None:
 
 
 def _check_pairs(declared: Limits) -> None:
-    """Check that limits of the same term leave values between their margins. Raises ``ValueError``."""
+    """Check that limits of the same term leave a range between their margins. Raises ``ValueError``."""
     for one, other in product(declared.keep, repeat=2):
         if one.term == other.term and one.low is not None and other.high is not None:
             require(

@@ -85,7 +85,7 @@ def _interrupt_afterwards() -> Iterator[None]:
 
 @contextmanager
 def on_interrupt(words: Callable[[], str]) -> Iterator[None]:
-    """Context that prints ``words`` after Ctrl-C, such as what was saved and how to continue, and raises it again."""
+    """Context that prints ``words`` after Ctrl-C, such as what was saved, and raises ``KeyboardInterrupt`` again."""
     try:
         yield
     except KeyboardInterrupt:

@@ -25,7 +25,7 @@ Compare = Literal["zero", "random"]
 
 @dataclass(frozen=True)
 class Beside:
-    """Options for controllers that run from the same starts as the policy, to compare them with it."""
+    """Options for controllers that run from the same starts as the policy, to compare their returns with its return."""
 
     compare: Annotated[
         Compare | None,

@@ -258,7 +258,7 @@ def _judges(episodes: int) -> bool:
 
 
 def _summary(reports: Sequence[tuple[Controller, Evaluation]], reference: str | None) -> dict[str, Any]:
-    """Return the policy's episodes as JSON, together with those of ``--compare`` and ``--reference``."""
+    """Return the policy's episodes as JSON, with those of the controllers of ``--compare`` and ``--reference``."""
     summary = reports[0][1].summary()
     for actions, other in reports[1:]:
         if actions == "reference":

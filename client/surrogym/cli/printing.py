@@ -51,7 +51,7 @@ def unregistered(steps: Callable[[], int], what: str) -> Iterator[None]:
 
 
 def found_aside(findings: Iterator[Finding]) -> Iterator[Finding]:
-    """Yield the findings. Output of an environment while a finding is made goes to standard error."""
+    """Yield the findings of checks. What an environment prints during a check goes to standard error."""
     while True:
         with prints_aside():
             finding = next(findings, None)

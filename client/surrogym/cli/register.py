@@ -201,13 +201,13 @@ def _lacks_specification(environment: str) -> bool:
 
 
 def _key(name: str, described: bytes) -> str:
-    """Return the idempotency key for reporting the real steps of a description, so that registering the same file twice
-    counts them once."""
+    """Return the idempotency key for reporting the real steps with which a specification was drafted, so that
+    registering the same file (``described``) twice counts them once."""
     return hashlib.sha256(name.encode() + b"\n" + described).hexdigest()[:32]
 
 
 def _require_free(api: Api, name: str) -> None:
-    """Check that no surrogate has this name, before the description of its environment takes real steps.
+    """Check that no surrogate has this name, before a specification is drafted by real steps.
 
     Raises:
         CommandError: a surrogate has this name.

@@ -131,7 +131,7 @@ def _without(metrics: dict[str, Any]) -> tuple[str, str]:
 
 
 def _real_steps(metrics: dict[str, Any]) -> str:
-    """Describe the real steps that the run learned from: those of the design, of the description, and of audits."""
+    """Describe the real steps of the design, of drafting a specification, and of audits."""
     real = metrics["real_queries"]
     others = {"description": metrics["description_steps"], "audit": _audit_steps(metrics)}
     parts = [str(real["total"]), *(f"{steps} for the {name}" for name, steps in others.items() if steps)]

@@ -89,7 +89,7 @@ class DemoSettings:
 
     @property
     def description_steps(self) -> int:
-        """Number of real steps that were taken to describe the environment; 0, as the demo's tasks have
+        """Number of real steps by which the environment's specification was drafted; 0, as the demo's tasks have
         specifications."""
         return 0
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:  # importlib.abc takes as long to load as all commands togethe
 
 
 def after_import(module: str, function: str) -> None:
-    """Call ``function``, given as ``package.module:name``, after ``module`` is imported; at once if it already is."""
+    """Call ``function``, given as ``package.module:name``, after ``module`` is imported; at once if it is already."""
     if module in sys.modules:
         _call(function)
     else:

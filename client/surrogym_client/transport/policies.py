@@ -69,7 +69,7 @@ class PolicyCalls:
         return self._connection.send("GET", f"{routes.policy(surrogate, which)}/files/{form}", timeout=_SECONDS)
 
     def evaluate(self, surrogate: str, version: int, evaluation: wire.AddEvaluation) -> wire.EvaluationView:
-        """Store the results of real episodes of a policy, once for each idempotency key. They don't change the
+        """Store the results of real episodes of a policy, once for each idempotency key. This does not change the
         surrogate's counts of real steps, see ``Api.report_steps``."""
         route = f"{routes.policy(surrogate, version)}/evaluations"
         reply = self._connection.send("POST", route, evaluation.model_dump_json().encode())
