@@ -19,12 +19,13 @@ from surrogym_shared.compiled.jit import compiled, summing
 
 Floats = NDArray[np.float64]
 
-ROUNDING = 1.5 * 2.0**52  # if it is added to a number below 2^51, the low bits hold the rounded number
+# Added to a number below 2^51, it rounds the number to an integer, which the low bits of the sum hold.
+ROUNDING = 1.5 * 2.0**52
 PER_LOG2 = 1.4426950408889634  # 1 / log 2
-LOG2_HIGH, LOG2_LOW = 6.93147180369123816490e-01, 1.90821492927058770002e-10  # log 2 in two parts
+LOG2_HIGH, LOG2_LOW = 6.93147180369123816490e-01, 1.90821492927058770002e-10  # log 2 as a sum of two parts
 LEAST_EXPONENT = -708.0  # e to this power is about the smallest normal number
 PER_RIGHT_ANGLE = 0.63661977236758134  # 2 / pi
-# pi / 2 in three parts, of which the first two have 33 bits, so that their products with k are exact
+# pi / 2 in three parts, of which the first two have 33 bits, so that their products with a whole number k are exact
 RIGHT_ANGLE = (1.57079632673412561417e00, 6.07710050630396597660e-11, 2.02226624879595063154e-21)
 LARGEST_ANGLE = 1e5  # larger angles are left to the C library, which reduces them exactly
 
@@ -47,7 +48,7 @@ float_of: Any = intrinsic(_float_of)  # function: the float64 with the bits of a
 
 @compiled
 def exponential(x: Floats) -> None:
-    """Replace x (n,) by e^x, for x <= 709; below -708 it is about 1e-308."""
+    """Replace x (n,) by e^x in place. Entries are at most 709. For entries below -708 the result is about 1e-308."""
     for i in range(x.size):
         v = x[i] if x[i] > LEAST_EXPONENT else LEAST_EXPONENT
         t = v * PER_LOG2 + ROUNDING
@@ -65,7 +66,8 @@ def exponential(x: Floats) -> None:
         p = p * r + 0.16666666666666669
         p = p * r + 0.5000000000000001
         p = p * r + 1.0
-        x[i] = float_of(bits_of(p * r + 1.0) + (bits_of(t) << 52))  # multiplies by 2^k
+        # Adding k to the bits of the exponent multiplies by 2^k.
+        x[i] = float_of(bits_of(p * r + 1.0) + (bits_of(t) << 52))
 
 
 @compiled
@@ -104,7 +106,7 @@ def sine_and_cosine(x: Floats, sine: Floats, cosine: Floats) -> None:
 
 @compiled
 def wrapped(angle: float) -> float:
-    """Return an angle, wrapped to [-pi, pi), as ``environment.definition.wrap`` does."""
+    """Return an angle in radians, wrapped to [-pi, pi), as ``environment.definition.wrap`` does."""
     turned = angle + math.pi
     if not 0.0 <= turned < 2 * math.pi:
         turned %= 2 * math.pi

@@ -12,12 +12,13 @@ from surrogym_shared.compiled.jit import compiled
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-Tables = tuple[Floats, Ints]  # all numbers (K,); and for each matrix (S, 3) its offset there, its rows and columns
+# Numbers of all S matrices (K,); offset, number of rows and number of columns of each matrix (S, 3).
+Tables = tuple[Floats, Ints]
 
 
 class TablesBuilder:
-    """Builder that collects matrices into tables. A vector is a matrix of one row; whole numbers are stored as
-    float64."""
+    """Builder of ``Tables``: one array with the numbers of many matrices, and the place of each matrix in it. A vector
+    is a matrix of one row; whole numbers are stored as float64."""
 
     def __init__(self) -> None:
         self._matrices: list[NDArray[Any]] = []

@@ -7,9 +7,11 @@ from concurrent.futures import ThreadPoolExecutor
 
 
 def side_by_side(function: Callable[[slice], None], rows: int, block: int, threads: int) -> None:
-    """Call ``function`` for all ``rows``, divided into as many slices as threads, each of whole blocks of rows.
+    """Call ``function`` with slices that together cover all ``rows``, at the same time in at most ``threads`` threads.
+    Each slice but the last consists of whole blocks of ``block`` rows.
 
-    The calling thread computes one slice. The other threads are new ones, because a forked process inherits none.
+    The calling thread computes one slice. The other threads are started for this call, because a forked process does
+    not inherit running threads.
     """
     blocks = -(-rows // block)
     share = block * -(-blocks // threads)

@@ -15,12 +15,12 @@ FLOAT32_SLACK = 1e-6  # accepted excess over a limit, as a share of the range, b
 
 
 def policy_actions(action: ActionDefinition, raw: NDArray[Any], num_envs: int) -> Array:
-    """Check a policy's actions, and convert them to the model's.
+    """Check the actions that a policy chose, and convert them to the form in which the model takes actions.
 
     Args:
         action: definition of the action.
-        raw: (N, F), or (N,) if F = 1.
-        num_envs: N.
+        raw: actions of the policy, (N, F), or (N,) if F = 1.
+        num_envs: number of environments, N.
 
     Returns:
         The model's actions, (N, F).
@@ -49,14 +49,15 @@ def model_actions(action: ActionDefinition, raw: NDArray[Any]) -> Array:
 
 
 def decode_bins(action: ActionDefinition, rows: Array) -> Array:
-    """Convert the numbers of equally spaced bins, (n, F), to continuous values, (n, F)."""
+    """Convert actions given as numbers of equally spaced bins, (n, F), to continuous values, (n, F)."""
     low, high = action.limits
     values: Array = low + rows * (high - low) / (np.array(action.bins) - 1)
     return values
 
 
 def _rows(raw: NDArray[Any], expected: tuple[int, int]) -> Array:
-    rows = np.array(raw, dtype=np.float64)  # a copy, because an array from a frame may be unaligned and read-only
+    # A copy, because an array from a received message may be unaligned and read-only.
+    rows = np.array(raw, dtype=np.float64)
     if rows.ndim == 1 and expected[1] == 1:
         rows = rows[:, None]
     if rows.shape != expected:
@@ -83,7 +84,7 @@ def _require_counts(rows: Array, counts: tuple[int, ...]) -> None:
 
 def _in_box(action: ActionDefinition, rows: Array) -> Array:
     low, high = action.limits
-    if ((rows >= low) & (rows <= high)).all():  # so all are finite, as the limits are
+    if ((rows >= low) & (rows <= high)).all():  # then all entries are finite too, because the limits are
         return rows
     _require_finite(rows)
     slack = FLOAT32_SLACK * (high - low)  # an action at a limit may be rounded beyond it in float32

@@ -15,15 +15,15 @@ from surrogym_server.environment.definition import EnvironmentDefinition, wrap
 from surrogym_server.environment.distributions import scaling
 
 POINTS_A_WEIGHT = 3  # least number of steps for each weight of the regression
-MAX_TURNS = 3  # greatest number of turns within a step
-STARTS_A_TURN = 8  # number of start slopes of the search for each turn
+MAX_TURNS = 3  # greatest number of full turns of an angle within a step
+STARTS_A_TURN = 8  # number of start slopes of the search for each full turn
 ROUNDS = 10  # number of iterations of the search
-CLEARLY = 0.25  # turns are added only if they reduce the squared residuals to less than this share
+CLEARLY = 0.25  # full turns are added only if they reduce the sum of squared residuals to less than this share of it
 
 
 def angle_increments(definition: EnvironmentDefinition, q: Tensor, q_next: Tensor) -> Tensor:
-    """Return the increments of each angle in the steps from q (n, C) to q_next (n, C), whole turns included, (n, A) in
-    radians."""
+    """Return the increments of the A angles in the steps from q (n, C) to q_next (n, C), (n, A) in radians. An
+    increment includes the full turns that the angle makes within the step."""
     change = wrap((q_next - q)[:, definition.angles])
     moved_by = [i for i in definition.moving if definition.coordinates[i].kind == "linear"]
     if not moved_by or len(q) < POINTS_A_WEIGHT * (len(moved_by) + 1):
@@ -34,11 +34,12 @@ def angle_increments(definition: EnvironmentDefinition, q: Tensor, q_next: Tenso
 
 
 def _unwrapped(speeds: Tensor, change: Tensor) -> Tensor:
-    """Add whole turns to increments (n,) so that they become most linear in the speeds (n, L), if this clearly reduces
-    the residuals.
+    """Add full turns to the increments of an angle (n,), so that they come as close as possible to a linear function of
+    the speeds (n, L). Return the increments unchanged if this does not clearly reduce the residuals.
 
-    The search starts from every slope of every speed that explains up to ``MAX_TURNS`` turns, alternates between turns
-    and least squares, and takes the start with the smallest final residual.
+    The search has many starts: each assumes a slope over one speed, up to the slope that explains ``MAX_TURNS`` turns
+    in a step. From each start it alternates between two steps: choose the turns that come closest to the linear
+    function, then fit the function by least squares. The result with the smallest residuals is used.
     """
     basis = torch.cat([torch.ones(len(speeds), 1, dtype=torch.float64), speeds], 1)
     solve = torch.linalg.pinv(basis)

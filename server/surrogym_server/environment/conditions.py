@@ -25,7 +25,8 @@ class InequalityDefinition:
 
 @dataclass(frozen=True)
 class Conditions:
-    """G groups of K inequalities in total, compiled: each inequality as sign * term >= threshold, exactly."""
+    """Compiled conditions: G groups with K inequalities in total. A group holds if all of its inequalities hold. Each
+    inequality is stored as sign * term >= threshold, which is also exact for < and >."""
 
     terms: TermSet  # the K terms
     sign: Tensor  # (K,) 1 or -1

@@ -43,10 +43,10 @@ class DeclaredRewardDefinition:
     device: torch.device = CPU  # device of its tensors
 
     def __call__(self, q: Tensor, u: Tensor) -> Tensor:
-        """Return the reward (m,) of states q (m, C), before or after the step as ``after`` says, and actions u (m, F),
-        without ``terminal``."""
+        """Return the reward (m,) of actions u (m, F) in states q (m, C), without the reward ``terminal`` of terminating
+        steps. If ``after`` is true, q are the states after the step, otherwise those before it."""
         values, weights, conditions = self._compiled
-        x = values(q) + u @ weights if weights.numel() else values(q)  # without quantities, weights have no shape
+        x = values(q) + u @ weights if weights.numel() else values(q)  # without quantities, ``weights`` is empty
         holds = conditions(q)
         total = q.new_zeros(len(q))
         begin = 0

@@ -30,7 +30,7 @@ from surrogym_shared.kinds import CoordinateKind, LagKind, RewardTiming
 from surrogym_shared.presets import InputProbability, Moves, Stopping, Tolerance
 
 REWARD = "reward"
-REACH = 1e6  # a coordinate without a bound is limited this many widths beyond its sampling range
+REACH = 1e6  # a coordinate without a bound is clipped this many widths of its sampling range beyond that range
 SCALING_POINTS = 4_096  # number of states from which the scale of the observation is computed
 Array = NDArray[np.float64]
 
@@ -40,7 +40,7 @@ class LagDefinition:
     """Past value that a coordinate repeats; ``spec.Lag`` explains the kinds."""
 
     kind: LagKind
-    source: int = 0  # index of the coordinate, or entry of the action
+    source: int = 0  # index of the coordinate or action entry whose past value is repeated
 
 
 @dataclass(frozen=True)
@@ -62,16 +62,16 @@ class CoordinateDefinition:
 
     @property
     def settable(self) -> tuple[float, float]:
-        """Range of values to which the original environment can be set: the bounds, or the sampling range if there are
-        none."""
+        """Range of values to which the original environment can be set. Each end is the bound, or the end of the
+        sampling range if there is no bound on this side."""
         low = self.low if np.isfinite(self.low) else self.sampling.low
         return low, self.high if np.isfinite(self.high) else self.sampling.high
 
 
 @dataclass(frozen=True)
 class ActionDefinition:
-    """Action of an environment: a box (low, high), offered to policies as ``bins`` if these are given, or discrete
-    values with counts ``nvec``."""
+    """Action of an environment: either a box from ``low`` to ``high``, or discrete with ``nvec`` values of each entry.
+    If ``bins`` are given, a policy chooses each entry of the box among that many equally spaced values."""
 
     kind: Literal["box", "discrete", "multi_discrete"]
     low: tuple[float, ...] = ()
@@ -100,9 +100,10 @@ class LearningDefinition:
 
     Attributes:
         model: family of models, by its name in ``models.registry``, and its settings.
-        moves: the quantity whose increments the transition outputs are; under ``observation`` the coordinates are read
-            back from the observation, as in the paper.
-        limits_rewards: whether virtual rewards are limited by those of the samples.
+        moves: whether the model predicts increments of the ``coordinates`` or of the ``observation``. With
+            ``observation``, the next coordinates are computed from the predicted observation, as in the paper.
+        limits_rewards: whether rewards of virtual steps are clipped to limits that follow from the rewards of the
+            samples.
     """
 
     model: Choice
@@ -116,16 +117,17 @@ class DesignDefinition:
 
     Attributes:
         initial: number of queries of the initial design.
-        hypercube_tries: number of random Latin hypercubes, of which the most spread one is used.
+        hypercube_tries: number of random Latin hypercubes. The one whose closest two points are farthest apart is used.
         acquisition: criterion of the adaptive queries.
-        tolerance: ``relative`` to an output's standard deviation over the initial design, or ``raw``: 1 in the
-            output's unit.
+        tolerance: default tolerance of an output: ``relative`` is 5 % of its standard deviation over the initial
+            design, ``raw`` is 1 in its unit.
         monte_carlo: number of points that estimate the confidence index (eq. 8).
-        visited_candidates: whether visited states join the candidates and the reference.
-        input_probability: P_i (eq. 11) before a policy has visited any state: ``uniform``, or the density of the
-            ``predicted`` next states, as in the paper.
-        stopping: ``confidence`` stops at the target of the index, as in the paper; ``tested_confidence`` also requires
-            leave-one-out errors within the tolerances, and adaptive queries that tried to disprove the model.
+        visited_candidates: whether states that policies visited are added to the candidates and the reference points.
+        input_probability: P_i (eq. 11) before a policy has visited any state: ``uniform``, or ``predicted``, the
+            density of the predicted next states, as in the paper.
+        stopping: ``confidence`` stops when the confidence index reaches its target, as in the paper.
+            ``tested_confidence`` also requires leave-one-out errors within the tolerances, and answers to adaptive
+            queries, which could have disproved the model.
         seed: seed of all random choices of the design.
     """
 
@@ -157,14 +159,16 @@ class EnvironmentDefinition:
     tolerances: tuple[tuple[str, float], ...]
     learning: LearningDefinition
     design: DesignDefinition
-    learns_termination: bool = False  # whether termination is learned from samples; then no groups are declared
+    # Whether termination is learned from samples; then ``termination_groups`` is empty.
+    learns_termination: bool = False
     declared_reward: DeclaredRewardDefinition | None = None
-    max_rollout: int | None = None  # greatest number of actions of a query; None if any state can be set
-    snapshots: bool = False  # whether such a query may begin at a saved state
+    # Greatest number of actions of a query; None if the environment can be set to any state.
+    max_rollout: int | None = None
+    snapshots: bool = False  # whether a query may begin at a snapshot (a saved state) instead of a reset
     starts: tuple[tuple[float, ...], ...] = ()  # states at which episodes start; if empty, by their distributions
-    outside_reward: float | None = None  # for each step that an episode misses after it left the sampling range
+    outside_reward: float | None = None  # reward for each step that an episode misses after it left the sampling range
     limits: LimitsDefinition | None = None  # limits of the specification, or None
-    device: torch.device = CPU  # device of its tensors, and of the states and actions that it is given
+    device: torch.device = CPU  # device of the definition's tensors, and of states and actions that are passed to it
 
     def on(self, device: torch.device) -> EnvironmentDefinition:
         """Return the same definition for states on another device."""
@@ -191,7 +195,8 @@ class EnvironmentDefinition:
 
     @cached_property
     def moving(self) -> tuple[int, ...]:
-        """Indices of the coordinates that the dynamics move: no constants and no lags."""
+        """Indices of the coordinates that the dynamics move: all except constants and lags (they repeat a past
+        value)."""
         return tuple(i for i, c in enumerate(self.coordinates) if c.kind != "constant" and c.lag is None)
 
     @cached_property
@@ -201,7 +206,7 @@ class EnvironmentDefinition:
 
     @cached_property
     def ages(self) -> tuple[int, ...]:
-        """Number of steps that each coordinate looks back, (C,); 0 for coordinates that are no lags."""
+        """Number of steps that each coordinate looks back, (C,); 0 for coordinates that repeat no past value."""
         ages: list[int] = []
         for c in self.coordinates:
             if c.lag is None or c.lag.kind == "steps":
@@ -218,11 +223,13 @@ class EnvironmentDefinition:
 
     @property
     def unknown_steps(self) -> int:
-        """Number of first steps of an episode from which a model does not learn, because lags are not known yet."""
+        """Number of steps at the beginning of an episode from which a model does not learn, because lags (coordinates
+        that repeat a past value) are not known yet."""
         return 0 if self.counter is None else math.ceil(self.coordinates[self.counter].high)
 
     def known(self, q: Tensor) -> Tensor:
-        """Return whether the lags of states q (..., C) are known, (...) bool."""
+        """Return for which of the states q (..., C) all lags are known, (...) bool. A lag is a coordinate that repeats
+        a past value."""
         if self.counter is None:
             return torch.ones(q.shape[:-1], dtype=torch.bool, device=q.device)
         return q[..., self.counter] >= self.unknown_steps
@@ -251,7 +258,7 @@ class EnvironmentDefinition:
 
     @cached_property
     def observation_combines(self) -> bool:
-        """Whether an observation entry is more than a coordinate, its cosine or its sine."""
+        """Whether any observation entry is a sum of several functions, or a function of several coordinates."""
         terms = self.observation_terms
         return any(len(t.parts) > 1 or any(np.count_nonzero(p.weights) > 1 for p in t.parts) for t in terms)
 
@@ -274,9 +281,11 @@ class EnvironmentDefinition:
 
     @cached
     def reach(self) -> tuple[Tensor, Tensor]:
-        """Lower and upper limits of the coordinates, (C,) each, so that a diverging model stays finite.
+        """Lower and upper limits to which predicted coordinates are clipped, (C,) each, so that they stay finite even
+        if the model diverges.
 
-        They are the saturation bounds. A side without a bound has a limit ``REACH`` widths beyond the sampling range.
+        A limit is the saturation bound. On a side without a bound it lies ``REACH`` times the width of the sampling
+        range beyond that range.
         """
         low, high = self.bounds
         begin, end = self.sampled
@@ -300,20 +309,22 @@ class EnvironmentDefinition:
         return tuple(i for i, c in enumerate(self.coordinates) if c.kind == "angle")
 
     def terminated(self, q: Tensor) -> Tensor:
-        """Return whether the declared termination holds at q (..., C), (...) bool: all inequalities of any group."""
+        """Return whether the declared termination holds at q (..., C), (...) bool. It holds if all inequalities of at
+        least one group hold."""
         if not self.termination_groups:
             return torch.zeros(q.shape[:-1], dtype=torch.bool, device=q.device)
         return self._termination(q).any(-1)
 
     def falls_back(self, q: Tensor, q_next: Tensor) -> Tensor:
-        """Return after which steps from q (..., C) to q_next (..., C) the fallback action of the limits acts,
-        (...) bool; false everywhere without limits."""
+        """Return whether the fallback action that the limits declare takes over after a step from q (..., C) to q_next
+        (..., C), (...) bool. Without limits it never does."""
         if self.limits is None:
             return torch.zeros(q_next.shape[:-1], dtype=torch.bool, device=q_next.device)
         return self._limits.falls_back(q, q_next)
 
     def room(self, q: Tensor) -> Tensor:
-        """Return the distance of states q (..., C) to the nearer end of each limit, (..., L); negative beyond it."""
+        """Return the distance of states q (..., C) to the nearer end of the range of each limit, (..., L); negative
+        outside the range."""
         return self._limits.room(q)
 
     @cached
@@ -327,7 +338,7 @@ class EnvironmentDefinition:
 
     @cached
     def start_states(self) -> Tensor:
-        """States at which episodes start, (k, C); k is 0 if starts have a distribution."""
+        """States at which episodes start, (k, C); k is 0 if starts are drawn from distributions instead."""
         return torch.tensor(self.starts, dtype=torch.float64, device=self.device).reshape(-1, len(self.coordinates))
 
     @cached
@@ -341,5 +352,5 @@ class EnvironmentDefinition:
 
 
 def wrap(angle: Tensor) -> Tensor:
-    """Wrap an angle to [-pi, pi)."""
+    """Wrap an angle in radians to [-pi, pi)."""
     return torch.remainder(angle + torch.pi, 2 * torch.pi) - torch.pi

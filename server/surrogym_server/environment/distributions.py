@@ -24,7 +24,7 @@ class UniformDefinition:
         return self.low + (self.high - self.low) * p
 
     def log_density(self, value: Tensor) -> Tensor:
-        """Return the logarithm of the density within the limits, less its maximum."""
+        """Return 0 for each value: the log density within the limits, less its maximum."""
         return torch.zeros_like(value)
 
 
@@ -45,7 +45,7 @@ class NormalDefinition:
         return torch.clamp(value, self.low, self.high)
 
     def log_density(self, value: Tensor) -> Tensor:
-        """Return the logarithm of the density within the limits, less its maximum, if the limits contain the mean."""
+        """Return the log density at values within the limits, less the log density at the mean."""
         return -0.5 * ((value - self.mean) / self.std).square()
 
 
@@ -76,7 +76,8 @@ Distribution = UniformDefinition | NormalDefinition | FixedDefinition
 
 
 def scaling(distribution: Distribution) -> tuple[float, float]:
-    """Return the centre and scale that give a sampled coordinate mean 0 and standard deviation about 1."""
+    """Return a centre and a scale such that (value - centre) / scale has mean 0 and standard deviation about 1 for
+    sampled values."""
     match distribution:
         case UniformDefinition(low, high):
             return (low + high) / 2, (high - low) / math.sqrt(12)

@@ -19,7 +19,8 @@ from surrogym_server.tensors import bend
 State = Literal["cos_sin", "wrapped", "both", "observation", "none"]
 Encoding = Literal["value", "one_hot", "none"]  # encodings of actions; one_hot is for discrete actions
 Parity = Literal["", "odd", "even"]
-Drift = tuple[tuple[float, ...], ...]  # for each angle, weights (C,) of the coordinates
+# For each angle, weights (C,) of the coordinates that predict the angle's increment.
+Drift = tuple[tuple[float, ...], ...]
 
 
 @dataclass(frozen=True)
@@ -27,20 +28,22 @@ class FeatureMap:
     """Encoding of coordinates q and action u as inputs of one output's process.
 
     Attributes:
-        state: angles as cos and sin, as the wrapped angle, or both; or ``observation``, standardised except in preset
-            paper; or ``none``: no coordinates and no action, only the lead.
+        state: how angles are encoded: as cos and sin, as the wrapped angle, or both. Or ``observation``: the
+            observation replaces the coordinates, standardised except in preset paper. Or ``none``: no coordinates and
+            no action, only the lead.
         action: discrete actions as evenly spaced values, or one-hot, or no action at all.
-        lead: whether the predicted, clipped next value of the leading coordinates is an input too. Then an output that
-            follows from it (an angle from its speed) has no kink.
+        lead: whether the lead is an input too: the predicted next value of each leading coordinate (see ``leading``),
+            clipped to its limits. With it, an output that depends on a limited speed, such as an angle, has no kink
+            where the speed reaches its limit.
         after: whether to encode the state after the step instead of the one before; only for the reward.
         drift: for each angle, weights (C,) of q that predict its increment; cos and sin of the angle after this
             increment are inputs too.
         parity: how the output changes if every coordinate and the action change their sign: it changes its sign too
             (odd), it stays (even), or there is no rule (empty).
         history: only lags that look back at most this many steps are inputs; None: all lags.
-        rates: for each feature that is not dropped (d,), the rate at which the output changes faster further along it;
-            empty for none; see ``gp.growth``.
-        dropped: indices of features that the output does not read, in the map without ``dropped``, ascending.
+        rates: (d,) rate of each feature that is not dropped. Along a feature with a rate above 0, the output changes
+            faster the larger the feature is (see ``gp.growth``). Empty if no feature has a rate.
+        dropped: indices of the features that the output does not read, among all features of the map, ascending.
     """
 
     state: State = "cos_sin"
@@ -61,7 +64,8 @@ class FeatureMap:
 
 
 def leading(definition: EnvironmentDefinition) -> tuple[int, ...]:
-    """Return the coordinates with two finite limits that affect no other coordinate, such as a limited speed.
+    """Return the indices of the coordinates that have two finite limits at which no other coordinate is stopped, such
+    as a limited speed.
 
     They are predicted first, because their next value can be an input of other outputs.
     """
@@ -73,7 +77,8 @@ def leading(definition: EnvironmentDefinition) -> tuple[int, ...]:
 
 
 class Feature(NamedTuple):
-    """One input of a process: function of an entry of [q, u], of the lead, of weights . q, or an observation entry."""
+    """One input of a process: a function of one entry of coordinates and action [q, u], of one leading coordinate's
+    next value, or of a weighted sum of coordinates; or an observation entry."""
 
     function: Literal[
         "affine", "cos", "sin", "turned_cos", "turned_sin", "wrapped", "equal", "observed", "lead", "grown"
@@ -86,7 +91,7 @@ class Feature(NamedTuple):
 
 
 def feature_names(definition: EnvironmentDefinition, feature_map: FeatureMap) -> list[str]:
-    """Return the name of what each feature of a map reads, in order, for display."""
+    """Return the name of the quantity that each feature of a map is a function of, in the map's order, for display."""
     entries = (*definition.coordinate_names, *(f"action {place}" for place in range(definition.action.size)))
     names = []
     for function, entry, centre, *_ in features(definition, feature_map):
@@ -141,16 +146,19 @@ def encode(
 
 @dataclass(frozen=True)
 class Encoder:
-    """Encoder of the features of several maps. It computes each feature once, and features of one function together."""
+    """Encoder of coordinates and actions as the features of several maps. It computes a feature that several maps
+    contain only once, and all features with the same function, such as cos, together."""
 
     definition: EnvironmentDefinition
-    # Features by function: its name, entries (or weights), centres, scales, rates.
+    # Features grouped by function: name of the function, then entries (or weights), centres, scales and rates of the
+    # features.
     groups: tuple[tuple[str, slice | Tensor, Tensor, Tensor, Tensor], ...]
     columns: Mapping[Feature, int]
 
     @classmethod
     def of(cls, definition: EnvironmentDefinition, maps: Iterable[FeatureMap]) -> Encoder:
-        """Compile maps: group their features by function, those of the lead last."""
+        """Build the encoder of some maps. It groups the features of all maps by their function, such as cos; features
+        of the lead come last."""
         wanted = {feature for feature_map in maps for feature in features(definition, feature_map)}
         ordered = sorted(wanted, key=lambda f: (f.function == "lead", f))
         groups = tuple(
@@ -160,21 +168,23 @@ class Encoder:
         return cls(definition, groups, {feature: column for column, feature in enumerate(ordered)})
 
     def inputs(self, feature_map: FeatureMap) -> tuple[int, ...]:
-        """Return the columns of a map's features, in the map's order."""
+        """Return the columns of a map's features in the encoder's result, in the map's order."""
         return tuple(self.columns[feature] for feature in features(self.definition, feature_map))
 
     def width(self, lead: bool) -> int:
-        """Return the number of features, with or without those of the lead."""
+        """Return the number of features, with or without those of the lead (the next values of leading coordinates)."""
         return sum(lead or feature.function != "lead" for feature in self.columns)
 
     def __call__(self, q: Tensor, u: Tensor) -> Tensor:
-        """Return all features of coordinates q (..., C) and actions u (..., F), except those of the lead."""
+        """Return all features of coordinates q (..., C) and actions u (..., F), except those of the lead (the next
+        values of leading coordinates)."""
         raw = torch.cat([q, u], -1)
         values = [self._values(*group, raw) for group in self.groups if group[0] != "lead"]
         return torch.cat(values, -1) if values else raw[..., :0]
 
     def with_lead(self, x: Tensor, lead: Tensor) -> Tensor:
-        """Append the features of the lead (..., L) to x (..., d), the result of a call."""
+        """Append the features of the lead (..., L), the next values of leading coordinates, to x (..., d), the result
+        of calling the encoder."""
         return torch.cat([x, *(self._values(*group, lead) for group in self.groups if group[0] == "lead")], -1)
 
     def _values(
@@ -256,8 +266,8 @@ def _of_action(definition: EnvironmentDefinition, feature_map: FeatureMap, entry
 
 
 def _group(same: tuple[Feature, ...], device: torch.device) -> tuple[slice | Tensor, Tensor, Tensor, Tensor]:
-    """Return the parameters of features of one function: entries (a slice if they are neighbours) or weights (C, k),
-    centres, scales and rates."""
+    """Return the parameters of features that all have the same function, such as cos: the entries that they read (a
+    slice if these are neighbours) or weights (C, k); then centres, scales and rates."""
     numbers = torch.tensor([(f.centre, f.scale, f.rate) for f in same], dtype=torch.float64, device=device)
     centre, scale, rate = numbers.T
     if same[0].weights:

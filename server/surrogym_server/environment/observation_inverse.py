@@ -24,8 +24,8 @@ class ObservationInverse:
 
     @classmethod
     def of(cls, definition: EnvironmentDefinition) -> ObservationInverse:
-        """Find the entries of each moving coordinate. Raises ``InvalidSpec`` if the observation does not determine
-        one."""
+        """Find the entries of each moving coordinate. Raises ``InvalidSpec`` if the observation does not determine a
+        moving coordinate."""
         return cls(tuple((i, _source(definition, i)) for i in definition.moving))
 
     def __call__(self, o: Tensor, q: Tensor) -> Tensor:
@@ -56,8 +56,8 @@ def _source(definition: EnvironmentDefinition, index: int) -> tuple[int, ...]:
 
 
 def _entry(definition: EnvironmentDefinition, part: PartDefinition, low: float, high: float) -> int | None:
-    """Return the index of the observation entry that consists of this part alone and is not clipped within [low,
-    high]."""
+    """Return the index of the observation entry that consists of this part alone and is not clipped within [low, high];
+    None if there is no such entry."""
     for position, term in enumerate(definition.observation_terms):
         if term.parts == (part,) and term.low <= low and term.high >= high:
             return position

@@ -34,7 +34,7 @@ class Points:
 
     @property
     def queries(self) -> tuple[Query, ...]:
-        """Query for a single step at each point."""
+        """One query for each point: a single step from its state under its action."""
         return tuple(Query.step(*step) for step in zip(self.q.tolist(), self.u.tolist(), strict=True))
 
     @classmethod

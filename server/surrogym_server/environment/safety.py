@@ -14,7 +14,8 @@ from surrogym_server.tensors import CPU, to_device
 
 @dataclass(frozen=True)
 class LimitDefinition:
-    """One limit: the range [low, high] of a term. Within ``margin`` of an end, the fallback action takes over."""
+    """Declared limit: the range [low, high] in which a term has to stay. At a distance below ``margin`` from an end,
+    the declared fallback action takes over."""
 
     term: TermDefinition
     low: float
@@ -24,7 +25,7 @@ class LimitDefinition:
 
 @dataclass(frozen=True)
 class LimitsDefinition:
-    """L limits, and the share ``probability`` of episodes that may leave one of them."""
+    """L declared limits. ``probability`` is the greatest share of episodes that may leave a limit."""
 
     keep: tuple[LimitDefinition, ...]
     probability: float
@@ -32,7 +33,7 @@ class LimitsDefinition:
 
 @dataclass(frozen=True)
 class Limits:
-    """L limits in the form in which they are computed for many states at once."""
+    """L limits, compiled to tensors that evaluate them for many states at once."""
 
     terms: TermSet
     low: Tensor  # (L,) lower end of each limit
@@ -48,12 +49,14 @@ class Limits:
         return to_device(cls(terms, low, high, margin), device)
 
     def room(self, q: Tensor) -> Tensor:
-        """Return the distance of states q (..., C) to the nearer end of each limit, (..., L); negative beyond it."""
+        """Return the distance of states q (..., C) to the nearer end of the range of each limit, (..., L); negative
+        outside the range."""
         value = self.terms(q)
         return torch.minimum(value - self.low, self.high - value)
 
     def falls_back(self, q: Tensor, q_next: Tensor) -> Tensor:
-        """Return whether the distance to a limit is below its margin at q_next (..., C), or would be so after one more
-        step with the same change as from q (..., C) to q_next: (...) bool."""
+        """Return whether the fallback action takes over after a step from q (..., C) to q_next (..., C), (...) bool. It
+        does if the distance to an end of a limit is below the limit's margin at q_next, or would be after one more step
+        in which the distance changes as much as in this one."""
         now = self.room(q_next)
         return (torch.minimum(now, 2 * now - self.room(q)) < self.margin).any(-1)

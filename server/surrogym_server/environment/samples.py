@@ -16,7 +16,7 @@ from surrogym_shared.nouns import RealSteps
 
 @dataclass(frozen=True)
 class Samples:
-    """n real steps, float64."""
+    """n steps of the original environment, as float64 tensors."""
 
     q: Tensor  # (n, C) coordinates before the step
     u: Tensor  # (n, F) actions
@@ -47,8 +47,9 @@ class Samples:
 
 
 def increments(definition: EnvironmentDefinition, samples: Samples) -> Tensor:
-    """Return the targets of the transition outputs, (n, M): q' - q of the moving coordinates, whole turns of angles
-    included; or o' - o if the outputs move the observation."""
+    """Return the targets of the transition outputs, (n, M). They are the changes of the moving coordinates, with the
+    full turns of angles. If the definition says that the model moves the observation, they are the changes of the
+    observation."""
     if definition.moves_observation:
         return definition.observe(samples.q_next) - definition.observe(samples.q)
     change = samples.q_next - samples.q
@@ -57,9 +58,10 @@ def increments(definition: EnvironmentDefinition, samples: Samples) -> Tensor:
 
 
 def preceding(definition: EnvironmentDefinition, samples: Samples) -> Tensor:
-    """Return the row of the step that each sample continues, (n,), or -1 if it continues none.
+    """Return for each sample the row of the sample that is the step before it, (n,); -1 if there is none.
 
-    A sample continues the row before it if that row did not end an episode and its next coordinates equal the sample's.
+    That is the previous row, if it did not end an episode and if its next coordinates equal the coordinates of the
+    sample.
     """
     columns = list(definition.moving)
     follows = torch.full((len(samples),), -1)
@@ -69,7 +71,8 @@ def preceding(definition: EnvironmentDefinition, samples: Samples) -> Tensor:
 
 
 def saturated(definition: EnvironmentDefinition, q_next: Tensor) -> Tensor:
-    """Return which samples (n,) ended at a declared bound, which cuts their increments off."""
+    """Return which samples that ended at q_next (n, C) reached a declared bound of any coordinate, (n,) bool. A bound
+    cuts the increments off."""
     return (limit_sides(definition, q_next) != 0).any(-1)
 
 

@@ -10,7 +10,7 @@ from surrogym_server.environment.observation_inverse import ObservationInverse
 
 
 def paid(terminal_reward: float, reward: Tensor, terminated: Tensor) -> Tensor:
-    """Add the terminal reward to the rewards (m,) of those steps that terminate, terminated (m,)."""
+    """Return the rewards (m,) of m steps, with the terminal reward added where ``terminated`` (m,) is true."""
     return reward + terminal_reward * terminated if terminal_reward else reward
 
 
@@ -21,8 +21,8 @@ def clip(definition: EnvironmentDefinition, q: Tensor) -> Tensor:
 
 
 def settle(definition: EnvironmentDefinition, q: Tensor) -> Tensor:
-    """Apply the rules of the environment to coordinates q (..., C): clip to bounds, stop speeds at walls, wrap
-    angles."""
+    """Apply the rules of the environment to coordinates q (..., C): clip them to bounds, set a speed that points into a
+    wall to 0, wrap angles."""
     inside = clip(definition, q)
     for index, coordinate in enumerate(definition.coordinates):
         if coordinate.stops is not None:
@@ -61,8 +61,8 @@ def moved(
 
 
 def with_lags(definition: EnvironmentDefinition, q: Tensor, u: Tensor, q_next: Tensor) -> Tensor:
-    """Set the lags of next coordinates q_next (m, C) to the values of the step from q (m, C) under u (m, F) that they
-    repeat."""
+    """Set the lags among the next coordinates q_next (m, C) of a step from q (m, C) under u (m, F). A lag is a
+    coordinate that repeats a past value."""
     if not definition.lags:
         return q_next
     repeated = [_repeated(definition, index, q, u, q_next) for index in definition.lags]
@@ -70,7 +70,8 @@ def with_lags(definition: EnvironmentDefinition, q: Tensor, u: Tensor, q_next: T
 
 
 def _repeated(definition: EnvironmentDefinition, index: int, q: Tensor, u: Tensor, q_next: Tensor) -> Tensor:
-    """Return the next value (m,) of the lag with coordinate index ``index``."""
+    """Return the value (m,) after the step of the lag (a coordinate that repeats a past value) with coordinate index
+    ``index``."""
     lag = definition.coordinates[index].lag
     assert lag is not None
     match lag.kind:

@@ -40,9 +40,11 @@ from surrogym_server.gp.search import blas, minimum
 from surrogym_server.gp.sparse import condition_sparse, pivots
 from surrogym_server.gp.subsets import SOME, spread
 
-SEARCHES = ((2_000, 40), (None, 15))  # most points (None for all) and iterations of each search, one after the other
-NOISY = 1e-4  # noise variance, as a share of the output's variance, above which errors of inducing points are small
-PRECISE = 1e-4  # error of points predicted from the others that counts as exact, in the output's standard deviations
+# Searches, one after the other: greatest number of points (None: all), and of iterations.
+SEARCHES = ((2_000, 40), (None, 15))
+# If the noise variance is above this share of the output's variance, it hides the errors of inducing points.
+NOISY = 1e-4
+PRECISE = 1e-4  # leave-one-out errors below this, in standard deviations of the output, count as exact
 HARDLY = 0.3  # an input may be left out if its effect on the mean is below this share of the noise deviation
 TRIES = 6  # greatest number of searches for inputs that can be left out
 JITTER = 1e-9  # added to the diagonal of K_uu, as a share of the points' mean prior variance
@@ -51,11 +53,12 @@ JITTER = 1e-9  # added to the diagonal of K_uu, as a share of the points' mean p
 def fit_bound(
     x: Tensor, y: Tensor, options: FitOptions, theta: Array, inducing: int, reflection: Reflection | None = None
 ) -> Posterior:
-    """Fit a process to x (n, d) and y (n,), both standardised, through at most ``inducing`` points. Runs on the CPU.
+    """Fit a sparse process to x (n, d) and y (n,), both standardised, by maximising the variational bound. Runs on the
+    CPU.
 
     Args:
-        theta: free parameters that were fitted to some of the points. The search starts there and at shorter length
-            scales, first with some of the points and then with all. Each search chooses its own inducing points.
+        theta: free parameters that were fitted to some of the points. One search starts at these, another at shorter
+            length scales. Both use some of the points first, and then all. Each search chooses its own inducing points.
         inducing: greatest number of inducing points.
 
     Raises:
@@ -84,8 +87,8 @@ def fit_through_few(
     points. Runs on the CPU.
 
     Args:
-        theta: free parameters that were fitted to some of the points. If they have noise, the bound of all points is
-            maximised from there as well.
+        theta: free parameters that were fitted to some of the points. If their noise is large enough to hide the errors
+            of inducing points, a search that starts at these also maximises the bound of all points.
 
     Returns:
         The posterior; None if inducing points would lose accuracy (see ``loses_nothing``), or if there are at most
@@ -106,10 +109,10 @@ def fit_through_few(
 
 
 def loses_nothing(posterior: Posterior) -> bool:
-    """Return whether a posterior represents all of its data.
+    """Return whether a posterior is as accurate as one that uses all points without inducing points.
 
-    An exact posterior does. Fewer than ``SOME`` inducing points do if the noise hides their errors, or if each point is
-    predicted precisely from the others.
+    An exact posterior is. A posterior with inducing points is if these are fewer than ``SOME`` and if either the noise
+    hides their errors or each point is predicted precisely from the others.
     """
     if posterior.sparse is None:
         return True
@@ -118,7 +121,7 @@ def loses_nothing(posterior: Posterior) -> bool:
 
 
 def is_noisy(hyper: Hyperparameters) -> bool:
-    """Return whether the noise is so large that the errors of inducing points are small beside it."""
+    """Return whether the noise is so large that the errors caused by inducing points are small compared with it."""
     return hyper.noise_variance > NOISY
 
 
@@ -133,11 +136,11 @@ class Fewer:
 def fewer_inputs(
     x: Tensor, y: Tensor, posterior: Posterior, options: FitOptions, inducing: int, may: Tensor, odds: float
 ) -> Fewer | None:
-    """Leave out inputs that hardly change the mean of a process, if this increases the bound with priors. Runs on the
-    CPU.
+    """Leave out inputs that hardly change the mean of a process, if this increases the variational bound of the log
+    evidence, with the priors of hyperparameters and of leaving out inputs. Runs on the CPU.
 
-    All such inputs are tried at once. If they can't be left out together, the set is halved, and its halves are tried
-    beside the inputs already left out, in ``TRIES`` searches at most.
+    The first of at most ``TRIES`` searches tries to leave out all such inputs at once. If a set of inputs can't be left
+    out, each half of it is tried, in addition to the inputs that are left out already.
 
     Args:
         x: inputs (n, d).
@@ -166,7 +169,8 @@ def fewer_inputs(
 
 
 class _Inputs:
-    """The inputs that a process still reads, and the free parameters that maximise its bound."""
+    """Search state of ``fewer_inputs``: the inputs that the process still reads, and the free parameters that maximise
+    the bound for these inputs."""
 
     def __init__(self, x: Tensor, y: Tensor, options: FitOptions, inducing: int, hyper: Hyperparameters) -> None:
         self._x, self._y, self._options, self._inducing, self._mirror = x, y, options, inducing, hyper.reflection
@@ -175,11 +179,13 @@ class _Inputs:
         self.mask = torch.ones(x.shape[1], dtype=torch.bool)
 
     def without(self, out: Sequence[int], odds: float) -> bool:
-        """Try to leave out the inputs ``out`` as well; do so and return true if this lowers the cost."""
+        """Leave out the inputs ``out`` as well if the negative bound without them is below the present one plus
+        ``odds`` for each input, the prior log odds of leaving out an input. Return whether they were left out."""
         mask = self.mask.index_fill(0, torch.tensor(out), value=False)
         mirror = self._reflection(mask)
         if mirror is not None and mirror.parity < 0 and bool((mirror.signs > 0).all()):
-            return False  # an odd function of unchanged inputs only is zero everywhere
+            # An odd function is zero everywhere if no remaining input changes its sign under the reflection.
+            return False
         others = np.ones(len(self._theta) - int(self.mask.sum()), dtype=bool)
         start = self._theta[np.concatenate([mask[self.mask].numpy(), others])]
         cost, theta = _searched(self._x[:, mask], self._y, self._options, start, self._inducing, mirror)
@@ -198,7 +204,8 @@ class _Inputs:
 
 
 def _effects(posterior: Posterior, x: Tensor) -> Tensor:
-    """Return how much the mean at x (m, d) changes if one input takes another row's value: root mean squares (d,)."""
+    """Return the effect of each input on the mean, (d,): the root mean square change of the mean at x (m, d) if the
+    values of this input are exchanged between rows."""
     mean, effects = posterior.mean(x), []
     for j in range(x.shape[1]):
         changed = x.clone()
@@ -210,8 +217,8 @@ def _effects(posterior: Posterior, x: Tensor) -> Tensor:
 def _searched(
     x: Tensor, y: Tensor, options: FitOptions, start: Array, inducing: int, reflection: Reflection | None
 ) -> tuple[float, Array]:
-    """Minimise the cost from a start, with inducing points chosen for the start. Return the least cost and its
-    theta."""
+    """Minimise the negative bound over theta, from the theta ``start``, with inducing points chosen for this theta.
+    Return the least value and the theta that has it."""
     parameters = Parameters(x.shape[1], options, reflection)
     clipped = np.clip(start, parameters.lower, parameters.upper)
     inducing_rows = pivots(parameters.hyper(clipped), x, inducing)
@@ -233,9 +240,9 @@ class Bound(Parameters):
         self._constant = 0.5 * len(y) * math.log(2 * math.pi) + self.prior_constant
 
     def __call__(self, theta: Array) -> tuple[float, Array]:
-        """Return value and gradient at theta.
+        """Return the negative bound with priors at theta, and its gradient.
 
-        If float64 can't factor a matrix, a very large cost stops the line search.
+        If a matrix has no Cholesky factor in float64, the value is very large, so that a line search turns back.
         """
         covariances = self._covariances(theta)
         k, noise = covariances.k, self.values(theta)[-1]
@@ -244,13 +251,14 @@ class Bound(Parameters):
         inner.flat[:: m + 1] += JITTER * prior / n
         if (lower := _factor(inner)) is None:
             return 1e10, np.zeros_like(theta)
-        v = _solve_lower(lower, k)  # V of the module's equations
+        v = _solve_lower(lower, k)  # the matrix V of the equations in the module's docstring
         square = v @ v.T
         s = square.copy()
         s.flat[:: m + 1] += noise
         if (root := _factor(s)) is None:
             return 1e10, np.zeros_like(theta)
-        weights = scipy.linalg.cho_solve((root, True), v @ self.y, check_finite=False)  # a of the module's equations
+        # The vector a of the equations in the module's docstring.
+        weights = scipy.linalg.cho_solve((root, True), v @ self.y, check_finite=False)
         inverse = scipy.linalg.cho_solve((root, True), np.eye(m), check_finite=False)
         alpha = (self.y - weights @ v) / noise
         left = prior - float(square.trace())
@@ -300,7 +308,8 @@ class Bound(Parameters):
         Args:
             theta: free parameters.
             covariances: the covariances at theta.
-            outer: gradient over K_uf, (m, n), in which that over K_uu is included.
+            outer: gradient over K_uf, (m, n). It includes the gradient over K_uu, because inducing points are some of
+                the points.
             each: gradient over each entry of K_ff's diagonal, equal for all.
         """
         lengthscale, signal, linear, quadratic, _ = self.values(theta)
@@ -326,9 +335,11 @@ class Bound(Parameters):
 @dataclass(frozen=True)
 class _Covariances:
     k: Array  # (m, n) covariances of the inducing points with all points
-    smooth: list[Array]  # the squared exponential in k, and with a reflection that of the points' mirror images
+    # The squared exponentials in k; with a reflection also those with the mirror images of the points.
+    smooth: list[Array]
     diagonal: Array  # (n,) prior variance of each point
-    mirrored: Array  # (n,) share of the diagonal from each point's own mirror image; empty without a reflection
+    # (n,) part of each diagonal entry that the point's own mirror image causes; empty without a reflection.
+    mirrored: Array
 
 
 def _exponential(a: Array, b: Array) -> Array:

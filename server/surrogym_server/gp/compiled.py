@@ -20,16 +20,13 @@ from surrogym_shared.compiled.jit import inlined
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-# Indices of a process's matrices in the tables:
-# HEAD: the scalars that are numbered below.
-# INPUTS (2, d): columns of x that the process reads, and inverse length scales.
-# POINTS (S, d): points over the length scales, then their mirror images if there is a reflection.
-# WEIGHTS (1, S): weights of the points in the mean.
-# POLYNOMIALS (5 + 2 n, d): coefficients of x and x^2 in the mean, of x^2 and x^4 in the prior variance, of the mirror
-#   image's exponent, and of the polynomial covariances with the n points (first linear, then quadratic).
-# FACTOR (n, n): Cholesky factor L.
-# KEPT, TURNED (d, 256): frequencies of posterior samples over the length scales, of the inputs whose sign a reflection
-#   keeps and of those whose sign it changes.
+# Indices of a process's matrices in the tables: HEAD: the scalars that are numbered below. INPUTS (2, d): columns of x
+# that the process reads, and inverse length scales. POINTS (S, d): points divided by the length scales, then their
+# mirror images if there is a reflection. WEIGHTS (1, S): weights of the points in the mean. POLYNOMIALS (5 + 2 n, d):
+# coefficients of x and x^2 in the mean, of x^2 and x^4 in the prior variance, of the mirror image's exponent, and of
+# the polynomial covariances with the n points (first linear, then quadratic). FACTOR (n, n): Cholesky factor L. KEPT,
+# TURNED (d, 256): frequencies of posterior samples, divided by the length scales: KEPT for inputs whose sign a
+# reflection keeps, TURNED for inputs whose sign it changes.
 HEAD, INPUTS, POINTS, WEIGHTS, POLYNOMIALS, FACTOR, KEPT, TURNED = range(8)
 # Columns of HEAD: scale of the output, constant of the mean, constant of the prior variance, parity of the reflection
 # (0 without one), signal variance, constant of the polynomial covariance, whether there is a polynomial part, number of
@@ -94,12 +91,13 @@ def add_process(
 
 @inlined
 def _smooth(own: Floats, inverse: Floats, points: Floats) -> Floats:
-    """Return exp(-1/2 sum_j (x_j / l_j - X_ij)^2) for inputs x (d, B) and scaled points X (S, d), shape (S, B).
+    """Return exp(-1/2 sum_j (x_j / l_j - X_ij)^2), (S, B), for B inputs x (d, B), length scales l and S points X (S,
+    d), which are divided by the length scales.
 
     Args:
         own: inputs x of the process.
         inverse: inverse length scales 1 / l, (d,).
-        points: points over the length scales.
+        points: the points X, already divided by the length scales.
     """
     size, lanes = own.shape
     scaled = np.empty_like(own)
@@ -132,7 +130,8 @@ def _covariances(head: Floats, rows: Floats, own: Floats, smooth: Floats) -> Flo
         head: matrix HEAD of the process.
         rows: matrix POLYNOMIALS of the process.
         own: inputs of the process.
-        smooth: squared exponential of the inputs with the points and their mirror images, (S, B).
+        smooth: squared exponentials of the inputs with the n points and then with their mirror images, if there is a
+            reflection, (S, B).
     """
     count, parity, signal = int(head[0, COUNT]), head[0, PARITY], head[0, SIGNAL]
     size, lanes = own.shape
@@ -155,7 +154,7 @@ def _covariances(head: Floats, rows: Floats, own: Floats, smooth: Floats) -> Flo
 
 @inlined
 def _explain(factor: Floats, k: Floats) -> None:
-    """Replace k (n, B) by L^-1 k, where ``factor`` (n, n) is the lower triangular L."""
+    """Replace k (n, B) by L^-1 k in place, with the lower triangular matrix L = ``factor`` (n, n)."""
     lanes = k.shape[1]
     for i in range(len(factor)):
         j = 0
@@ -181,7 +180,8 @@ def _std(head: Floats, rows: Floats, own: Floats, explained: Floats, std: Floats
         head: matrix HEAD of the process.
         rows: matrix POLYNOMIALS of the process.
         own: inputs x of the process, (d, B).
-        explained: L^-1 k, (n, B).
+        explained: L^-1 k, (n, B), with the covariances k of the inputs with the n points. Its squares are the variance
+            that the points explain.
         std: array for the result.
     """
     size, lanes = own.shape
@@ -210,12 +210,14 @@ def _std(head: Floats, rows: Floats, own: Floats, explained: Floats, std: Floats
 def _add_residuals(
     head: Floats, rows: Floats, kept: Floats, turned: Floats, own: Floats, k: Floats, paths: Floats, mean: Floats
 ) -> None:
-    """Add the residuals of posterior samples, one sample for each of B inputs, to ``mean`` (B,).
+    """Add to ``mean`` (B,) the difference between a posterior sample and the posterior mean, at B inputs with one
+    sample each.
 
     Args:
         head: matrix HEAD of the process.
         rows: matrix POLYNOMIALS of the process.
-        kept, turned: matrices KEPT and TURNED of the process.
+        kept, turned: matrices KEPT and TURNED of the process: frequencies of the inputs whose sign a reflection keeps,
+            and of those whose sign it changes.
         own: inputs of the process, (d, B).
         k: covariances of the inputs with the n points, (n, B).
         paths: weights of the posterior samples, (B, W), of which the first columns belong to this process.
@@ -270,7 +272,7 @@ def predict(
         numbers, places: the tables.
         at: index of the process's first matrix in the tables.
         x: all inputs of the model.
-        wanted: whether to write the latent standard deviation too.
+        wanted: whether to write latent standard deviations to ``std``.
         paths: (B, W) weights of one posterior sample for each input, whose value then replaces the mean; or (0, W).
         mean, std: arrays for the results, in the output's unit.
     """

@@ -19,9 +19,10 @@ from surrogym_server.gp.search import Evidence, blas, minimum
 from surrogym_server.gp.sparse import hardest
 from surrogym_server.gp.subsets import FEW, SOME, spread
 
-NOISY = 1e-2  # noise variance at which the noisy search starts, as a share of the output's variance
+NOISY = 1e-2  # noise variance at which the search of ``noisy_explanation`` starts, as a share of the output's variance
 MANY_POINTS = 24  # a warm fit to more points tries the default start in one of four fits only
-# Greatest number of points, and of iterations, of each refining search; each starts near the optimum.
+# Refining searches, one after the other: greatest number of points, and of iterations. Each starts near the optimum, so
+# few iterations suffice.
 REFINEMENTS = ((1_000, 20), (2_000, 10))
 HARD, HARD_ITERATIONS = 1_000, 20  # numbers of points and iterations of a search on the points predicted worst
 SHORTER = 0.5  # a fit's second start has length scales shorter by this much in the logarithm
@@ -58,11 +59,11 @@ def fit(
 
 
 def fit_some(x: Tensor, y: Tensor, options: FitOptions, theta: Array, reflection: Reflection | None = None) -> Array:
-    """Fit hyperparameters to at most ``SOME`` of the points x (n, d), y (n,), from a ``theta`` that was fitted to fewer
-    points. Return the new theta.
+    """Fit hyperparameters to at most ``SOME`` of the points x (n, d), y (n,), and return their theta. The argument
+    ``theta`` was fitted to fewer points.
 
-    The optimum moves with more points, because they resolve what fewer points explain as noise. So the search has two
-    starts: ``theta``, and one with shorter length scales and little noise.
+    The optimum changes with more points: they show structure that looks like noise with fewer points. So the search has
+    two starts: ``theta``, and one with shorter length scales and little noise.
     """
     rows = spread(len(y), SOME)
     objective = Evidence(x[rows], y[rows], options, reflection)
@@ -77,9 +78,11 @@ def fit_some(x: Tensor, y: Tensor, options: FitOptions, theta: Array, reflection
 def refine(
     x: Tensor, y: Tensor, options: FitOptions, theta: Array, reflection: Reflection | None = None
 ) -> tuple[Hyperparameters, ...]:
-    """Refine hyperparameters of points x (n, d), y (n,) from ``theta``, the result of ``fit_some``.
+    """Refine hyperparameters on more of the points x (n, d), y (n,), starting from ``theta``, the result of
+    ``fit_some``.
 
-    Each stage searches on more points in fewer iterations, so that the time stays bounded (see ``gp.subsets``).
+    There are several stages. Each uses more points and fewer iterations than the one before, which limits the time (see
+    ``gp.subsets``).
 
     Returns:
         The hyperparameters of ``theta`` and of each stage, in that order; the last stage saw the most points.
@@ -112,10 +115,12 @@ def refine_where_hard(posterior: Posterior, x: Tensor, y: Tensor, options: FitOp
 
 
 def noisy_explanation(posterior: Posterior, options: FitOptions) -> float:
-    """Return the noise variance of the likeliest explanation of a posterior's points: the result of a search that
-    starts with much noise, or the posterior's own variance if that is likelier.
+    """Search for hyperparameters from a start with much noise. Return the noise variance that is found if the points
+    are at least as likely with it as with the posterior's own hyperparameters, otherwise the posterior's own noise
+    variance.
 
-    It detects a warm fit that stays at an optimum without noise. Of many points, at most ``FEW`` are searched.
+    This finds noise that a warm fit missed because it stayed at an optimum without noise. At most ``FEW`` of the points
+    are used.
     """
     rows = spread(len(posterior.y), FEW)
     objective = Evidence(posterior.x[rows], posterior.y[rows], options, posterior.hyper.reflection)
@@ -128,10 +133,10 @@ def noisy_explanation(posterior: Posterior, options: FitOptions) -> float:
 
 
 def _starts(default: Array, warm: Array | None, points: int) -> Sequence[Array]:
-    """Return the starts of a fit: the default start, and the warm start if there is one.
+    """Return the thetas at which a fit starts to search: the default one, and the warm one if there is one.
 
-    With few points there are many optima and a fit is cheap, so both are tried. With more than ``MANY_POINTS`` points a
-    warm fit tries the default start in one of four fits only.
+    With at most ``MANY_POINTS`` points there are many optima and a fit is fast, so both are used. With more points a
+    fit with a warm start uses the default start only if ``points`` is a multiple of 4.
     """
     if warm is None:
         return (default,)

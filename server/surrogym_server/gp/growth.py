@@ -40,17 +40,19 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Growing:
-    """Result of a fit of F with rates: the process G and the rates of its inputs."""
+    """Result of fitting F, a function that changes faster the larger an input is (see the module): an ordinary process
+    G, and the rate of each input."""
 
     fitted: Fitted  # fit of the process G (see the module); `score` is that of F, and `theta` ends with the rates
     rates: tuple[float, ...]  # (d,) rate of each input
 
 
 def fit_growing(z: Tensor, t: Tensor, may: Tensor, options: FitOptions, starts: Sequence[Array]) -> Growing:
-    """Fit F to inputs z (n, d) and targets t (n,), both standardised. Runs on the CPU.
+    """Fit F, a function that changes faster the larger an input is (see the module), to inputs z (n, d) and targets t
+    (n,), both standardised. Runs on the CPU.
 
     Args:
-        may: (d,) bool, the inputs that may have a rate. All their samples lie within ``EDGE``.
+        may: (d,) bool, the inputs that may have a rate. The absolute values of these inputs are at most ``EDGE``.
         options: options of the fit without rates; they must have no quadratic part.
         starts: thetas of fits without rates, or of earlier fits with rates.
 
@@ -75,7 +77,8 @@ def fit_growing(z: Tensor, t: Tensor, may: Tensor, options: FitOptions, starts: 
 
 
 class _GrowingObjective:
-    """Negative log evidence, priors included, over theta = [theta of G, rates of the inputs that may have one]."""
+    """Negative log evidence of F, priors included, as a function of theta = [theta of the process G, rates of the
+    inputs that may have one]; see the module."""
 
     def __init__(self, z: Tensor, t: Tensor, may: Tensor, options: FitOptions) -> None:
         if options.quadratic:
@@ -94,7 +97,8 @@ class _GrowingObjective:
         return rates
 
     def plain(self, theta: Array) -> tuple[Evidence, Array]:
-        """Return the objective of G at the rates in theta, and the derivatives of w over the rates, (n, d)."""
+        """Return the objective of the process G at the rates in theta, and the derivatives of its inputs w over the
+        rates, (n, d)."""
         rates, z = self.rates(theta), self._z
         small = np.abs(rates) < FLAT
         safe = np.where(small, 1.0, rates)

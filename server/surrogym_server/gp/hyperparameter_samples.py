@@ -20,7 +20,8 @@ from surrogym_server.gp.search import Evidence, blas, minimum
 
 BURN_IN, THINNING = 30, 10  # number of updates before the first sample, and between two samples
 SHORTER = (0.0, 1.0, 2.0)  # each start has length scales shorter by this much in the logarithm than the fitted ones
-NARROWEST = 1e-6  # an update is given up if its interval of angles is narrower than this, in radians
+# An update leaves theta unchanged if its interval of rotation angles becomes narrower than this, in radians.
+NARROWEST = 1e-6
 
 Array = NDArray[np.float64]
 
@@ -28,10 +29,11 @@ Array = NDArray[np.float64]
 def hyperparameter_samples(
     posterior: Posterior, count: int, seed: int, noise_floor: float = NOISE_FLOOR, most_noise: float = MOST_NOISE
 ) -> tuple[Hyperparameters, ...]:
-    """Draw hyperparameters from their posterior given the points of a process. The same arguments give the same result.
+    """Draw samples of hyperparameters from their posterior distribution, given the points of a process. The same
+    arguments give the same result.
 
     Args:
-        posterior: an exact process, whose own hyperparameters start the chain.
+        posterior: an exact process. The Markov chain starts at its hyperparameters.
         count: number of samples.
         seed: seed of the chain.
         noise_floor: least noise variance, as in the fit: a share of the output's variance.
@@ -57,8 +59,8 @@ def hyperparameter_samples(
 
 
 def _with_less_noise(evidence: Evidence, theta: Array) -> Array:
-    """Return the likeliest theta within the bounds of ``evidence``, searched from ever shorter length scales: what was
-    noise before must now vary within short distances."""
+    """Return the likeliest theta within the bounds of ``evidence``, which allow less noise than before. The searches
+    start at several shorter length scales, because the function now has to explain what was noise before."""
     starts = [theta.copy() for _ in SHORTER]
     for start, shorter in zip(starts, SHORTER, strict=True):
         start[: evidence.d] -= shorter
@@ -66,7 +68,8 @@ def _with_less_noise(evidence: Evidence, theta: Array) -> Array:
 
 
 class _Chain:
-    """Markov chain of theta, whose stationary distribution is the posterior of theta."""
+    """Markov chain of theta, the logarithms of hyperparameters. Its stationary distribution is the posterior of theta
+    given the points."""
 
     def __init__(self, evidence: Evidence, rng: np.random.Generator) -> None:
         self._evidence, self._rng = evidence, rng

@@ -21,7 +21,7 @@ from surrogym_server.gp.posterior import Posterior
 
 @dataclass(frozen=True)
 class Joint:
-    """Posterior of a process at m fixed points, in the standardised units of the process."""
+    """Joint posterior distribution of a process at m fixed points, in the standardised units of the process."""
 
     hyper: Hyperparameters
     x: Tensor  # (m, d) inputs of the m points
@@ -32,7 +32,7 @@ class Joint:
 
     @classmethod
     def of(cls, posterior: Posterior, x: Tensor) -> Joint:
-        """Return the joint posterior at points x (m, d), before any assumed observation."""
+        """Return the joint posterior at points x (m, d), given the points of the process alone."""
         k = covariance(posterior.hyper, posterior.x, x)
         whitened = torch.linalg.solve_triangular(posterior.factor, k, upper=False)
         latent = (variance(posterior.hyper, x) - whitened.square().sum(0)).clamp_min(0)
@@ -46,8 +46,8 @@ class Joint:
         return prior - explained
 
     def row(self, index: int) -> Tensor:
-        """Return r (m,) for an observation at point ``index``: its covariances with all points, over the standard
-        deviation of the observation."""
+        """Return the vector r (m,) of the module's docstring for an observation at point ``index``: the covariances of
+        this point with all points, divided by the standard deviation of the observation."""
         shared = self.between(slice(index, index + 1), slice(None))[0]
         return shared / (self.variance[index] + self.noise).sqrt()
 

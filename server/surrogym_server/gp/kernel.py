@@ -21,20 +21,22 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Reflection:
-    """A symmetry of functions: f(signs x) = parity f(x)."""
+    """Mirror symmetry of functions: f(signs x) = parity f(x)."""
 
     signs: Tensor  # (d,) 1 or -1: the factor of each input in the mirror image
-    parity: int  # 1: even, -1: odd
+    parity: int  # 1 for even functions, -1 for odd functions
 
     @property
     def kept(self) -> Tensor:
-        """1 for each input x_j for which f(x) = x_j has this symmetry, 0 for the others; shape (d,)."""
+        """Which linear terms have this symmetry, (d,): 1 for each input x_j for which the function f(x) = x_j has it, 0
+        for the others."""
         return (1 + self.parity * self.signs) / 2
 
 
 @dataclass(frozen=True)
 class Polynomial:
-    """The coefficients of constant + sum_j linear_j x_j x'_j + sum_j quadratic_j x_j^2 x'_j^2."""
+    """Coefficients of the covariance constant + sum_j linear_j x_j x'_j + sum_j quadratic_j x_j^2 x'_j^2 of inputs x
+    and x'."""
 
     constant: float
     linear: Tensor  # (d,) coefficient of each x_j x'_j
@@ -43,11 +45,11 @@ class Polynomial:
 
     @classmethod
     def of(cls, linear: float, quadratic: float, reflection: Reflection | None, like: Tensor) -> Polynomial:
-        """Build the polynomial with the terms of the reflection's parity, or with all terms without a reflection.
+        """Build the polynomial. With a reflection, it only has the terms that have this symmetry.
 
         Args:
             linear: variance of the constant and of each linear term.
-            quadratic: variance of each square.
+            quadratic: variance of each quadratic term.
             reflection: the symmetry of the process, or None.
             like: any tensor (..., d), which gives the number of inputs, the dtype and the device.
         """
@@ -73,7 +75,7 @@ class Polynomial:
 class Hyperparameters:
     """Hyperparameters of a process, chosen by the marginal likelihood, in units of standardised inputs and outputs."""
 
-    lengthscale: Tensor  # (d,) one for each input
+    lengthscale: Tensor  # (d,) length scale of each input
     signal_variance: float
     linear_variance: float  # 0 means no linear part
     quadratic_variance: float  # 0 means no quadratic part
@@ -94,14 +96,16 @@ class Hyperparameters:
 
     @property
     def polynomial(self) -> Polynomial:
-        """Polynomial part of the covariance: all of it but the squared exponential."""
+        """Polynomial part of the covariance, that is everything except the squared exponential."""
         return Polynomial.of(self.linear_variance, self.quadratic_variance, self.reflection, self.lengthscale)
 
 
 def covariance(hyper: Hyperparameters, a: Tensor, b: Tensor) -> Tensor:
-    """Latent covariance of inputs a (..., m, d) and b (..., n, d), shape (..., m, n).
+    """Return the prior covariance, without noise, of the function at inputs a (..., m, d) and b (..., n, d), (..., m,
+    n).
 
-    Distances are taken by differences: the expansion |a|^2 + |b|^2 - 2 a.b loses the digits that a small noise needs.
+    Squared distances are computed from differences. The expansion |a|^2 + |b|^2 - 2 a.b has a rounding error that is
+    too large if the noise is small.
     """
     k = hyper.signal_variance * _smooth(hyper, a, b)
     if (reflection := hyper.reflection) is not None:
@@ -110,7 +114,7 @@ def covariance(hyper: Hyperparameters, a: Tensor, b: Tensor) -> Tensor:
 
 
 def variance(hyper: Hyperparameters, x: Tensor) -> Tensor:
-    """Latent prior variance k(x, x) of inputs x (m, d), shape (m,)."""
+    """Return the prior variance k(x, x), without noise, of the function at inputs x (m, d), (m,)."""
     prior = torch.full(x.shape[:-1], hyper.signal_variance, dtype=x.dtype, device=x.device)
     if (reflection := hyper.reflection) is not None:
         prior = prior + hyper.signal_variance * reflection.parity * (x.square() @ to_mirror(hyper)).exp()
@@ -118,7 +122,8 @@ def variance(hyper: Hyperparameters, x: Tensor) -> Tensor:
 
 
 def to_mirror(hyper: Hyperparameters) -> Tensor:
-    """Coefficients c (d,) with e(x, s x) = exp(sum_j c_j x_j^2): x and s x differ by 2 x_j where s_j is -1."""
+    """Return coefficients c (d,) such that exp(sum_j c_j x_j^2) is the squared exponential between x and its mirror
+    image s x. These two differ by 2 x_j in each input with s_j = -1."""
     assert hyper.reflection is not None
     return (hyper.reflection.signs - 1) / hyper.lengthscale.square()
 

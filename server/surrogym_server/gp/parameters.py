@@ -21,10 +21,11 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class FitOptions:
-    """Parts of the kernel, and normal priors (mean, standard deviation) on the logarithms of hyperparameters.
+    """Options of a fit: which parts the kernel has, and normal priors (mean, standard deviation) on the logarithms of
+    hyperparameters.
 
-    Inputs and outputs are standardised. The length scale's prior grows with sqrt(d), as distances do (Hvarfner et al.,
-    ICML 2024).
+    Inputs and outputs are standardised. The prior median of a length scale grows with sqrt(d), as distances between
+    points do (Hvarfner et al., ICML 2024).
     """
 
     linear: bool = True  # whether the kernel has a linear part
@@ -40,7 +41,8 @@ class FitOptions:
 
 
 class Parameters:
-    """Free parameters theta of a process over d inputs: their order, priors and bounds."""
+    """Free parameters theta of a process over d inputs, which are the logarithms of its hyperparameters: their order,
+    priors and bounds."""
 
     def __init__(self, d: int, options: FitOptions, reflection: Reflection | None) -> None:
         self.d, self.options, self.reflection = d, options, reflection
@@ -79,8 +81,8 @@ class Parameters:
     def standardised(self, theta: Array) -> Array:
         """Return how far each free parameter is from its prior's mean, in the prior's standard deviations.
 
-        The negative log density of the priors is half the sum of its squares, plus ``prior_constant``, plus
-        log(2 pi) / 2 for each free parameter.
+        The negative log density of the priors is half the sum of the squares of this result, plus ``prior_constant``,
+        plus log(2 pi) / 2 for each free parameter.
         """
         distance: Array = (theta - self.prior[:, 0]) / self.prior[:, 1]
         return distance

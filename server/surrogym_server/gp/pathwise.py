@@ -32,8 +32,8 @@ FREQUENCIES = 256  # number S of frequencies of the random Fourier features
 
 @dataclass(frozen=True)
 class Pathwise:
-    """Posterior samples of one process. Each is a row of ``size`` weights: first those of the prior's features, then
-    those of the n points."""
+    """Sampler of functions from the posterior of one process. A sampled function is a row of ``size`` weights: first
+    the weights of the prior's features, then those of the n points."""
 
     posterior: Posterior
 
@@ -50,12 +50,14 @@ class Pathwise:
         return torch.cat([prior, -torch.cholesky_solve(at_points.T, posterior.factor).T], 1)
 
     def residual(self, x: Tensor, weights: Tensor) -> Tensor:
-        """Return the value less the posterior mean of sample i, ``weights`` (N, size), at input i of x (N, d): (N,)."""
+        """Return, for each of N inputs x (N, d), by how much the posterior sample in the same row of ``weights`` (N,
+        size) exceeds the posterior mean, (N,)."""
         k = covariance(self.posterior.hyper, x, self.posterior.x)
         return (torch.cat([self._prior(x), k], 1) * weights).sum(1)
 
     def _noise(self, at_samples: Tensor) -> Tensor:
-        """Return noise of the n points, (N, n), made from standard normal ``at_samples`` (N, n)."""
+        """Return N samples of the noise at the n points, (N, n), computed from standard normal numbers ``at_samples``
+        (N, n)."""
         posterior = self.posterior
         if posterior.sparse is not None:
             return at_samples @ self._sparse_noise
@@ -63,7 +65,8 @@ class Pathwise:
 
     @cached
     def _sparse_noise(self) -> Tensor:
-        """Square root (n, n) of the remaining noise covariance at inducing points, F F^T - k(Z, Z)."""
+        """Symmetric square root (n, n) of the covariance of the noise at the n inducing points Z, which is F F^T - k(Z,
+        Z), with F the factor of the posterior."""
         posterior = self.posterior
         left = posterior.factor @ posterior.factor.T - covariance(posterior.hyper, posterior.x, posterior.x)
         values, vectors = torch.linalg.eigh(left)
@@ -80,8 +83,8 @@ class Pathwise:
         return self._prior(self.posterior.x)
 
     def _prior(self, x: Tensor) -> Tensor:
-        """Return features of the prior at x (m, d), (m, 2 S + those of the polynomial parts). Their scalar products
-        approximate the prior covariance."""
+        """Return features of the prior at x (m, d): 2 S random Fourier features, then those of the polynomial parts.
+        The scalar product of the features at two inputs approximates their prior covariance."""
         hyper = self.posterior.hyper
         parts = [self._waves(x)]
         if (reflection := hyper.reflection) is not None:
@@ -103,7 +106,7 @@ class Pathwise:
 @cache
 @torch.inference_mode(False)
 def frequencies(d: int, device: torch.device) -> Tensor:
-    """Return frequencies (d, S) of the squared exponential, in units of 1 / length scale: standard normal numbers from
-    a fixed seed."""
+    """Return the frequencies of the random Fourier features of the squared exponential, (d, S), in units of 1 / length
+    scale. They are standard normal numbers from a fixed seed."""
     values = np.random.Generator(np.random.Philox(key=d)).standard_normal((d, FREQUENCIES))
     return torch.from_numpy(values).to(device)

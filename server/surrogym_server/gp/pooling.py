@@ -24,21 +24,22 @@ from surrogym_server.gp.search import Evidence, blas, minimum
 from surrogym_server.gp.subsets import FEW, spread
 
 Inputs = tuple[int, ...]
-STARTS, SWEEPS = 3, 4  # number of starts, and of sweeps from each, in a search for corresponding inputs
+# Number of starts of a search for corresponding inputs, and greatest number of steps from each start.
+STARTS, SWEEPS = 3, 4
 
 
 @dataclass(frozen=True)
 class Part:
-    """One output that may join a pool: its exact process, its samples and its unit.
+    """One output that may share its samples with others in a pool: its exact process, its samples and its unit.
 
     Attributes:
         x: inputs (n, D).
         y: standardised targets (n,); in the output's unit they are centre + scale y.
         hyper: hyperparameters of the process of all inputs, for standardised targets.
-        centre, scale: unit of the output, see ``y``.
+        centre, scale: mean and scale with which the targets were standardised, see ``y``.
         options: options with which the process was fitted.
-        reads: indices of the inputs that the process probably reads, ascending.
-        fewer: hyperparameters of the process of these inputs only.
+        reads: indices of the inputs that the output probably depends on, ascending.
+        fewer: hyperparameters of the process that reads only the inputs ``reads``.
         signs: (D,) signs of the inputs in the mirror image of the environment, or None if it has no mirror symmetry.
     """
 
@@ -54,7 +55,8 @@ class Part:
 
     @cached_property
     def alone(self) -> float:
-        """Log evidence of this output's targets from its own samples only."""
+        """Log evidence of this output's targets if it is modelled separately, by the likelier of its two processes:
+        that of all inputs, or that of the inputs ``reads``."""
         return max(self.evidence(self.hyper, self.x, self.y), self.evidence(self.fewer, self.read(self.reads), self.y))
 
     @cached_property
@@ -71,8 +73,8 @@ class Part:
         return (other.centre + other.scale * other.y - self.centre) / self.scale
 
     def evidence(self, hyper: Hyperparameters, x: Tensor, y: Tensor) -> float:
-        """Return the log evidence, in the output's unit, of targets (n,) that are standardised like this part's, at
-        inputs (n, d)."""
+        """Return the log evidence, in the output's unit, of targets y (n,) at inputs x (n, d). The targets are
+        standardised with this part's centre and scale."""
         objective = Evidence(x, y, self.options, hyper.reflection)
         return -objective(objective.theta(hyper))[0] - len(y) * math.log(self.scale)
 
@@ -82,11 +84,12 @@ class Pool:
     """Outputs that are modelled as one function.
 
     Attributes:
-        numbers: indices of the pooled parts in the sequence given to ``pools``.
-        parts: the pooled parts. The first one gives the unit.
-        inputs: for each part, the indices of its inputs in the order in which the function reads them.
-        hyper: hyperparameters of the function, in the unit of the first part.
-        gain: log evidence of the pool less that of the separate parts.
+        numbers: indices of the pooled parts in the argument ``parts`` of ``pools``.
+        parts: the pooled parts. The centre and scale of the first one apply to the common function.
+        inputs: for each part, the indices of its inputs that correspond to the arguments of the common function, in the
+            order of these arguments.
+        hyper: hyperparameters of the common function, in the standardised unit of the first part.
+        gain: log evidence of the common function less the sum of those of the separate parts.
     """
 
     numbers: tuple[int, ...]
@@ -96,11 +99,12 @@ class Pool:
     gain: float
 
     def samples_of(self, member: int, most: int) -> tuple[Tensor, Tensor, Hyperparameters]:
-        """Return inputs (k, d), targets (k,) and hyperparameters of the pooled function, as one part uses them.
+        """Return inputs (k, d), targets (k,) and hyperparameters of the common function, in the form in which the part
+        with index ``member`` uses them.
 
-        The inputs are in ascending order of the part's indices. All of the part's own samples come first; samples of
-        the others fill up to ``most``. Targets are standardised with the part's scale and the first part's centre,
-        which is 0 for an odd function.
+        The columns of the inputs are in ascending order of the part's input indices. The first rows are all samples of
+        the part itself. Samples of the other parts follow, up to ``most`` rows in total. Targets are standardised with
+        the part's scale and the first part's centre, which is 0 for an odd function.
         """
         first, own, inputs = self.parts[0], self.parts[member], self.inputs[member]
         back = [inputs.index(place) for place in sorted(inputs)]
@@ -123,10 +127,11 @@ class Pool:
 
 
 def pools(parts: Sequence[Part], most: int) -> list[Pool]:
-    """Group outputs (parts) that are more likely one function than separate ones. Runs on the CPU.
+    """Group outputs (parts) into pools: outputs whose samples are more likely under one common function than under
+    separate functions. Runs on the CPU.
 
-    Parts with the least leave-one-out error come first, and others join them. Only a part that probably reads at most
-    ``most`` inputs may be first.
+    A part that probably depends on at most ``most`` inputs starts a pool, in the order of the leave-one-out errors, the
+    smallest first. Each part that is not in a pool yet may join it.
 
     Raises:
         NumericalFailure: no jitter makes the covariance of a part's points positive definite.
@@ -149,10 +154,11 @@ def pools(parts: Sequence[Part], most: int) -> list[Pool]:
 
 
 def _inputs_alike(part: Part, other: Part) -> Inputs | None:
-    """Return the inputs of ``other`` that correspond to the inputs that ``part`` reads; None if the two are more likely
-    separate functions.
+    """Return the inputs of ``other`` that correspond to the inputs ``reads`` of ``part``; None if the two parts are
+    more likely separate functions.
 
-    Every order of inputs has the same prior probability. Hyperparameters stay unchanged.
+    All assignments of inputs have the same prior probability. Both alternatives are compared without fitting
+    hyperparameters again.
     """
     if part.options != other.options:
         return None
@@ -171,8 +177,8 @@ def _orders(other: Part, count: int) -> float:
 
 
 def _may_play(part: Part, other: Part) -> Tensor:
-    """Return (d, D) bool: which inputs of ``other`` may correspond to each input that ``part`` reads. Both must have
-    the same sign in a mirror image."""
+    """Return which of the D inputs of ``other`` may correspond to each of the d inputs that ``part`` reads, (d, D)
+    bool. If ``part`` has mirror symmetry, both inputs must have the same sign in a mirror image."""
     mirror: Reflection | None = part.fewer.reflection
     d, size = len(part.reads), other.x.shape[1]
     if mirror is None:
@@ -185,8 +191,9 @@ def _may_play(part: Part, other: Part) -> Tensor:
 def _played(process: Posterior, x: Tensor, y: Tensor, may: Tensor) -> Inputs | None:
     """Find the inputs of x (n, D) with which a process predicts targets y (n,) best; None if no choice is allowed.
 
-    The search starts at the inputs that vary most with the targets. As long as the error shrinks, it exchanges one
-    input, or two with each other. ``may`` (d, D) says which inputs of x may take the place of each of the process's d.
+    The search starts at the inputs that correlate most with the targets. As long as this reduces the mean squared
+    error, it replaces one input by another, which may be one of the chosen; the two then change places. ``may`` (d, D)
+    says which of the D inputs of x may be used as each of the d inputs of the process.
     """
     d, size = may.shape
     if size < d or not bool(may.any(1).all()):
@@ -213,7 +220,8 @@ def _played(process: Posterior, x: Tensor, y: Tensor, may: Tensor) -> Inputs | N
 
 
 def _neighbours(inputs: Inputs, size: int) -> list[Inputs]:
-    """Return all choices in which one input is exchanged for another of the ``size`` inputs, or two change places."""
+    """Return all choices of inputs that differ from ``inputs`` in one step: one input is replaced by another of the
+    ``size`` inputs, or two inputs change places."""
     swaps = []
     for place, old in enumerate(inputs):
         for new in set(range(size)) - {old}:
@@ -228,7 +236,8 @@ def _may_read(may: Tensor, inputs: Inputs) -> bool:
 
 
 def _errors(process: Posterior, x: Tensor, y: Tensor, choices: Sequence[Inputs]) -> Tensor:
-    """Return the mean squared error of the process at targets y (n,) for each choice of inputs, (t,)."""
+    """Return, for each of t choices of inputs, the mean squared error with which the process predicts targets y (n,)
+    from these columns of x, (t,)."""
     points = torch.cat([x[:, list(inputs)] for inputs in choices])
     return (process.mean(points).view(len(choices), len(y)) - y).square().mean(1)
 

@@ -22,7 +22,7 @@ BLOCK = 16_384  # number of rows predicted at once, which bounds the memory
 
 @dataclass(frozen=True)
 class LeftOut:
-    """Accuracy of a process in predicting each of its points from all others."""
+    """Accuracy of leave-one-out predictions: each point of a process is predicted from all other points."""
 
     error: float  # root mean square error, in units of y
     within_one: float  # share of the points within one predictive standard deviation
@@ -31,7 +31,8 @@ class LeftOut:
 
     @classmethod
     def of(cls, error: Tensor, variance: Tensor) -> LeftOut:
-        """Compute the accuracy from prediction errors (n,) and their predicted variances (n,), noise included."""
+        """Compute the accuracy of n predictions from their errors (n,) and their predictive variances (n,), noise
+        included."""
         size, std = error.abs(), variance.sqrt()
         one, two = (float((size <= width * std).double().mean()) for width in (1, 2))
         log_density = -0.5 * float((size.square() / variance + (2 * math.pi * variance).log()).mean())
@@ -43,14 +44,15 @@ class Sparse:
     """Summary of the many points to which a process with inducing points was fitted."""
 
     points: int  # number of points that the process was fitted to
-    unexplained: float  # standard deviation that the inducing points leave (root mean square), over the prior's
+    # Root mean square standard deviation that the inducing points leave unexplained, as a share of the prior's.
+    unexplained: float
     left_out: LeftOut  # accuracy at the points that the process was fitted to
 
 
 @dataclass(frozen=True)
 class Posterior:
-    """A process conditioned on n points. It holds all quantities that prediction needs, so loading recomputes
-    nothing."""
+    """A process conditioned on n points. It contains everything that predictions need, so that nothing is computed
+    again after loading it."""
 
     hyper: Hyperparameters
     x: Tensor  # (n, d) inputs of the points
@@ -61,11 +63,11 @@ class Posterior:
     sparse: Sparse | None = None  # None if the n points are all the data; see ``gp.sparse``
 
     def mean(self, x: Tensor) -> Tensor:
-        """Posterior mean at x (m, d), shape (m,)."""
+        """Return the posterior mean at x (m, d), (m,)."""
         return covariance(self.hyper, x, self.x) @ self.weights
 
     def mean_and_variance(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Posterior mean and latent variance at x (m, d), each (m,)."""
+        """Return the posterior mean and the variance without noise at x (m, d), each (m,)."""
         means, variances = [], []
         for block in torch.split(x, BLOCK):
             k = covariance(self.hyper, block, self.x)
@@ -75,7 +77,8 @@ class Posterior:
         return torch.cat(means), torch.cat(variances)
 
     def joint_covariance(self, x: Tensor) -> Tensor:
-        """Latent covariance of m points with each other, for each of b sets x (b, m, d): (b, m, m)."""
+        """Return the posterior covariances, without noise, of m points with each other, for each of b sets of points x
+        (b, m, d): (b, m, m)."""
         sets, points, _ = x.shape
         k = covariance(self.hyper, x.flatten(0, 1), self.x)
         v = torch.linalg.solve_triangular(self.factor, k.T, upper=False).reshape(-1, sets, points).transpose(0, 1)
@@ -84,13 +87,14 @@ class Posterior:
 
     @property
     def log_evidence(self) -> float:
-        """Log marginal likelihood of the points, without priors of hyperparameters; R&W (2006), eq. 2.30."""
+        """Log marginal likelihood of the points, without priors of hyperparameters; Rasmussen and Williams (2006), eq.
+        2.30."""
         roots = self.factor.diagonal().log().sum()
         return -float(0.5 * (self.y @ self.weights) + roots) - 0.5 * len(self.y) * math.log(2 * math.pi)
 
     @property
     def points(self) -> int:
-        """Number of points that the process was fitted to: n, or more if its n points are inducing points."""
+        """Number of points that the process was fitted to. It is n, or larger if the process has n inducing points."""
         return len(self.y) if self.sparse is None else self.sparse.points
 
     @property
@@ -102,8 +106,8 @@ class Posterior:
         return LeftOut.of(mean - self.y, variance)
 
     def leave_one_out(self) -> tuple[Tensor, Tensor]:
-        """Return the predictive mean and variance (noise included) of each y from all other points, (n,) each; R&W
-        (2006), eq. 5.12."""
+        """Return the mean and variance, noise included, of predicting each target in y from all other points, (n,)
+        each; Rasmussen and Williams (2006), eq. 5.12."""
         precision = torch.cholesky_inverse(self.factor).diagonal()
         return self.y - self.weights / precision, 1 / precision
 
@@ -116,7 +120,8 @@ class Posterior:
         return 0.5 * float((self.y[:, None] - self.y)[equal].square().mean())
 
     def extend(self, x: Tensor, y: Tensor) -> Posterior:
-        """Return the process conditioned on one more point, x (d,) and y (), in O(n^2), by a new row of the factor."""
+        """Return the process conditioned on one more point, x (d,) and y (). This adds a row to the Cholesky factor and
+        takes O(n^2) time."""
         k = covariance(self.hyper, x[None], self.x)
         row = torch.linalg.solve_triangular(self.factor, k.T, upper=False).T
         pivot = variance(self.hyper, x[None]) + self.hyper.noise_variance + self.jitter - row.square().sum(1)
@@ -145,8 +150,8 @@ def factorise(k: Tensor) -> tuple[Tensor, float]:
     """Return the lower Cholesky factor of k (n, n), and the jitter that had to be added to its diagonal.
 
     The jitter is 0, or if that fails 1e-10 of the mean diagonal, increased tenfold until k can be factored. The factor
-    is stored row by row, as a loaded one is. In LAPACK's order, column by column, a new model would differ from a
-    loaded one in the last bits.
+    is stored in memory row by row, as after loading a model from a file. Stored column by column, as LAPACK returns it,
+    it would give predictions that differ in the last bits from those of the loaded model.
 
     Raises:
         NumericalFailure: k can't be factored, even with a jitter of ``MAX_JITTER`` of its mean diagonal.

@@ -20,7 +20,7 @@ from surrogym_server.gp.parameters import Array, FitOptions, Parameters
 
 
 class Objective(Protocol):
-    """Cost over theta, with its gradient and the bounds of theta."""
+    """Cost as a function of free parameters theta, with its gradient and the bounds of theta."""
 
     options: FitOptions
     lower: Array
@@ -45,9 +45,9 @@ def minimum(objective: Objective, start: Array) -> tuple[float, Array]:
 def blas() -> ThreadpoolController:
     """Return a handle that limits the threads of all BLAS libraries in the process.
 
-    L-BFGS-B multiplies matrices of a dozen rows; with more than one thread it waits ten times as long as it computes if
-    the machine has other work. SciPy has a BLAS library beside NumPy's, and a controller only knows libraries that were
-    loaded before it, so SciPy's parts are imported first.
+    L-BFGS-B multiplies matrices of a dozen rows. With more than one thread, on a machine that has other work, it would
+    wait ten times as long as it computes. SciPy has a BLAS library beside NumPy's, and a controller only knows
+    libraries that were loaded before it, so SciPy's parts are imported first.
     """
     for part in ("linalg", "optimize"):
         getattr(scipy, part)
@@ -56,21 +56,21 @@ def blas() -> ThreadpoolController:
 
 @dataclass(frozen=True)
 class Evaluated:
-    """Value and gradient of an objective at one theta, with intermediate results."""
+    """Negative log evidence and its gradient at one theta, with intermediate results."""
 
     value: float
     slopes: Array  # gradient over theta
-    half: Array  # (P,) 1/2 (beta beta^T - K^-1) at each pair of points; entries off the diagonal are doubled
-    weighted: Array  # (1, P), or (2, P) with a reflection: half times the squared exponential
+    half: Array  # (P,) entries of 1/2 (beta beta^T - K^-1) with i >= j; those off the diagonal are doubled
+    weighted: Array  # (1, P), or (2, P) with a reflection: product of ``half`` and the squared exponential
     weights: Array  # (n,) beta = K^-1 y
 
 
 class Evidence(Parameters):
-    """Negative log evidence of n points, priors of hyperparameters included, and its gradient over theta.
+    """Negative log evidence of n points, priors of hyperparameters included, as a function of theta, with its gradient.
 
-    A fit makes thousands of evaluations on a few dozen points. So each symmetric matrix is stored as its pairs i >= j
-    of points, (P,) with P = n (n + 1) / 2, and the computation uses NumPy and LAPACK: the overhead of calling torch
-    would exceed the computation.
+    A fit makes thousands of evaluations on a few dozen points. So of each symmetric matrix only the entries with i >= j
+    are stored, (P,) with P = n (n + 1) / 2. The computation uses NumPy and LAPACK, because calls of torch would take
+    longer than the computation itself.
     """
 
     def __init__(self, x: Tensor, y: Tensor, options: FitOptions, reflection: Reflection | None) -> None:
@@ -79,10 +79,12 @@ class Evidence(Parameters):
         self.n, self.x, self.y = n, x.numpy(), y.numpy()
         self.rows, self.columns = np.tril_indices(n)
         self.places = self.rows * n + self.columns  # index of each pair in the flattened (n, n) matrix
-        self.twice = np.where(self.rows == self.columns, 1.0, 2.0)  # how often a pair occurs in a symmetric matrix
+        # How often an entry with i >= j occurs in the symmetric matrix.
+        self.twice = np.where(self.rows == self.columns, 1.0, 2.0)
         mirrored = [] if reflection is None else [x * reflection.signs]
         differences = [other.numpy()[self.columns] - x.numpy()[self.rows] for other in (x, *mirrored)]
-        # Squared differences of the pairs, (d, P), or with those of the mirror images (d, 2 P).
+        # Squared differences between the two points of each pair, (d, P). With a reflection, those between a point and
+        # a mirror image follow, (d, 2 P).
         self.squared = np.ascontiguousarray(np.concatenate(differences).T ** 2)
         self.parity = 0 if reflection is None else reflection.parity
         self.linear = self._pairs(Polynomial.of(1.0, 0.0, reflection, x)(x, x))
@@ -91,7 +93,8 @@ class Evidence(Parameters):
 
     @property
     def noisy_starts(self) -> list[Array]:
-        """At most one start, with the noise that points with equal inputs and different targets show.
+        """Further thetas at which to start a search: one if points with equal inputs have different targets, otherwise
+        none. Its noise variance is estimated from these points.
 
         A search that has explained such targets by short length scales does not find the noisy optimum by itself.
         """
@@ -110,13 +113,14 @@ class Evidence(Parameters):
         return (1e10, np.zeros_like(theta)) if terms is None else (terms.value, terms.slopes)
 
     def evaluated(self, theta: Array) -> Evaluated | None:
-        """Return value and gradient at theta, or None if K has no Cholesky factor in float64."""
+        """Return value and gradient at theta, or None if the covariance matrix has no Cholesky factor in float64."""
         lengthscale, signal, linear, quadratic, noise = self.values(theta)
         precision = lengthscale**-2
         smooth = (-0.5 * precision) @ self.squared
         np.exp(smooth, out=smooth)
         smooth *= signal
-        smooth = smooth.reshape(-1, len(self.rows))  # one row for the points, another for their mirror images
+        # One row for pairs of points, and with a reflection another for pairs with a mirror image.
+        smooth = smooth.reshape(-1, len(self.rows))
         k = smooth[0] + linear * self.linear + quadratic * self.quadratic
         if self.parity:
             smooth[1] *= self.parity
@@ -147,16 +151,16 @@ class Evidence(Parameters):
         lengthscale, _, linear, _, _ = self.values(theta)
         smooth, line = np.zeros((self.n, self.n)), np.zeros((self.n, self.n))
         smooth.ravel()[self.places], line.ravel()[self.places] = terms.weighted[0], terms.half
-        smooth, line = smooth + smooth.T, line + line.T  # each pair contributes to both of its points
+        smooth, line = smooth + smooth.T, line + line.T  # each pair contributes to the gradients of both of its points
         pulled = (smooth.sum(1)[:, None] * self.x - smooth @ self.x) * lengthscale**-2
         slopes: Array = pulled - linear * (line @ self.x)
         return slopes
 
     def _solve(self, matrix: Array) -> tuple[Array, Array, float] | None:
-        """Return K^-1 (lower half valid), K^-1 y, and half of log det K; None if K has no Cholesky factor.
+        """Return K^-1 (only its lower half is valid), K^-1 y, and 1/2 log det K; None if K has no Cholesky factor.
 
         Args:
-            matrix: K (n, n), of which only the lower half is read. It is overwritten.
+            matrix: the covariance matrix K (n, n). Only its lower half is read, and it is overwritten.
         """
         lapack = scipy.linalg.lapack
         upper, info = lapack.dpotrf(matrix.T, lower=0, overwrite_a=1)  # the transpose has LAPACK's column order
@@ -168,6 +172,6 @@ class Evidence(Parameters):
         return inverse.T, weights, root
 
     def _pairs(self, symmetric: Tensor) -> Array:
-        """Return the pairs i >= j, (P,), of a symmetric matrix (n, n)."""
+        """Return the P entries with i >= j of a symmetric matrix (n, n), (P,)."""
         pairs: Array = symmetric.numpy()[self.rows, self.columns]
         return pairs

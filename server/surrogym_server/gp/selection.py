@@ -22,7 +22,7 @@ from surrogym_server.gp.search import Evidence, blas, minimum
 
 @dataclass(frozen=True)
 class Selection:
-    """Result of an elimination of inputs: a process that reads only some of them."""
+    """Result of eliminating inputs of a process: a process that reads only some of the inputs."""
 
     mask: Tensor  # (d,) bool, true for the inputs that the process reads
     theta: Array  # free parameters of the process
@@ -32,13 +32,15 @@ class Selection:
 
 
 def select_inputs(posterior: Posterior, options: FitOptions, may: Tensor, odds: float) -> Selection:
-    """Eliminate inputs of an exact process backwards, one at a time, as long as its evidence allows. Runs on the CPU.
+    """Leave out inputs of an exact process, one after the other, as long as the process without the input is likely
+    enough. Runs on the CPU.
 
     Args:
         posterior: the process with all inputs, and its points.
         options: options with which the process was fitted.
         may: (d,) bool, the inputs that may be left out. At least one input is kept.
-        odds: prior log odds of leaving out one input more.
+        odds: prior log odds of leaving out one more input. An input is left out if the log evidence decreases by at
+            most this number; if it is negative, the log evidence has to increase by that much.
     """
     search = _Search(posterior, options, may)
     with blas().limit(limits=1):
@@ -69,8 +71,8 @@ class _Search:
         return Evidence(self._posterior.x[:, mask], self._posterior.y, self._options, part)
 
     def whole(self) -> _Subset:
-        """Return all inputs, with hyperparameters fitted from those of the process, which may come from other
-        points."""
+        """Return the subset of all inputs. Its hyperparameters are fitted, starting at those of the process, which may
+        have been fitted to other points."""
         mask = torch.ones_like(self._may)
         theta = self.objective(mask).theta(self._posterior.hyper)
         return self.fitted(_Subset(mask, theta, 0.0))
@@ -81,9 +83,9 @@ class _Search:
         return replace(subset, theta=theta, cost=cost)
 
     def without_one(self, subset: _Subset, most: float) -> _Subset | None:
-        """Return the best subset with one input less, or None if each costs more than ``most``.
+        """Return the subset with one input less that has the lowest cost, or None if this cost is above ``most``.
 
-        The hyperparameters of the best are fitted again only if its cost with the present ones is above ``most``.
+        Its hyperparameters are fitted again only if the cost with the hyperparameters of ``subset`` is above ``most``.
         """
         best = min(self._each_without_one(subset), key=lambda less: less.cost, default=None)
         if best is not None and best.cost > most:
@@ -91,8 +93,8 @@ class _Search:
         return best if best is not None and best.cost <= most else None
 
     def _each_without_one(self, subset: _Subset) -> Iterator[_Subset]:
-        """Yield each subset with one input less, with unchanged hyperparameters, unless the rest forces the function to
-        zero."""
+        """Yield each subset with one input less, with unchanged hyperparameters. Skip a subset on which only the zero
+        function has the symmetry of the process."""
         mirror, places = self._posterior.hyper.reflection, subset.mask.nonzero()[:, 0].tolist()
         for position, place in enumerate(places):
             mask = subset.mask.clone()

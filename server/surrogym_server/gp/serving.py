@@ -27,7 +27,7 @@ from surrogym_server.gp.kernel import Hyperparameters, to_mirror
 from surrogym_server.gp.posterior import Posterior
 from surrogym_server.tensors import CPU, in_blocks
 
-BLOCK = 262_144  # number of covariances held at once, so that they fit into the cache and memory is bounded
+BLOCK = 262_144  # number of covariances computed at once, so that they fit into the cache and memory is bounded
 MIN_ROWS = 64  # least number of rows predicted at once
 MEAN_TOLERANCE = 1e-8  # accepted rounding error of the mean, in prior standard deviations
 VARIANCE_TOLERANCE = 5e-10  # accepted rounding error of the variance, in prior variances
@@ -35,7 +35,8 @@ VARIANCE_TOLERANCE = 5e-10  # accepted rounding error of the variance, in prior 
 
 @dataclass(frozen=True)
 class Output:
-    """One output of a model: centre + scale * process, or the constant centre if ``posterior`` is None.
+    """One output of a model: the function centre + scale * process, or the constant ``centre`` if ``posterior`` is
+    None.
 
     ``inputs`` are the columns of x that the process reads; ``column`` is the output's column in the predicted means.
     """
@@ -49,35 +50,38 @@ class Output:
 
 @dataclass(frozen=True)
 class _Process:
-    """One output's part of the matrix products, with n points and D = 2 d + 1 entries of z."""
+    """Tensors of one output for predictions by matrix products. Its process has n points and d inputs; z = [x, x^2, 1]
+    has D entries."""
 
-    span: slice  # columns of A that belong to the output
+    span: slice  # columns of ``Serving.exponents`` that belong to the output
     inputs: Tensor  # columns of x that the process reads
     inverse_lengthscale: Tensor  # (d,) 1 / lengthscale
-    scaled: Tensor  # (n, d) points in length scales, and their mirror images if there is a reflection: (2 n, d)
+    scaled: Tensor  # (n, d) points divided by length scales; with a reflection also their mirror images, (2 n, d)
     factor: Tensor  # (n, n) lower Cholesky factor, L / sigma_f^2
     polynomial: Tensor | None  # (D, n) coefficients R of the polynomial covariances, over sigma_f^2
     prior: Tensor  # (D,) coefficients of z^2 in the prior variance, without the mirror image's term
     signal_variance: float
     parity: int  # 1 or -1; 0 without a reflection
-    mirror: Tensor | None  # (D,) coefficients of z in the exponent of e(x, s x)
+    # (D,) coefficients of z in the exponent of the squared exponential between x and its mirror image.
+    mirror: Tensor | None
     scale: float
     mean_by_differences: bool
     variance_by_differences: bool
 
     def exponent(self, x: Tensor) -> Tensor:
-        """Return the exponent of the squared exponential at x (m, width) with all points, from differences: (m, n)."""
+        """Return the exponents of the squared exponentials of inputs x (m, width) with all n points, (m, n), computed
+        from differences because these round less than products."""
         a = x.index_select(-1, self.inputs) * self.inverse_lengthscale
         distance = torch.cdist(a, self.scaled, compute_mode="donot_use_mm_for_euclid_dist")
         exponent: Tensor = distance.square_().mul_(-0.5)
         return exponent
 
     def std(self, x: Tensor, z: Tensor, squared: Tensor, smooth: Tensor) -> Tensor:
-        """Return the latent standard deviation (m,), in the output's unit. Overwrites this output's columns of
+        """Return the standard deviation without noise, (m,), in the output's unit. Overwrites this output's columns of
         ``smooth``.
 
         Args:
-            x: all inputs of the model, one row a point.
+            x: all inputs of the model at m points, (m, width).
             z: [x, x^2, 1], (m, D).
             squared: z^2, (m, D).
             smooth: squared exponentials with the points of all processes, (m, S).
@@ -100,7 +104,8 @@ class _Process:
 
 @dataclass(frozen=True)
 class Serving:
-    """Outputs over shared inputs x (m, width), in the form in which they are predicted: O columns of means."""
+    """Outputs of a model, compiled so that few matrix products predict all of them at inputs x (m, width). A prediction
+    has O columns."""
 
     exponents: Tensor  # A (D, S), coefficients of the exponents; S points of all processes
     weights: Tensor  # W (S, O), weights of the points in the means, multiplied by the outputs' scales
@@ -144,8 +149,8 @@ class Serving:
         return in_blocks(self.rows, lambda rows: (self._means(*self._covariances(rows)),), x)[0]
 
     def mean_and_std(self, x: Tensor, columns: Sequence[int]) -> tuple[Tensor, Tensor]:
-        """Return means and latent standard deviations at x (m, width), (m, O) each; the deviations of other columns
-        than ``columns`` are 0."""
+        """Return means and standard deviations without noise at x (m, width), (m, O) each. Only the standard deviations
+        of ``columns`` are computed; those of other columns are 0."""
 
         def block(rows: Tensor) -> tuple[Tensor, Tensor]:
             z, smooth = self._covariances(rows)
@@ -159,7 +164,8 @@ class Serving:
         return mean, std
 
     def _covariances(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Return z (m, D), and the squared exponentials of x with the points of all processes, (m, S)."""
+        """Return z = [x, x^2, 1], (m, D), and the squared exponentials of inputs x (m, width) with the S points of all
+        processes, (m, S)."""
         z = torch.cat([x, x * x, x.new_ones(len(x), 1)], -1)
         exponent = z @ self.exponents
         for process in self.processes.values():
@@ -195,21 +201,24 @@ def _process(output: Output, posterior: Posterior, span: slice, polynomial: Tens
 
 
 def _points(posterior: Posterior) -> Tensor:
-    """Return the points of the squared exponential, (n, d), or (2 n, d) with their mirror images under a reflection."""
+    """Return the points with which inputs have squared exponentials: the n points of the process, (n, d), followed by
+    their mirror images if there is a reflection, (2 n, d)."""
     if (reflection := posterior.hyper.reflection) is None:
         return posterior.x
     return torch.cat([posterior.x, posterior.x * reflection.signs])
 
 
 def _weights(posterior: Posterior) -> Tensor:
-    """Return the weights in the mean of the points and, under a reflection, of their mirror images."""
+    """Return the weights of the points in the posterior mean, followed by those of their mirror images if there is a
+    reflection."""
     if (reflection := posterior.hyper.reflection) is None:
         return posterior.weights
     return torch.cat([posterior.weights, reflection.parity * posterior.weights])
 
 
 def _exponents(posterior: Posterior, inputs: Sequence[int], width: int) -> Tensor:
-    """Return the columns of A for one process, (D, n), or (D, 2 n) with mirror images."""
+    """Return the columns of the matrix A for one process, (D, n), or (D, 2 n) with mirror images. The product of z =
+    [x, x^2, 1] and A gives the exponents of the squared exponentials."""
     points = _points(posterior)
     precision = posterior.hyper.lengthscale.square().reciprocal()
     scaled = points / posterior.hyper.lengthscale
@@ -218,7 +227,8 @@ def _exponents(posterior: Posterior, inputs: Sequence[int], width: int) -> Tenso
 
 
 def _polynomial(posterior: Posterior, inputs: Sequence[int], width: int) -> Tensor:
-    """Return the columns of R for one process: coefficients of z in its polynomial covariances, (D, n)."""
+    """Return the coefficients R (D, n) of z = [x, x^2, 1] in the polynomial covariances of an input x with the n points
+    of one process."""
     polynomial, x = posterior.hyper.polynomial, posterior.x
     constant = x.new_full((len(x),), polynomial.constant)
     return _in_z((x * polynomial.linear).T, (x.square() * polynomial.quadratic).T, constant, inputs, width)
@@ -238,15 +248,16 @@ def _squares_alone(coefficients: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _in_z(linear: Tensor, quadratic: Tensor, constant: Tensor, inputs: Sequence[int], width: int) -> Tensor:
-    """Arrange the coefficients of n quadratic functions of some inputs as columns for the entries of z = [x, x^2, 1].
+    """Arrange the coefficients of n quadratic functions of d inputs as a matrix M, so that z M with z = [x, x^2, 1] are
+    their values for all inputs x of the model.
 
     Args:
         linear, quadratic: coefficients of the inputs and their squares, (d, n) each.
-        constant: constants, (n,).
-        inputs: the d inputs among the ``width`` inputs of the model.
+        constant: constant of each function, (n,).
+        inputs: indices of the d inputs among the ``width`` inputs of the model.
 
     Returns:
-        (2 width + 1, n).
+        The matrix M, (2 width + 1, n).
     """
     rows = linear.new_zeros(2 * width + 1, linear.shape[1])
     at = torch.tensor(inputs, device=linear.device)
@@ -255,8 +266,8 @@ def _in_z(linear: Tensor, quadratic: Tensor, constant: Tensor, inputs: Sequence[
 
 
 def _error_bounds(posterior: Posterior) -> tuple[float, float]:
-    """Return bounds on the error of mean and variance if exponents are computed by products, for x up to twice as far
-    from the origin as the farthest point.
+    """Return bounds on the rounding errors of mean and variance if exponents are computed by matrix products. They hold
+    for inputs up to twice as far from the origin as the farthest point.
 
     With delta the largest error of an exponent, the error of the mean is at most sigma_f^2 delta |beta|_1, in prior
     standard deviations. The error of the variance is 2 |L^-1 k| |L^-1 dk| <= 2 s sigma_f^2 delta sqrt(n) / sigma_n, in

@@ -32,28 +32,30 @@ from surrogym_server.gp.posterior import BLOCK, LeftOut, Posterior, Sparse, cond
 MAX_EXACT = 2_000  # a process with more points uses inducing points
 INDUCING = 1_000  # greatest number of inducing points, unless the caller gives another
 NOISES = (1.0, 1e2)  # noise variances to try, as multiples of the fitted one
-SHARE = 1e-12  # lower limit of the share of all other points in the prediction at a point
-# No further inducing point is chosen below this unexplained variance, as a share of the prior's variance and of the
-# noise variance.
+SHARE = 1e-12  # lower limit of the weight that all other points have in the prediction at a point
+# No further inducing point is chosen if the unexplained variance of all points is below the first share of the prior
+# variance, or below the second share of the noise variance.
 EXPLAINED, BELOW_NOISE = 1e-10, 1e-3
 
 
 @dataclass(frozen=True)
 class Censored:
-    """Points for which only a bound of f is known: side * f(x) is at least side * y."""
+    """Points x at which only a bound y of the function f is known: side * f(x) is at least side * y, with side 1
+    or -1."""
 
     x: Tensor  # (k, d) inputs of the points
     y: Tensor  # (k,) the bounds
     side: Tensor  # (k,) 1 if y is a lower bound of f(x), -1 if it is an upper bound
 
     def log_probability(self, posterior: Posterior) -> float:
-        """Return the sum of the log probabilities that each bound holds, point by point."""
+        """Return the sum over the points of the log probability, under a posterior, that the bound at the point
+        holds."""
         mean, variance = posterior.mean_and_variance(self.x)
         over = self.side * (mean - self.y) / (variance + posterior.hyper.noise_variance).sqrt()
         return float(torch.special.log_ndtr(over).sum())
 
     def misfit(self, posterior: Posterior) -> float:
-        """Return the sum of squares by which the mean violates the bounds."""
+        """Return the sum of the squared amounts by which the posterior mean violates the bounds."""
         return float((self.side * (self.y - posterior.mean(self.x))).clamp_min(0).square().sum())
 
 
@@ -66,15 +68,16 @@ def condition_many(
 ) -> Posterior:
     """Condition a process on x (n, d) and y (n,); with more than ``MAX_EXACT`` points through inducing points.
 
-    Up to ``MAX_EXACT`` points the result is exact, with the last hyperparameters. With more, all points select the
-    hyperparameters, because a fit to a subset may miss rare points: each point is predicted from the others, and each
-    ``censored`` one as well. The predictive density selects the noise, since inducing points leave errors that the
-    fitted noise does not contain. Then the mean squared error selects the hyperparameters. R&W (2006), section 5.4.2.
+    Up to ``MAX_EXACT`` points the result is exact, with the last hyperparameters. With more, one of the candidates is
+    selected by its predictions of all points, each from the others, and of the ``censored`` points, because a fit to a
+    subset may miss rare points. First the density of these predictions selects the noise of each candidate, because
+    inducing points cause errors that the fitted noise does not include. Then the mean squared error selects the
+    candidate. Rasmussen and Williams (2006), section 5.4.2.
 
     Args:
-        hypers: candidates, the last one fitted to the most points.
+        hypers: candidate hyperparameters. The last one was fitted to the most points.
         censored: points with a bound only, or None.
-        earlier: another process of the same points, compared with the candidates, or None.
+        earlier: another posterior of the same points that is also a candidate, or None.
 
     Raises:
         NumericalFailure: no jitter makes a covariance positive definite.
@@ -104,16 +107,17 @@ def condition_sparse(hyper: Hyperparameters, x: Tensor, y: Tensor, most: int | N
 
 
 def pivots(hyper: Hyperparameters, x: Tensor, most: int) -> Tensor:
-    """Return indices (m,) of at most ``most`` of the points x (n, d), in the order of choice: each is the point
-    that the earlier ones explain least."""
+    """Return indices (m,) of at most ``most`` of the points x (n, d), in the order in which they are chosen: each is
+    the point whose variance given the earlier ones is greatest."""
     return _pivots(hyper, x, most)[0]
 
 
 def hardest(posterior: Posterior, x: Tensor, y: Tensor, most: int) -> Tensor:
-    """Return indices of at most ``most`` of the points x (n, d), y (n,) that a process of them predicts worst.
+    """Return the indices of at most ``most`` of the points x (n, d), y (n,): those that the posterior, which was fitted
+    to all of them, predicts worst.
 
-    Half are those that the others explain least, in the order of the pivoted Cholesky. The others have the largest
-    residuals.
+    The first half is chosen by pivoted Cholesky: each is the point whose variance given the earlier ones is greatest.
+    The second half are the points with the largest residuals.
     """
     apart, _, _ = _pivots(posterior.hyper, x, most // 2)
     off = (y - posterior.mean(x)).abs().index_fill(0, apart, -1.0)
@@ -121,8 +125,8 @@ def hardest(posterior: Posterior, x: Tensor, y: Tensor, most: int) -> Tensor:
 
 
 def _with_noises(hyper: Hyperparameters, x: Tensor, y: Tensor) -> Iterator[Posterior]:
-    """Yield the process through inducing points, once for each noise variance of ``NOISES``; the points are the
-    same."""
+    """Yield the process of x (n, d) and y (n,) through inducing points, once for each multiple of the noise variance in
+    ``NOISES``. All use the same inducing points."""
     pivots = _pivots(hyper, x)
     for noise in NOISES:
         yield _projected(replace(hyper, noise_variance=noise * hyper.noise_variance), x, y, pivots)
@@ -149,13 +153,14 @@ def _projected(hyper: Hyperparameters, x: Tensor, y: Tensor, pivots: tuple[Tenso
 
 
 def _left_out(v: Tensor, solid: Tensor, residual: Tensor, noise: float, left: Tensor) -> tuple[Tensor, Tensor]:
-    """Return error and variance, noise included, of each of n points predicted from all others, (n,) each.
+    """Return the errors and the variances (noise included) of predictions of each of n points from all others, (n,)
+    each.
 
     Args:
-        v: V = L^-1 K of the m inducing points and all n, (m, n).
-        solid: Cholesky factor of C + sigma_n^2 I, (m, m).
-        residual: y less the mean at every point, (n,).
-        noise: sigma_n^2.
+        v: V = L^-1 K, with the covariances K of the m inducing points with all n points, (m, n).
+        solid: Cholesky factor of V V^T + sigma_n^2 I, (m, m).
+        residual: target less posterior mean at each point, (n,).
+        noise: noise variance sigma_n^2.
         left: variance that the inducing points leave unexplained, (n,).
     """
     blocks = torch.split(v, BLOCK, dim=1)
@@ -168,8 +173,8 @@ def _pivots(hyper: Hyperparameters, x: Tensor, most: int | None = None) -> tuple
     """Choose at most ``most`` inducing points of x (n, d), by default ``INDUCING``, by pivoted Cholesky.
 
     Returns:
-        Indices of the points in the order of their choice (m,), the rows V (m, n), and the variance that they leave
-        unexplained at each point (n,).
+        Indices of the inducing points in the order in which they were chosen (m,); the rows V (m, n) of the partial
+        Cholesky factor; and the variance of each point that the inducing points leave unexplained (n,).
     """
     left, prior = variance(hyper, x), float(variance(hyper, x).mean())
     enough = max(BELOW_NOISE * hyper.noise_variance, EXPLAINED * prior)

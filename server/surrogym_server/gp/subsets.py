@@ -11,15 +11,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-FEW, SOME = 150, 400  # numbers of points: to compare alternatives, and to fit the chosen one
+FEW, SOME = 150, 400  # numbers of points to which a process is fitted: to compare alternatives, and for the chosen one
 SEED = 0
 
 
 def spread(points: int, most: int) -> Tensor:
     """Select at most ``most`` of the points, as ascending indices (m,).
 
-    All are selected if there are no more than ``most``. Otherwise the sequence is cut into ``most`` equal stretches,
-    and a fixed seed draws one point of each: points at equal distances could sample one phase of a periodic sequence.
+    If there are no more than ``most`` points, all are selected. Otherwise the sequence of points is cut into ``most``
+    equal parts, and one random point of each part is selected, always with the same seed. Points at equal distances
+    could all lie at one phase of a periodic sequence.
     """
     if points <= most:
         return torch.arange(points)

@@ -29,7 +29,8 @@ UNIT_ANGLE = math.sqrt(3) / math.pi  # gives an angle that is uniform on the cir
 def add_features(tables: TablesBuilder, definition: EnvironmentDefinition, encoder: Encoder) -> int:
     """Add the features of an encoder to the tables, and return the index of their first matrix.
 
-    Features of the lead read entries behind those of coordinates and action.
+    Features of the lead (the predicted next values of the leading coordinates) come last. They read entries that follow
+    those of coordinates and action.
     """
     size = len(definition.coordinates)
     rows, weights = np.zeros((len(encoder.columns), 5)), np.zeros((len(encoder.columns), size))
@@ -52,7 +53,7 @@ def encode(
         numbers, places: the tables.
         at: index of the encoder's first matrix.
         observe: index of the terms of the observation.
-        raw: coordinates, action and lead, (C + F + L, B).
+        raw: coordinates, action and lead (next values of the L leading coordinates), (C + F + L, B).
         size: number of coordinates, C.
         x: array for the features.
         begin, end: range of the features.

@@ -16,16 +16,18 @@ from surrogym_shared.compiled.jit import compiled, inlined
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-# Columns of the rules, one row for each coordinate: ends of its reach, its bounds, the coordinate that they stop or -1,
-# and whether it is an angle; then, for a lag, how it repeats a value, and from which row of coordinates and action (-1
-# if it is no lag).
+# Columns of the rules, one row for each coordinate: lower and upper limit of predictions; lower and upper bound; index
+# of the coordinate that becomes 0 at a bound, or -1; whether the coordinate is an angle. Two columns are for lags,
+# which repeat a past value, and -1 for other coordinates: how the lag is computed, and the index of its source in
+# [coordinates, action].
 REACH_LOW, REACH_HIGH, LOW, HIGH, STOPS, ANGLE, LAG, SOURCE = range(8)
-# How a lag repeats: change of a coordinate, change of an angle, value before the step, or value before the step plus 1.
+# How a lag is computed from its source: change in the step, change of an angle, value before the step, or this value +
+# 1.
 CHANGE, TURN, REPEAT, COUNT = range(4)
 
 
 def add_rules(tables: TablesBuilder, definition: EnvironmentDefinition) -> int:
-    """Add the matrix that ``settle`` and ``repeat`` read to the tables, and return its index."""
+    """Add to the tables the matrix of rules, which ``settle`` and ``repeat`` read, and return its index."""
     low, high = (end.tolist() for end in definition.reach)
     return tables.add(
         [
@@ -51,8 +53,9 @@ def _lag(definition: EnvironmentDefinition, index: int, lag: LagDefinition) -> t
 
 
 def add_inverse(tables: TablesBuilder, inverse: ObservationInverse | None) -> int:
-    """Add the entries from which moving coordinates are read back to the tables, -1 for none, and return their
-    index."""
+    """Add a matrix that says from which entries of an observation each moving coordinate is computed, and return its
+    index. Its rows are (coordinate, entry, -1), or for an angle (coordinate, cosine, sine). It is empty without an
+    inverse."""
     sources = () if inverse is None else inverse.sources
     rows = [(index, *entries, *[-1] * (2 - len(entries))) for index, entries in sources]
     return tables.add(np.array(rows).reshape(-1, 3))
@@ -60,14 +63,15 @@ def add_inverse(tables: TablesBuilder, inverse: ObservationInverse | None) -> in
 
 @compiled
 def clipped(rules: Floats, c: int, value: float) -> float:
-    """Return a value of coordinate c, clipped to its reach."""
+    """Return a value of coordinate c, clipped to the coordinate's limits (see ``EnvironmentDefinition.reach``)."""
     low, high = rules[c, REACH_LOW], rules[c, REACH_HIGH]
     return low if value < low else (high if value > high else value)
 
 
 @inlined
 def settle(rules: Floats, q: Floats) -> None:
-    """Apply the rules of the environment to coordinates q (C, B) in place: clip, stop at walls, wrap angles."""
+    """Apply the rules of the environment to coordinates q (C, B) in place: clip them to limits, set a speed that points
+    into a wall to 0, wrap angles."""
     size, lanes = q.shape
     for c in range(size):
         for b in range(lanes):
@@ -86,8 +90,8 @@ def settle(rules: Floats, q: Floats) -> None:
 
 @inlined
 def repeat(rules: Floats, raw: Floats, q: Floats) -> None:
-    """Set the lags of next coordinates q (C, B) to the values of coordinates and action, raw (C + F, B), that they
-    repeat."""
+    """Set the lags among the next coordinates q (C, B). A lag is a coordinate that repeats a past value; it is computed
+    from ``raw`` (C + F, B), the coordinates and action before the step."""
     size, lanes = q.shape
     for c in range(size):
         lag, source = int(rules[c, LAG]), int(rules[c, SOURCE])
@@ -104,8 +108,8 @@ def repeat(rules: Floats, raw: Floats, q: Floats) -> None:
 
 @inlined
 def recover(numbers: Floats, places: Ints, at: int, o: Floats, q: Floats) -> None:
-    """Read the moving coordinates back from observations o (D, B), and write them to q (C, B); ``at`` is the index of
-    the inverse."""
+    """Compute the moving coordinates from observations o (D, B), and write them to q (C, B). ``at`` is the index of the
+    matrix from ``add_inverse``."""
     sources = matrix(numbers, places, at)
     for s in range(len(sources)):
         c, first, second = int(sources[s, 0]), int(sources[s, 1]), int(sources[s, 2])
