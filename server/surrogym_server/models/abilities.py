@@ -31,18 +31,18 @@ def offers(model: DynamicsModel, ability: type[A]) -> A | None:
 
 
 class TakesPrior(ABC):
-    """Ability of a ``Learner`` to use a prior: a model of the same family and definition that represents earlier
-    knowledge, such as a model of a simulator.
+    """Ability of a ``Learner`` to use a prior: an earlier model of the same family and definition, such as a model of a
+    simulator of the environment.
 
-    Fallback of ``services``: the prior is refused.
+    A learner without this ability: ``services`` refuses the prior.
     """
 
     @abstractmethod
     def learn_beside(
         self, prior: DynamicsModel, definition: EnvironmentDefinition, samples: Samples, warm: Warm | None = None
     ) -> Learned:
-        """Fit as ``Learner.learn`` does, with the prior's prediction as the mean of those outputs for which this
-        predicts left-out samples better.
+        """Fit as ``Learner.learn`` does, but use the prior's prediction as the prior mean of an output if left-out
+        samples are then predicted better.
 
         Raises:
             TypeError: the prior belongs to another family.
@@ -52,22 +52,25 @@ class TakesPrior(ABC):
 
 
 class FunctionDraws(ABC):
-    """Ability to sample whole functions from the posterior, each consistent for a whole episode.
+    """Ability to sample functions from the posterior. An episode can follow one of them: equal inputs then give equal
+    predictions throughout the episode.
 
-    Fallback of ``models.draws``: keep one standard normal number for each transition output during an episode, and
-    shift the output everywhere by that many standard deviations, as if its error were the same at all states.
+    For a model without this ability, ``models.draws`` draws one standard normal number for each transition output and
+    episode, and adds this number of standard deviations to the output's mean at all states.
     """
 
     @property
     @abstractmethod
     def path_size(self) -> int:
-        """Number W of standard normal numbers that a sampled function takes, which is also its number of weights."""
+        """Number W of weights that represent a sampled function; also the number of standard normal numbers from which
+        they are computed."""
 
     @abstractmethod
     def draw(self, noise: Tensor) -> Tensor:
-        """Sample functions (N, W), one from each row of standard normal ``noise`` (N, W).
+        """Return the weights (N, W) of N sampled functions, each computed from one row of standard normal numbers
+        ``noise`` (N, W).
 
-        Each draw is a pure function of its row, except for the last bits.
+        The weights of a function depend on its own row alone, except for the last bits.
         """
 
     @abstractmethod
@@ -81,27 +84,30 @@ class FunctionDraws(ABC):
         stds: bool = False,
         reward_std: bool = False,
     ) -> Transition:
-        """Predict as ``transition`` does, with each row along a sampled function of its own.
+        """Predict as ``transition`` does, but with the values of a sampled function, one for each row, instead of the
+        mean.
 
         Args:
-            paths: (m, W') the functions, W' >= W; the first W = ``path_size`` columns are used.
+            paths: (m, W') weights of the function of each row, W' >= W; the first W = ``path_size`` columns are used.
             q, u, process, stds, reward_std: as for ``transition``.
         """
 
 
 class UncertainHyperparameters(ABC):
-    """Ability to sample functions with sampled hyperparameters, because few samples don't determine these.
+    """Ability to sample functions with sampled hyperparameters, because few samples don't determine the
+    hyperparameters.
 
-    Fallback of ``virtual``: the functions of ``FunctionDraws``, sampled with the optimal hyperparameters.
+    For a model without this ability, ``virtual`` samples functions with the optimal hyperparameters, see
+    ``FunctionDraws``.
     """
 
     @property
     @abstractmethod
     def uncertain_functions(self) -> FunctionDraws:
-        """Object that samples functions with uncertain hyperparameters.
+        """Sampler of functions that also samples the hyperparameters of each function.
 
-        The first use of this property may take as long as a fit. If the object has compiled steps, they are those of
-        its own ``CompiledSteps``.
+        The first use of this property may take as long as a fit. If the sampler has compiled steps, it offers them by
+        the ability ``CompiledSteps``, independently of the model.
         """
 
 
@@ -117,8 +123,8 @@ class LeaveOneOutErrors:
 class LeaveOneOut(ABC):
     """Ability to compute leave-one-out errors on the samples.
 
-    Fallback of ``sampling``: the errors are unknown, None in the fidelity. A design that requires tests on left-out
-    samples then never counts as ready, and spends its budget.
+    For a model without this ability, the errors are unknown: None in the fidelity report. A design that requires
+    leave-one-out errors within the tolerances then never counts as ready, and spends its whole budget.
     """
 
     @abstractmethod
@@ -129,7 +135,7 @@ class LeaveOneOut(ABC):
 class LearnedNoise(ABC):
     """Ability to learn the noise of a single step together with the function.
 
-    Fallback of ``sampling``: the environment counts as noiseless, and no query is repeated.
+    For a model without this ability, ``sampling`` treats the environment as noiseless and repeats no query.
     """
 
     @property
@@ -139,14 +145,16 @@ class LearnedNoise(ABC):
 
     @property
     def possible_noise(self) -> tuple[float, ...]:
-        """Standard deviation of each output's noise in a noisier explanation of the samples, if one is at least as
-        likely as the learned one, (O,). Equal to ``noise_stds`` if the family finds or looks for none."""
+        """Greatest standard deviation of each output's noise that is plausible, (O,). If a fit with more noise makes
+        the samples at least as likely as the learned model does, it is the noise of that fit, otherwise ``noise_stds``.
+        """
         return self.noise_stds
 
 
 @dataclass(frozen=True)
 class AtSamples:
-    """Prior of one output's process at k of the samples, in the output's unit."""
+    """Values of one output at k of the samples, and the prior covariance of its function there, in the output's
+    unit."""
 
     rows: Tensor  # (k,) indices of the samples
     targets: Tensor  # (k,) values of the output less their mean
@@ -155,20 +163,21 @@ class AtSamples:
 
 
 class SampledFunctions(ABC):
-    """Ability to give the covariance of an output's function at the samples, so that other explanations of the noise
-    can be compared with independent noise.
+    """Ability to give the prior covariance of an output's function at the samples. With it, ``sampling`` tests whether
+    noise is independent from step to step or comes from a sensor or from hidden state.
 
-    Fallback of ``sampling``: sensor noise is not distinguished from process noise.
+    For a model without this ability, ``sampling`` does not distinguish sensor noise from process noise.
     """
 
     @abstractmethod
     def at_samples(self, samples: Samples, column: int) -> AtSamples | None:
-        """Return the process of the output ``column`` at the samples from which it learns; None for an output that
-        never varied."""
+        """Return values and prior covariance of the output with index ``column`` at the samples from which it is
+        learned; None for an output that never varied."""
 
 
 class OutputOutlook(ABC):
-    """Forecast of one output's standard deviations at m candidates after some assumed queries, in the output's unit."""
+    """Forecast of one output's standard deviations at m candidates, in the output's unit, as if certain queries had
+    been answered."""
 
     learns: Tensor  # (m,) bool: whether a sample at the candidate would improve this output
 
@@ -190,8 +199,8 @@ class OutputOutlook(ABC):
 
 
 class PathOutlook(ABC):
-    """Forecast of one output along b predicted paths of T steps: its standard deviations, and the information that
-    real steps there would give."""
+    """Forecast of one output along b predicted paths of T steps: its standard deviations at these steps, and the
+    information that real steps along the paths would give about the output."""
 
     learns: Tensor  # (b, T) bool: whether a real step at that point of a path would improve this output
 
@@ -202,9 +211,10 @@ class PathOutlook(ABC):
 
     @abstractmethod
     def information(self, weight: Tensor, tolerance: float) -> Tensor:
-        """Return the information that the first steps of each path give about this output, in nats, (b, T).
+        """Return the information about this output that each path would give up to each of its steps, in nats, (b, T).
 
-        Entry t counts all steps up to t. A step is evaluated given the earlier ones, so a repeated state adds little.
+        Each step counts with what it adds to the earlier steps of its path, so a state that is visited again adds
+        little.
 
         Args:
             weight: (b, T) weight of each step.
@@ -228,16 +238,17 @@ class PredictedSteps:
 
     @property
     def flat(self) -> PredictedSteps:
-        """The same steps with a single leading dimension."""
+        """The same steps as one list: tensors (k, C) or (k, F), with k the number of all steps of all paths."""
         return PredictedSteps(*(tensor.flatten(0, -2) for tensor in (self.q, self.u, self.q_next)))
 
 
 class Lookahead(ABC):
-    """Ability to forecast how further real steps would change the standard deviations, before they are taken.
+    """Ability to forecast how further real steps would change the model's standard deviations, before these steps are
+    taken.
 
-    Fallback of ``sampling``: a sample is assumed to be correlated with nearby points, by their distance in standard
-    deviations of the sampling range. Along paths the steps count as independent, and a planned path does not change the
-    model for the next path.
+    For a model without this ability, ``sampling`` assumes that outputs are correlated at nearby points, depending on
+    their distance in standard deviations of the sampling range. The steps of a path then count as independent, and
+    planning a path does not change the model with which the next path is planned.
     """
 
     @abstractmethod
@@ -254,40 +265,42 @@ class Lookahead(ABC):
 
     @abstractmethod
     def as_if_answered(self, steps: PredictedSteps) -> DynamicsModel:
-        """Return the model as if real steps (T, ...) had been taken as predicted: standard deviations shrink, means
-        stay."""
+        """Return the model as if T real steps had been taken with the predicted results: standard deviations decrease,
+        means stay."""
 
 
 class RewardEdges(ABC):
-    """Ability to find sets of states at whose edges the reward jumps.
+    """Ability to find regions of states inside which the reward is higher or lower by a constant, so that it jumps at
+    their edge.
 
-    Fallback of ``sampling``: no edges are known, and no query is spent on them.
+    For a model without this ability, ``sampling`` knows no such edges and spends no query on them.
     """
 
     @abstractmethod
     def reward_edge_doubts(self, q: Tensor, q_next: Tensor) -> Iterator[Tensor]:
-        """Yield, for each edge, the probability (m,) that the model puts steps from q (m, C) to q_next (m, C) on the
-        wrong side of the edge."""
+        """Yield, for each region of states at whose edge the reward jumps, the probability (m,) that the model is wrong
+        about whether a step from q (m, C) to q_next (m, C) is inside the region."""
 
 
 class RewardPeaks(ABC):
     """Ability to learn rewards that are nearly zero almost everywhere, so that the design can search for their peaks.
 
-    Fallback of ``sampling``: no query is spent on the search.
+    For a model without this ability, ``sampling`` spends no query on such a search.
     """
 
     @property
     @abstractmethod
     def reward_hides(self) -> bool:
-        """Whether this model's reward is nearly zero almost everywhere and was learned in the way that finds its
-        peaks."""
+        """Whether this model's reward is nearly zero almost everywhere and was learned by a method that finds peaks,
+        such as a fit to its logarithm."""
 
     @abstractmethod
     def promise(self, q: Tensor, u: Tensor) -> Tensor:
-        """Return an optimistic score of the reward of steps from q (m, C) under u (m, F), (m,): the higher, the larger
-        the reward may be given the uncertainty.
+        """Return an optimistic score of the reward of steps from q (m, C) under u (m, F), (m,). It is higher where the
+        reward may be larger, given the model's uncertainty.
 
-        The scores have no unit. They keep the order of rewards, and distinguish points whose rewards are nearly zero.
+        Only the order of the scores matters, which is that of the optimistic rewards. It is also meaningful among
+        points whose rewards are nearly zero.
         """
 
 
@@ -305,7 +318,8 @@ class ArrayTransition:
 
 
 class ArraySteps(ABC):
-    """A model's ``transition`` and ``terminated`` in one call on NumPy arrays. Compared and hashed by identity."""
+    """Function that computes a model's ``transition`` and ``terminated`` in one call on NumPy arrays. Two objects are
+    equal only if they are the same object."""
 
     definition: EnvironmentDefinition
 
@@ -325,35 +339,36 @@ class ArraySteps(ABC):
 
         Args:
             q, u, noise, process, stds, reward_std: as for ``DynamicsModel.transition``.
-            paths: (m, W) sampled functions, as for ``FunctionDraws.transition_along``; None for the mean.
+            paths: (m, W) weights of a sampled function for each row, as for ``FunctionDraws.transition_along``; None
+                for the mean.
         """
 
 
 class CompiledSteps(ABC):
-    """Ability to step by compiled code on CPU arrays. Results agree with ``transition`` except for the last bits. A few
-    rows take a tenth of the time.
+    """Ability to predict steps by compiled code on CPU arrays. Results agree with ``transition`` except for the last
+    bits. For few rows, compiled code takes a tenth of the time.
 
-    Fallback of ``virtual``: call ``transition`` and ``terminated``.
+    For a model without this ability, ``virtual`` calls ``transition`` and ``terminated``.
     """
 
     @abstractmethod
     def compiled(self) -> ArraySteps | None:
         """Return the model's compiled steps; None if this installation can't compile, or if the model is on another
-        device.
+        device than the CPU.
 
         The first call in a process loads compiled code. The first call on a machine compiles it.
         """
 
     @abstractmethod
     def compiled_pays(self, *, stds: bool) -> bool:
-        """Return whether compiled steps are faster than ``transition``; ``stds``: with standard deviations in each
-        step."""
+        """Return whether compiled steps are faster than ``transition``. ``stds`` says whether each step computes
+        standard deviations."""
 
 
 @dataclass(frozen=True)
 class StepSource:
-    """C99 source of a model's mean step, its standard deviations and its termination. The functions are declared in
-    its ``step.h``."""
+    """C99 source of functions that compute a model's mean step, its standard deviations and its termination. The file
+    ``step.h`` declares them."""
 
     files: Mapping[str, str]  # file contents by name; step.c is the file to compile
     numbers: int  # number of float64 constants in the source
@@ -362,12 +377,14 @@ class StepSource:
 class WrittenInC(ABC):
     """Ability to write the mean step as C source, for programs that have no Python.
 
-    Fallback of ``deployment``: the model is refused, and the message names the families that have this ability.
+    A model without this ability can't be deployed: ``deployment`` refuses it and names the families that have the
+    ability.
     """
 
     @abstractmethod
     def step_source(self) -> StepSource | None:
         """Return the C source of the mean step, which agrees with ``transition`` except for the last bits.
 
-        None if this installation lacks numba, which lays out the tables, or if the model is on another device.
+        None if numba is not installed, which the model's tables of numbers need, or if the model is on another device
+        than the CPU.
         """

@@ -11,12 +11,14 @@ from surrogym_server.models.port import DynamicsModel, Transition
 
 
 def function_draws(model: DynamicsModel, functions: int | None = None) -> FunctionDraws:
-    """Return the object that samples functions of a model: the model itself, or a fallback if its family samples none.
+    """Return the object that samples functions of a model: the model itself, or ``ConstantErrors`` if the model's
+    family can't sample functions.
 
     Args:
         model: the model.
-        functions: number of functions that the lanes share, or None if each episode has its own. With a number,
-            hyperparameters are sampled too, so that the few functions cover their uncertainty.
+        functions: number of functions that the lanes (parallel environments) share, or None if each episode samples a
+            function. With a number, hyperparameters are sampled too, so that few functions also cover the uncertainty
+            of hyperparameters.
     """
     if functions is not None and (able := offers(model, UncertainHyperparameters)) is not None:
         return able.uncertain_functions
@@ -25,10 +27,10 @@ def function_draws(model: DynamicsModel, functions: int | None = None) -> Functi
 
 @dataclass(frozen=True)
 class ConstantErrors(FunctionDraws):
-    """Functions at a constant distance from the mean, in standard deviations of each output; the reward's function is
-    its mean.
+    """Sampler of functions for any model: each function is the mean plus a constant number of standard deviations of
+    each transition output. The reward is its mean.
 
-    Each function is one standard normal number for each transition output.
+    The weights of a function are these numbers, drawn from the standard normal distribution.
     """
 
     model: DynamicsModel

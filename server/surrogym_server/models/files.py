@@ -23,7 +23,8 @@ MALFORMED = (SafetensorError, ValueError, LookupError, TypeError, AttributeError
 
 
 def to_bytes(model: DynamicsModel) -> bytes:
-    """Return a whole model as the bytes of a file, so that loading it repeats no long computation."""
+    """Return a model as the bytes of a file. It includes the results of long computations, so that loading does not
+    repeat them."""
     family = model.definition.learning.model
     data = learner_of(family).codec.encode(model)
     return with_checksum({FAMILY: family.name, **data.header}, data.tensors)
@@ -38,8 +39,8 @@ def from_bytes(definition: EnvironmentDefinition, data: bytes) -> DynamicsModel:
     """Read the model that ``to_bytes`` wrote.
 
     Raises:
-        InvalidInput: the bytes are not a model file, or a damaged one, or the model is of another family or has other
-            outputs than the definition says.
+        InvalidInput: the bytes are not a model file, the file is damaged, or its model has another family or other
+            outputs than the definition.
     """
     header, tensors = _content(data)
     try:
@@ -55,7 +56,8 @@ def from_bytes(definition: EnvironmentDefinition, data: bytes) -> DynamicsModel:
 
 
 def _content(data: bytes) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Return header and tensors of a file. Raises ``InvalidInput`` unless its checksum is that of its content."""
+    """Return header and tensors of a file. Raises ``InvalidInput`` unless the checksum in the file is that of header
+    and tensors."""
     length = int.from_bytes(data[:8], "little")
     try:
         header = json.loads(json.loads(data[8 : 8 + length])["__metadata__"][METADATA])

@@ -28,9 +28,10 @@ class Header:
 
     Attributes:
         terminal_reward: reward that is added on a step that ends an episode.
-        samples: number of samples of the fit.
+        samples: number of samples to which the model was fitted.
         digest: ``Samples.digest`` of these samples.
-        label: the label of termination if all samples have the same one, 0 or 1; otherwise None. Not checked here.
+        label: the label of termination that all samples have in common, 0 or 1; None if there are both. It is not
+            checked here.
     """
 
     terminal_reward: float
@@ -167,7 +168,8 @@ def _checked_header(definition: EnvironmentDefinition, stored: StoredModel) -> H
 
 
 def _require_shapes(name: str, arrays: Mapping[str, Tensor], shapes: Mapping[str, tuple[int, ...]]) -> None:
-    """Raise ``InvalidInput`` unless each array in ``shapes`` has its shape; ``name`` is the part of the model."""
+    """Raise ``InvalidInput`` unless each of the arrays has the shape that ``shapes`` gives for its name. ``name`` is
+    the part of the model, for the message."""
     for part, shape in shapes.items():
         if (got := tuple(arrays[part].shape)) != shape:
             raise InvalidInput(f"{name}: expected {part} of shape {shape}, got {got}; export the model again")

@@ -18,17 +18,19 @@ LEAST = {"members": 2, "units": 1, "steps": 1, "seed": 0}
 
 @dataclass(frozen=True)
 class NetworkEnsembles(Learner):
-    """Learner of networks of two hidden layers, each anchored to its own initial weights, with noise that depends on
-    the state.
+    """Learner of ensembles: networks of two hidden layers, each pulled towards its own random initial weights, and
+    networks that predict the noise at each state.
 
-    There is no warm start: networks whose training continues would fit the first samples better than later ones.
+    Each fit starts anew, without a warm start: networks whose training continues would fit the first samples better
+    than later ones.
 
     Attributes:
         members: number of networks.
         units: number of units of each hidden layer.
         steps: number of steps of gradient descent.
         seed: seed of initial weights and of batches.
-        beta: from 0, where noise explains what is hard to learn, to 1, where the mean fits all samples alike.
+        beta: weighting of the samples in the likelihood, from 0 to 1. With 0, samples with much predicted noise hardly
+            influence the mean; with 1, all samples influence it equally.
     """
 
     members: int = 5

@@ -16,8 +16,9 @@ from surrogym_server.models.ensemble.networks import Networks
 from surrogym_server.models.ensemble.training import Training, cross_entropy, squared_error, train, train_with_noise
 
 MIN_POINTS = 2  # least number of samples to learn from
-CONSTANT = 1e-9  # an output whose standard deviation is below this share of its mean counts as constant
-REWARD_SEED, END_SEED = 1, 2  # added to the seed, so that reward and termination networks start with other weights
+CONSTANT = 1e-9  # an output whose standard deviation is below this share of its absolute mean counts as constant
+# Added to the seed, so that networks of reward and termination have other initial weights than those of transitions.
+REWARD_SEED, END_SEED = 1, 2
 
 
 def learn(training: Training, definition: EnvironmentDefinition, samples: Samples) -> NetworkEnsembleModel:
@@ -38,8 +39,8 @@ def learn(training: Training, definition: EnvironmentDefinition, samples: Sample
 
 
 def _reward(training: Training, inputs: Inputs, samples: Samples) -> tuple[Regression | None, float]:
-    """Fit the reward of non-terminating steps. Return the networks, or None if the reward is declared, and the mean
-    reward that terminating steps pay in addition."""
+    """Fit networks to the rewards of non-terminating steps. Return the networks (None if the reward is declared), and
+    the terminal reward: the mean reward that terminating steps pay in addition."""
     if (declared := inputs.definition.declared_reward) is not None:
         return None, declared.terminal
     goes_on = enough(~samples.terminated)
@@ -59,7 +60,7 @@ def _ending(training: Training, x: Tensor, ended: Tensor) -> Networks | float:
 
 
 def _with_noise(training: Training, x: Tensor, y: Tensor) -> Regression:
-    """Fit networks, and networks of their noise, to inputs x (n, d) and targets y (n, p)."""
+    """Fit networks of the mean, and networks of the noise, to inputs x (n, d) and targets y (n, p)."""
     target, centre, scale = standardised(y)
     networks, noisy = train_with_noise(training, x, target)
     noise = Noise(noisy, torch.zeros_like(scale))
@@ -68,7 +69,8 @@ def _with_noise(training: Training, x: Tensor, y: Tensor) -> Regression:
 
 
 def _noiseless(training: Training, x: Tensor, y: Tensor) -> Regression:
-    """Fit networks without noise to inputs x (n, d), squares included, and targets y (n, p)."""
+    """Fit networks of the mean alone, without noise, to inputs x (n, d) and targets y (n, p). Their linear part also
+    reads the squares of the inputs."""
     target, centre, scale = standardised(y)
     return Regression(train(training, x, target, squared_error, quadratic=True), centre, scale)
 
@@ -82,7 +84,7 @@ def standardised(y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def enough(chosen: Tensor) -> Tensor:
-    """Return the mask ``chosen`` (n,), or one of all samples if it selects too few to learn from."""
+    """Return the mask ``chosen`` (n,), or if it selects too few samples to learn from, a mask that selects all."""
     return chosen if int(chosen.sum()) >= MIN_POINTS else torch.ones_like(chosen)
 
 

@@ -18,9 +18,10 @@ from surrogym_server.tensors import cached
 
 @dataclass(frozen=True)
 class Noise:
-    """Learned noise of single steps, which depends on the inputs; unit: standard deviations of the outputs."""
+    """Learned noise of single steps, which depends on the inputs. Its unit is the standard deviation of each output
+    over the samples."""
 
-    networks: Networks  # predict the log variance of the noise
+    networks: Networks  # networks of the log variance of the noise
     size: Tensor  # (p,) root mean square of the noise over the samples
 
     def std(self, x: Tensor) -> Tensor:
@@ -30,13 +31,13 @@ class Noise:
 
 @dataclass(frozen=True)
 class Regression:
-    """Networks f of some outputs in the outputs' units: centre + scale * f(x). An output that never varied has scale
-    0."""
+    """Predictor of some outputs by networks f: centre + scale * f(x), in the units of the outputs. An output that never
+    varied has scale 0."""
 
     networks: Networks
     centre: Tensor  # (p,) mean of each output over the samples
     scale: Tensor  # (p,) standard deviation of each output over the samples
-    noise: Noise | None = None  # None for a reward, whose noise is not learned
+    noise: Noise | None = None  # None for rewards, because their noise is not learned
 
     def __call__(self, x: Tensor) -> Tensor:
         """Return the values of every member at x (m, d), (K, m, p)."""
@@ -59,7 +60,8 @@ class NetworkEnsembleModel(SteppedInBlocks, LearnedNoise):
     definition: EnvironmentDefinition
     transitions: Regression  # networks of the M transition outputs
     reward: Regression | None  # None if the reward is declared
-    ending: Networks | float | None  # logits of termination, or its only label; None if termination is declared
+    # Networks of the logit of termination, or the label that all samples share; None if termination is declared.
+    ending: Networks | float | None
     terminal_reward: float
     samples: int
     digest: str
@@ -75,7 +77,8 @@ class NetworkEnsembleModel(SteppedInBlocks, LearnedNoise):
         return 1
 
     def draw(self, noise: Tensor) -> Tensor:
-        """Sample functions. Each is one of the members, chosen with equal probability, and is stored as its index."""
+        """Sample N functions from standard normal numbers ``noise`` (N, 1). Each function is one of the networks
+        (members), chosen with equal probability; its weight (N, 1) is the index of the network."""
         return drawn_member(noise, self.transitions.networks.members)
 
     def means(self, q: Tensor, u: Tensor) -> Tensor:
@@ -85,7 +88,8 @@ class NetworkEnsembleModel(SteppedInBlocks, LearnedNoise):
         return torch.cat([change, reward[:, None]], -1)
 
     def learned_termination(self, q: Tensor) -> Tensor:
-        """Return the members' mean probability of termination; if all samples have the same label, that label."""
+        """Return the mean over the networks of the probability of termination at q (m, C), (m,); if all samples have
+        the same label, that label."""
         if isinstance(self.ending, Networks):
             return self.ending(self._inputs.of_end(q))[..., 0].sigmoid().mean(0)
         return q.new_full((len(q),), self.ending or 0.0)
@@ -145,8 +149,8 @@ class NetworkEnsembleModel(SteppedInBlocks, LearnedNoise):
 
 
 def _of_member(values: Tensor, member: Tensor | None) -> Tensor:
-    """Return the mean of members' values (K, m, ...), or in each row the value of the member that ``member`` (m,)
-    selects."""
+    """Return the mean of the values (K, m, ...) over the K networks (members). If ``member`` (m,) is given, return
+    instead the value of network ``member[i]`` in each row i."""
     if member is None:
         return values.mean(0)
     return values[member, torch.arange(len(member), device=member.device)]

@@ -33,7 +33,7 @@ class Networks:
 
     @property
     def hidden(self) -> tuple[Tensor, ...]:
-        """Weights that gradient descent trains in the hidden layers: all except ``skip``."""
+        """Weights of the nonlinear part: all except ``skip``, the weights of the linear part."""
         return (self.first, self.first_bias, self.second, self.second_bias, self.last)
 
     def __call__(self, x: Tensor) -> Tensor:
@@ -49,7 +49,7 @@ def bounded(log_variance: Tensor) -> Tensor:
 
 
 def basis(x: Tensor, quadratic: bool) -> Tensor:
-    """Return [1, x], with ``quadratic`` [1, x, x^2], for inputs x (m, d): shape (m, s)."""
+    """Return the terms of the linear part for inputs x (m, d): [1, x], or [1, x, x^2] if ``quadratic``, (m, s)."""
     return torch.cat([torch.ones_like(x[:, :1]), x, *([x.square()] if quadratic else [])], -1)
 
 

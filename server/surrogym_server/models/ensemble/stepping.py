@@ -18,7 +18,7 @@ from surrogym_server.tensors import in_blocks
 
 
 class SteppedInBlocks(DynamicsModel, FunctionDraws):
-    """Model that predicts at most ``rows`` steps at once, to bound memory."""
+    """Base class of models that predict many steps in blocks of at most ``rows`` steps, to bound memory."""
 
     rows: ClassVar[int]
 
@@ -63,13 +63,13 @@ class SteppedInBlocks(DynamicsModel, FunctionDraws):
             stds, reward_std: whether standard deviations of transition outputs and of the reward are needed.
             q: coordinates (m, C).
             u: actions (m, F).
-            noise: standard deviations by which each output is moved from the mean, (m, M), or None.
+            noise: number of standard deviations that are added to the mean of each transition output, (m, M), or None.
             process: standard normal numbers of the learned noise, (m, M), or None.
-            paths: sampled function of each row, (m, W), or None for the mean.
+            paths: weights of the sampled function that each row follows, (m, W), or None for the mean.
 
         Returns:
-            Next coordinates (m, C), rewards (m,), and the standard deviations (m, M) and (m,); (m, 0) and (m,) if they
-            are not needed.
+            Next coordinates (m, C), rewards (m,), standard deviations of transition outputs (m, M), or (m, 0) if they
+            are not needed, and standard deviations of the reward (m,).
         """
 
     def _in_blocks(
@@ -99,12 +99,13 @@ class SteppedInBlocks(DynamicsModel, FunctionDraws):
 
 
 def drawn_member(noise: Tensor, members: int) -> Tensor:
-    """Return indices of members, all equally likely, as floats, from standard normal numbers ``noise``."""
+    """Return indices of networks (members), below ``members`` and all equally likely, as floats. Each is computed from
+    one of the standard normal numbers ``noise``."""
     numbers: Tensor = (members * torch.special.ndtr(noise)).floor().clamp_max(members - 1)
     return numbers
 
 
 def between(values: Tensor, correction: int = 1) -> Tensor:
-    """Return the variance between members' values (K, ...). An empty array is returned as it is, without the warning of
-    torch."""
+    """Return the variance of values (K, ...) over the K networks (members). Unlike ``torch.var`` it gives no warning
+    for an empty tensor."""
     return values.var(0, correction=correction) if values.numel() else values[0]

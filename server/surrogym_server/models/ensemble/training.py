@@ -34,11 +34,13 @@ from torch.nn.functional import binary_cross_entropy_with_logits
 from surrogym_server.models.ensemble.networks import Networks, basis, bounded, nonlinear
 from surrogym_server.tensors import in_rows
 
-NOISE = 0.01  # sigma, as a share of an output's standard deviation
+# Assumed noise sigma of networks without learned noise (see the module), as a share of an output's standard deviation.
+NOISE = 0.01
 RIDGE = 1e-3  # ridge penalty of the linear part
 RATE = 0.01  # initial learning rate; it decays to 0 by a cosine
 LARGEST_BATCH = 512
-# Noise before training, as a share of an output's standard deviation. With 0.05 training fails near contacts.
+# Predicted noise before training, as a share of an output's standard deviation. If it begins at 0.05, training fails
+# near contacts, where the motion changes suddenly.
 NOISE_BEGINS = math.exp(-1.5)
 Loss = Callable[[Tensor, Tensor], Tensor]  # arguments: predictions (K, m, p) and targets (m, p)
 
@@ -102,16 +104,17 @@ def train_with_noise(training: Training, x: Tensor, y: Tensor) -> tuple[Networks
         return _unlikely(mean, log_variance, y[rows], training.beta) + NOISE**2 / len(x) * torch.stack(pull).sum()
 
     _descend((skip, *hidden, log_noise, *noisy), objective, training.steps)
-    # The linear part of the noise networks is a constant: weight 0 for every input.
+    # The linear part of the noise networks is a constant, so the weights of the inputs are 0.
     constant = torch.cat([log_noise, log_noise.new_zeros(len(log_noise), x.shape[1], y.shape[1])], 1)
     return Networks(*map(in_rows, (skip, *hidden))), Networks(*map(in_rows, (constant, *noisy)))
 
 
 def _unlikely(mean: Tensor, log_variance: Tensor, target: Tensor, beta: float) -> Tensor:
-    """Return the negative log likelihood of targets (m, p), less a constant.
+    """Return the negative log likelihood of targets (m, p) up to a constant, as a loss.
 
-    It is summed over members and outputs, and averaged over samples. Each sample's term is weighted by the predicted
-    variance to the power of ``beta``. ``mean`` and ``log_variance`` are those of every member, (K, m, p).
+    It is summed over networks (members) and outputs, and averaged over samples. The term of each sample is weighted by
+    its predicted variance to the power of ``beta``. ``mean`` and ``log_variance`` are the predictions of all K
+    networks, (K, m, p).
     """
     each = 0.5 * (log_variance + (target - mean).square() * (-log_variance).exp())
     return (each * (beta * log_variance.detach()).exp()).mean(1).sum()
@@ -129,7 +132,8 @@ def _descend(weights: Sequence[Tensor], objective: Callable[[], Tensor], steps: 
 
 
 def _batch(count: int, generator: torch.Generator) -> Tensor | slice:
-    """Return the rows of one step of gradient descent: all ``count``, or a random choice if there are many."""
+    """Return the rows of samples for one step of gradient descent: all ``count`` rows, or a random selection if there
+    are many."""
     return slice(None) if count <= LARGEST_BATCH else torch.randint(count, (LARGEST_BATCH,), generator=generator)
 
 

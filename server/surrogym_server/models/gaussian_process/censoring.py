@@ -15,10 +15,11 @@ from surrogym_server.environment.samples import saturated
 def usable(
     definition: EnvironmentDefinition, column: int, q_next: Tensor, feature_map: FeatureMap, *, past_limits: bool
 ) -> Tensor:
-    """Return which samples that end at q_next (m, C) a transition output learns from, (m,) bool.
+    """Return from which samples, ending at q_next (m, C), a transition output learns, (m,) bool. It does not learn from
+    samples whose result a limit may have changed.
 
     Args:
-        column: the output.
+        column: index of the transition output.
         feature_map: features that the output's process reads.
         past_limits: whether the output also learns from samples that end at a limit of another coordinate.
     """
@@ -32,9 +33,10 @@ def usable(
 
 
 def stopped(definition: EnvironmentDefinition, index: int, q_next: Tensor) -> Tensor:
-    """Return which samples (n,) ended at a bound after which coordinate ``index`` is unknown: its own, or a wall.
+    """Return which samples, ending at q_next (n, C), reached a bound that may have changed the result of coordinate
+    ``index``, (n,) bool: a bound of this coordinate, or a wall, which stops another coordinate.
 
-    A limit of another coordinate, such as a relief valve's, does not make a sample useless.
+    A limit of another coordinate that stops nothing, such as the pressure limit of a relief valve, does not count.
     """
     limits = [i for i in definition.moving if i != index and definition.coordinates[i].stops is None]
     others = q_next.clone()
@@ -43,7 +45,8 @@ def stopped(definition: EnvironmentDefinition, index: int, q_next: Tensor) -> Te
 
 
 def saturates(definition: EnvironmentDefinition, index: int, q_next: Tensor) -> Tensor:
-    """Return which samples (n,) ended with coordinate ``index``, or any other except the leading one, at a bound."""
+    """Return which samples, ending at q_next (n, C), reached a bound of coordinate ``index``, or of any other
+    coordinate except the leading ones, whose clipped next values the output can read, (n,) bool."""
     others = q_next.clone()
     others[:, leading(definition)] = math.nan
     others[:, index] = q_next[:, index]

@@ -16,8 +16,8 @@ from surrogym_server.models.port import DynamicsModel, Learned, Learner, ModelCo
 
 @dataclass(frozen=True)
 class GaussianProcesses(Settings, Learner, TakesPrior):
-    """Learner of one Gaussian process for each output, with a structure chosen by evidence. Hyperparameters of an
-    earlier fit are its warm start."""
+    """Learner of one Gaussian process for each output, whose structure (such as its inputs) is chosen by evidence. A
+    fit can start at the hyperparameters of an earlier fit (warm start)."""
 
     @property
     def codec(self) -> ModelCodec:

@@ -11,7 +11,7 @@ from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.features import Drift, Encoding, Feature, FeatureMap, Parity, State, features, leading
 from surrogym_server.gp import Reflection
 
-CENTRED = 1e-9  # a range is centred if its middle is no farther from 0 than this share of its scale
+CENTRED = 1e-9  # a range counts as centred at 0 if its middle is no farther from 0 than this share of its scale
 
 
 def reward_candidates(definition: EnvironmentDefinition) -> tuple[FeatureMap, ...]:
@@ -29,12 +29,14 @@ def reward_candidates(definition: EnvironmentDefinition) -> tuple[FeatureMap, ..
 def candidates(
     definition: EnvironmentDefinition, follows: bool, drift: Drift = (), parity: Parity = "odd"
 ) -> tuple[FeatureMap, ...]:
-    """Return candidate feature maps of one output. With lags, each map comes with every shorter history.
+    """Return candidate feature maps of one output. If the environment has lags (coordinates that repeat past values),
+    each map also occurs with every shorter history of lags.
 
     Args:
         definition: the environment.
-        follows: whether the output may read the predicted next values of leading coordinates.
-        drift: learned motion of angles, or empty.
+        follows: whether the output may read the predicted next values of the leading coordinates, see
+            ``features.leading``.
+        drift: for each angle, weights of the coordinates that predict the angle's increment; or empty.
         parity: parity of the output if the environment has mirror symmetry.
     """
     if definition.moves_observation:
@@ -56,11 +58,11 @@ def candidates(
 
 
 def reflection(definition: EnvironmentDefinition, feature_map: FeatureMap) -> Reflection | None:
-    """Return the signs of a map's features under a change of sign of every coordinate and of the action, with the map's
-    parity.
+    """Return the symmetry of a process with a feature map: whether each feature changes its sign if all coordinates and
+    the action change their signs, and the map's parity.
 
-    None if the map has no parity, or if a feature has no such sign: a range that is not centred at 0, a one-hot action,
-    or an observation.
+    None if the map has no parity, or if a feature neither stays equal nor changes its sign: a coordinate whose range is
+    not centred at 0, a one-hot action, or an observation.
     """
     if not feature_map.parity:
         return None
@@ -72,14 +74,16 @@ def reflection(definition: EnvironmentDefinition, feature_map: FeatureMap) -> Re
 
 
 def _sign(definition: EnvironmentDefinition, feature: Feature) -> int:
-    """Return 1 if a feature stays the same when all signs change, -1 if its own sign changes, 0 otherwise."""
+    """Return 1 if a feature stays the same when all coordinates and the action change their signs, -1 if it changes its
+    sign then, 0 otherwise."""
     match feature.function:
         case "cos" | "turned_cos":
             return 1
         case "sin" | "turned_sin" | "wrapped":
             return -1
         case "affine" if feature.entry >= len(definition.coordinates) and definition.action.nvec:
-            return -1  # discrete actions are numbered from one end, and the reverse order is the mirror image
+            # The mirror image of a discrete action has the reverse number, so the centred number changes its sign.
+            return -1
         case "affine" | "lead":
             return -1 if abs(feature.centre) <= CENTRED * feature.scale else 0
     return 0

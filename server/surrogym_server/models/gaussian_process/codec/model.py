@@ -107,7 +107,7 @@ def _read_prior(
 
 
 def _require_consistent(model: GaussianProcessModel) -> None:
-    """Raise ``InvalidInput`` if the parts of a model don't fit each other or the definition."""
+    """Raise ``InvalidInput`` if parts of a model contradict each other or the environment's definition."""
     definition, reward = model.definition, model.reward
     if model.prior is None and any(output.size_with_prior is not None for output in model.outputs):
         raise InvalidInput(

@@ -39,7 +39,8 @@ def output_tensors(output: OutputModel, prefix: str) -> dict[str, Tensor]:
 
 
 def require_output(definition: EnvironmentDefinition, output: OutputModel) -> None:
-    """Raise ``InvalidInput`` unless an output's arrays have the right shapes and its numbers are those of a process."""
+    """Raise ``InvalidInput`` unless an output's arrays have the right shapes and all its numbers are ones that a fit
+    can give."""
     _require_drift(definition, output)
     _require_dropped(definition, output)
     _require_warp(output)
@@ -52,7 +53,7 @@ def require_output(definition: EnvironmentDefinition, output: OutputModel) -> No
 
 
 def output_header(output: OutputModel) -> dict[str, Any]:
-    """Return everything of an output except its arrays, as JSON."""
+    """Return all fields of an output except its arrays, as values for JSON."""
     entry: dict[str, Any] = {
         "name": output.name,
         "feature_map": asdict(output.feature_map),
@@ -156,8 +157,8 @@ def _require_drift(definition: EnvironmentDefinition, output: OutputModel) -> No
 
 
 def _require_dropped(definition: EnvironmentDefinition, output: OutputModel) -> None:
-    """Raise ``InvalidInput`` unless the features left out are some of the map's, in ascending order, and at least one
-    is left."""
+    """Raise ``InvalidInput`` unless the dropped features are features of the map in ascending order, and at least one
+    feature remains."""
     if not (places := output.feature_map.dropped):
         return
     count = len(features(definition, replace(output.feature_map, rates=(), dropped=())))
@@ -170,7 +171,8 @@ def _require_dropped(definition: EnvironmentDefinition, output: OutputModel) -> 
 
 
 def _require_size(output: OutputModel) -> None:
-    """Raise ``InvalidInput`` unless an output learned beside a prior has a finite size above 0 and no warp."""
+    """Raise ``InvalidInput`` unless an output that adds to a model's prior has a finite ``size_with_prior`` above 0 and
+    no ``warp`` (learned logarithm)."""
     size = output.size_with_prior
     if size is not None and (not 0 < size < math.inf or output.warp is not None):
         raise InvalidInput(
@@ -180,7 +182,8 @@ def _require_size(output: OutputModel) -> None:
 
 
 def _require_warp(output: OutputModel) -> None:
-    """Raise ``InvalidInput`` if an output other than a learned reward has a warp."""
+    """Raise ``InvalidInput`` if an output other than a learned reward has a ``warp``, that is, was learned by its
+    logarithm."""
     if output.warp is None:
         return
     if output.name != REWARD or output.posterior is None or not output.warp.finite:
@@ -191,8 +194,8 @@ def _require_warp(output: OutputModel) -> None:
 
 
 def _require_rates(definition: EnvironmentDefinition, output: OutputModel) -> None:
-    """Raise ``InvalidInput`` unless rates are those of a transition, one for each feature, with an amplitude above 0 at
-    all points."""
+    """Raise ``InvalidInput`` unless only transition outputs have rates, one for each feature, and the amplitude is
+    above 0 at all points."""
     if not (rates := output.feature_map.rates):
         return
     plain = replace(output.feature_map, rates=())
@@ -217,8 +220,8 @@ def _require_rates(definition: EnvironmentDefinition, output: OutputModel) -> No
 
 
 def _require_at_limit(definition: EnvironmentDefinition, output: OutputModel) -> None:
-    """Raise ``InvalidInput`` unless only a transition has points at a limit, and its sides are as many as its
-    points."""
+    """Raise ``InvalidInput`` unless ``at_limit``, which says which points observe a limit, has one entry for each point
+    and belongs to a transition output."""
     if not (sides := output.at_limit):
         return
     count = 0 if output.posterior is None else len(output.posterior.y)
@@ -230,7 +233,8 @@ def _require_at_limit(definition: EnvironmentDefinition, output: OutputModel) ->
 
 
 def _require_shared(definition: EnvironmentDefinition, output: OutputModel) -> None:
-    """Raise ``InvalidInput`` unless an output that shares samples is a transition and shares them with transitions."""
+    """Raise ``InvalidInput`` if an output that learned from samples of other outputs, or one of these, is not a
+    transition output."""
     transitions = definition.outputs[:-1]
     if output.shared and not {output.name, *output.shared} <= set(transitions):
         raise InvalidInput(

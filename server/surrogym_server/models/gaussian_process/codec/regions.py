@@ -28,7 +28,7 @@ from surrogym_server.models.gaussian_process.prediction.regions import (
 
 
 def region_header(region: Region) -> dict[str, Any]:
-    """Return everything of a region except its arrays, as JSON."""
+    """Return all fields of a region except its arrays, as values for JSON."""
     return {"forms": [[weight, _form_header(form)] for weight, form in region.forms], "scores": region.scores}
 
 
@@ -44,7 +44,7 @@ def region_tensors(region: Region, prefix: str) -> dict[str, Tensor]:
 def read_region(
     definition: EnvironmentDefinition, entry: Any, tensors: Mapping[str, Tensor], prefix: str
 ) -> Region | None:
-    """Build a region from its entry in the header and its arrays; None for no entry.
+    """Build a region from its entry in the header and its arrays. Return None if ``entry`` is None.
 
     Raises:
         LookupError, TypeError, ValueError: the entry is malformed.

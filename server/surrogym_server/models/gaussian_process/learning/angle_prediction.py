@@ -18,7 +18,8 @@ POINTS_A_WEIGHT = 3  # least number of samples for each weight of the regression
 
 
 def learn_drift(definition: EnvironmentDefinition, samples: Samples) -> Drift:
-    """Fit, for each angle, weights (C,) of the coordinates w with increment = w . q + constant, by least squares.
+    """Fit, for each angle, weights w (C,) of the coordinates q that predict the angle's increment as w . q + constant,
+    by least squares.
 
     Only linear coordinates have a weight other than 0. Return () if there is no angle or if the samples are too few.
     """

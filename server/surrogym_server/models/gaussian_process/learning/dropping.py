@@ -16,19 +16,21 @@ from surrogym_server.models.gaussian_process.learning.rates import inputs_of
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 
 ODDS = -1.0  # prior log odds of leaving out one input
-WIN = 2.0  # log odds per sample by which fewer inputs must be likelier; with less, some predictions were too sure
+# Log odds per sample by which fewer inputs must be likelier; with a smaller value some predictions were overconfident.
+WIN = 2.0
 LESS = 0.5  # greatest leave-one-out error with fewer inputs, as a share of the error with all inputs
-FEWEST = 20  # least number of samples to leave out an input; with fewer, some wrong choices won
+# Least number of samples with which inputs are left out; with fewer samples some wrong inputs were left out.
+FEWEST = 20
 
 
 def without_inputs(
     learner: OutputLearner, output: OutputModel, target: Tensor, inputs: Mapping[FeatureMap, Tensor], used: Tensor
 ) -> OutputModel:
-    """Return the output without those inputs that hardly matter to it, or unchanged if all of them matter.
+    """Return the output without the inputs that hardly influence it, or unchanged if all inputs matter.
 
     Args:
         output: the learned output.
-        target: its targets (n,).
+        target: targets of the output, (n,).
         inputs: features (n, d) of each candidate map.
         used: (n,) bool, the samples from which the output was learned.
     """
@@ -57,7 +59,8 @@ def without_inputs(
 def _of_many(
     learner: OutputLearner, output: OutputModel, posterior: Posterior, may: Tensor, x: Tensor, y: Tensor
 ) -> OutputModel:
-    """Leave out inputs of an output whose process has inducing points, given all of its points x (n, d), y (n,)."""
+    """Leave out inputs of an output whose process has inducing points and was fitted to points x (n, d), y (n,).
+    ``may`` (d,) bool are the inputs that may be left out."""
     selection = learner.many.fewer_inputs(x, y, learner.options(output.name), posterior, may, ODDS)
     if selection is None:
         return output
@@ -67,8 +70,9 @@ def _of_many(
 def _may_be_dropped(learner: OutputLearner, output: OutputModel) -> Tensor:
     """Return which inputs of an output may be left out, (d,) bool.
 
-    The next value of a limited speed may not: its effect only shows when a sample ends at the limit. An input with a
-    rate may not either. No input may if the samples are too few to decide, or if the process has little error left.
+    Some inputs may not: the next value of a leading coordinate, such as a limited speed, because only samples that end
+    at its limit show its effect; and inputs with a rate. If there are too few samples, or if the process predicts well
+    already, no input may be left out.
     """
     read = features(learner.definition, output.feature_map)
     may = torch.tensor([feature.function not in ("lead", "grown") for feature in read])
@@ -81,8 +85,8 @@ def _may_be_dropped(learner: OutputLearner, output: OutputModel) -> Tensor:
 
 
 def _with_fewer(learner: OutputLearner, output: OutputModel, x: Tensor, y: Tensor, selection: Selection) -> OutputModel:
-    """Return the output with only the selected inputs, if this reduces its leave-one-out error enough; otherwise
-    unchanged. Its points are x (n, d), y (n,)."""
+    """Return the output with only the selected inputs, fitted to points x (n, d), y (n,), if this reduces the
+    leave-one-out error enough. Otherwise return it unchanged."""
     assert output.posterior is not None
     mask, x = selection.mask, x[:, selection.mask]
     feature_map = map_without(output.feature_map, mask)

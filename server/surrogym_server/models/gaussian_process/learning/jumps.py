@@ -26,7 +26,8 @@ EDGE = "reward edge"
 MAX_JUMPS = 3
 SPLITS = 3  # number of gaps of the sorted rewards at which a split is tried, the widest first
 GAP = 0.2  # least width of a gap of the sorted rewards at which a split is tried, as a share of their range
-MARGIN = 2.0  # log odds per sample by which a jump must be likelier; smooth bumps reached 1.5, jumps began at 2.9
+# Log odds per sample by which jumps must be likelier; in experiments smooth bumps reached 1.5, true jumps at least 2.9.
+MARGIN = 2.0
 WORTH = 5.0  # log odds by which one more jump must be likelier
 SIZE = 3.0  # prior standard deviation of a jump, in standard deviations of the reward
 FLOOR = 1e-4  # noise assumed for rewards that are all equal, in standard deviations of the reward
@@ -37,13 +38,15 @@ Split = tuple[float, Region, OutputModel, Tensor]
 def with_jumps(
     learner: OutputLearner, samples: Samples, inputs: Mapping[FeatureMap, Tensor], going: Tensor, plain: OutputModel
 ) -> tuple[OutputModel, tuple[Jump, ...]]:
-    """Search for jumps of the reward. Return the process without them, and the jumps; none if they don't win.
+    """Search for jumps: regions of states inside which the reward is higher or lower by a constant. Return the output
+    for the reward without these constants, and the jumps. If jumps don't explain the rewards clearly better, return
+    ``plain`` and no jumps.
 
     Args:
         samples: all n samples.
         inputs: features (n, d) of each candidate map.
         going: (n,) bool, the samples from which the reward is learned: the non-terminating steps.
-        plain: the process that was learned from them without jumps.
+        plain: the output that was learned from these samples without jumps.
     """
     best, process, total, rest = (0.0, plain, 0), plain, 0.0, going
     regions: list[tuple[Region, Tensor]] = []
@@ -54,7 +57,8 @@ def with_jumps(
         gain, edge, process, outside = max(splits, key=lambda split: split[0])
         regions.append((edge, rest & ~outside))
         total, rest = total + gain, outside
-        if total > max(MARGIN * int(going.sum()), best[0] + WORTH):  # the first of two jumps may win little by itself
+        # Checked for all numbers of jumps, because the first of two jumps may gain little by itself.
+        if total > max(MARGIN * int(going.sum()), best[0] + WORTH):
             best = (total, process, len(regions))
     _, process, count = best
     residual = samples.reward - process.mean(inputs[process.feature_map])
@@ -64,10 +68,12 @@ def with_jumps(
 def _splits(
     learner: OutputLearner, samples: Samples, inputs: Mapping[FeatureMap, Tensor], going: Tensor, plain: OutputModel
 ) -> Iterator[Split]:
-    """Yield each candidate split of the rewards: its gain in log odds, the region inside, the process outside, and the
-    samples (n,) outside.
+    """Yield each candidate for a jump, which splits the samples of ``going`` (n,) by their reward into a smaller part
+    inside and the rest outside: its gain in log odds over ``plain``, the region inside, the output learned outside, and
+    the samples outside (n,) bool.
 
-    A single sample counts as a jump only if all others have the same reward. Otherwise it may as well be a slope.
+    A single sample inside counts as a jump only if the rewards of all others are equal. Otherwise it may also lie on a
+    steep slope.
     """
     same = replace(plain.feature_map, after=False)
     inputs = {m: x for m, x in inputs.items() if replace(m, after=False) == same}
@@ -94,7 +100,7 @@ def _splits(
 
 
 def _levels(reward: Tensor) -> list[float]:
-    """Return the levels at which to split rewards (n,): the middles of the widest gaps between them."""
+    """Return the levels at which to split rewards (n,): the middles of the widest gaps in their sorted sequence."""
     ordered = reward.sort().values
     gaps = ordered.diff()
     wide = [int(i) for i in gaps.argsort(descending=True)[:SPLITS] if gaps[i] > GAP * (ordered[-1] - ordered[0])]
@@ -102,14 +108,16 @@ def _levels(reward: Tensor) -> list[float]:
 
 
 def _evidence(process: OutputModel, points: int, unit: float) -> float:
-    """Return the log density of the ``points`` targets to which a process was fitted, in multiples of ``unit``."""
+    """Return the log density of the ``points`` targets to which an output was fitted, if targets are measured in
+    multiples of ``unit``."""
     if process.posterior is None:
         return -points * (math.log(FLOOR) + 0.5 * math.log(2 * math.pi))
     return dict(process.scores)[str(process.feature_map)] - points * math.log(process.scale / unit)
 
 
 def _paid_inside(residual: Tensor, spread: Tensor) -> float:
-    """Return the log density of residuals (i,) that share one normal jump and vary around it by ``spread`` (i,)."""
+    """Return the log density of residuals (i,) if each is the sum of one common jump with a normal prior and an
+    individual normal error with standard deviation ``spread`` (i,)."""
     shared = SIZE**2 * torch.ones(len(residual), len(residual), dtype=residual.dtype)
     covariance = shared + torch.diag(spread.square() + FLOOR**2)
     factor = torch.linalg.cholesky(covariance)

@@ -63,13 +63,13 @@ def learn(
 
 @dataclass(frozen=True)
 class _Among:
-    """Candidate inputs of one output, and masks of the n samples from which it may learn.
+    """Candidate inputs of one transition output, and masks (n,) of the samples from which it may learn.
 
     Attributes:
         inputs: features (n, d) of each candidate map.
-        keep: samples that no bound has cut.
+        keep: samples that did not end at a bound, which would cut their increments off.
         keep_lead: samples to learn from with maps that read the next values of leading coordinates.
-        past: samples to learn from if limits of other coordinates don't affect this output.
+        past: samples to learn from if reaching limits of other coordinates does not change this output.
         side: (n,) 1 for a sample that ended at the output's own upper limit, -1 at the lower, otherwise 0.
     """
 
@@ -81,7 +81,8 @@ class _Among:
 
 
 def _transitions(learner: OutputLearner, samples: Samples, known: Tensor | None) -> tuple[OutputModel, ...]:
-    """Learn all transition outputs. ``known`` (n, M) is the prior's prediction at the samples, or None."""
+    """Learn all M transition outputs. ``known`` (n, M) is the prediction of the prior model at the samples, or None
+    without a prior."""
     definition = learner.definition
     everything, change = torch.ones(len(samples), dtype=torch.bool), increments(definition, samples)
     columns = [None] * change.shape[1] if known is None else list(known.T)
@@ -99,7 +100,8 @@ def _transitions(learner: OutputLearner, samples: Samples, known: Tensor | None)
     keep = ~saturated(definition, samples.q_next)
     keep = keep if int(keep.sum()) >= MIN_POINTS else everything
     sides = limit_sides(definition, samples.q_next)
-    sides = sides * ((sides != 0).sum(-1, keepdim=True) == 1)  # at several limits, no single inequality holds
+    # A sample at the limits of several coordinates is no inequality for any of them.
+    sides = sides * ((sides != 0).sum(-1, keepdim=True) == 1)
     lead, drift = leading(definition), learn_drift(definition, samples)
     outputs = []
     for column, index in enumerate(definition.moving):

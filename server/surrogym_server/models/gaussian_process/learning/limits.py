@@ -29,12 +29,15 @@ from surrogym_server.models.gaussian_process.learning.output_learner import Outp
 from surrogym_server.models.gaussian_process.learning.rates import inputs_of, output_with_rates
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 
-WIDER = " past limits"  # suffix of an output's name in the keys of warm starts: fits with samples at other limits
-HELD = " held"  # suffix of an output's name in the keys of warm starts: fits with samples at the output's own limit
+# Suffix of an output's name in the keys of warm starts, for fits that include samples at limits of other coordinates.
+WIDER = " past limits"
+# Suffix of an output's name in the keys of warm starts, for fits that include samples at the output's own limit.
+HELD = " held"
 SHORT = 0.01  # accepted shortfall of a prediction at a limit, in standard deviations of the targets
-ROUNDS = 3  # number of fits, each with the inequalities that the previous process violates
-WORSE = 10.0  # greatest factor by which a round may increase the misfit, which few samples measure only roughly
-MOST = 200  # greatest number of samples that become observations in one round
+ROUNDS = 3  # greatest number of fits, each with the inequalities that the previous process violates
+# Greatest factor by which a round may increase the misfit; it is large because few samples measure the misfit roughly.
+WORSE = 10.0
+MOST = 200  # greatest number of samples at limits that become observations of the limit in one round
 
 
 def past_limits(
@@ -47,14 +50,15 @@ def past_limits(
     more: Tensor,
     side: Tensor,
 ) -> OutputModel:
-    """Return the output, or one that also learns from samples at limits of other coordinates if its error is smaller.
+    """Learn the output also from samples that ended at limits of other coordinates. Return the result if its error is
+    smaller, otherwise ``output``.
 
     Args:
-        output: the output, learned from the samples ``keep``, or ``keep_lead`` if it reads a lead.
+        output: the output, learned from the samples ``keep``, or from ``keep_lead`` if it reads a lead (a next value).
         target: targets (n,) of all samples.
         inputs: features (n, d) of each candidate map.
         keep, keep_lead: (n,) bool, see ``output``.
-        more: (n,) bool, samples that may be used if such limits don't affect the output.
+        more: (n,) bool, samples that may be used if limits of other coordinates don't affect the output.
         side: (n,) 1 for a sample that ended at the output's own upper limit, -1 at the lower, otherwise 0.
     """
     rows = keep_lead if output.feature_map.lead else keep
@@ -80,13 +84,15 @@ def within_limits(
     keep: Tensor,
     side: Tensor,
 ) -> OutputModel:
-    """Return the output with those samples added as observations of its own limit whose inequalities it violates.
+    """Return the output, learned from further samples if it contradicts them. A sample that ended at the output's own
+    limit says that without the limit the step would have gone at least as far. If the output predicts less, the sample
+    is added as an observation of the limit.
 
     Args:
         output: the output, learned from the samples ``keep``.
         target: targets (n,) of all samples.
         inputs: features (n, d) of each candidate map.
-        keep: (n,) bool.
+        keep: (n,) bool, samples that did not end at a limit.
         side: (n,) 1 for a sample that ended at the output's own upper limit, -1 at the lower, otherwise 0.
     """
     if output.feature_map.lead:
@@ -114,7 +120,8 @@ def within_limits(
 
 
 def _sides(output: OutputModel, side: Tensor) -> tuple[int, ...]:
-    """Return ``side`` (n,) as integers for an exact process; () for inducing points, which are not samples."""
+    """Return ``side`` (n,) as integers if the process is exact, otherwise (), because inducing points are not
+    samples."""
     exact = output.posterior is not None and output.posterior.sparse is None
     return tuple(side.int().tolist()) if exact else ()
 
@@ -124,8 +131,9 @@ def _misfit(
 ) -> float:
     """Return a sum of squared errors of an output's targets (n,).
 
-    A sample of ``rows`` (n,) away from the output's limit, where ``side`` (n,) is 0, contributes its error when
-    predicted from the others. A sample at the limit contributes the amount by which the prediction falls short of it.
+    ``side`` (n,) is not 0 at samples that ended at the output's own limit. These contribute the amount by which the
+    prediction falls short of the limit. Other samples contribute only if they are among ``rows`` (n,), from which the
+    output was learned: with their leave-one-out errors.
     """
     if output.posterior is None:
         return float("inf")
@@ -142,9 +150,9 @@ def _misfit(
 def _with_samples(
     learner: OutputLearner, output: OutputModel, target: Tensor, inputs: Mapping[FeatureMap, Tensor], keep: Tensor
 ) -> OutputModel:
-    """Learn the output from the samples ``keep`` (n,) with unchanged hyperparameters.
+    """Condition the output on the samples ``keep`` (n,) with unchanged hyperparameters.
 
-    A new fit of many samples takes long, and a few more of them hardly change the hyperparameters.
+    With many samples, fitting hyperparameters takes long, and a few more samples hardly change them.
     """
     assert output.posterior is not None
     x = inputs_of(output, inputs)[keep]
@@ -153,9 +161,10 @@ def _with_samples(
 
 
 def _violated(posterior: Posterior, x: Tensor, y: Tensor, side: Tensor) -> list[int]:
-    """Select points to observe at their limits, so that the process falls short of no limit. Return their indices.
+    """Select points that must be observed at their limits, so that the process predicts at least the limit at all k
+    points. Return their indices.
 
-    The point with the greatest shortfall is observed first.
+    The selection is greedy: next is always the point at which the prediction falls short of the limit by most.
 
     Args:
         posterior: the process.
@@ -180,8 +189,8 @@ def _error(output: OutputModel, target: Tensor, x: Tensor, rows: Tensor, every: 
     """Return the mean squared error of targets (n,) at inputs x (n, d), over the samples ``every`` (n,).
 
     The samples ``rows`` (n,), from which the output was learned, count with their leave-one-out errors, the others with
-    their residuals. A process of inducing points has no samples of its own to leave out, so all count with their
-    residuals; each of many samples hardly influences it.
+    their residuals. If the process has inducing points, all samples count with their residuals, because each of so many
+    samples hardly influences the process.
     """
     assert output.posterior is not None
     if output.posterior.sparse is not None:

@@ -28,11 +28,12 @@ from surrogym_server.gp import (
 )
 from surrogym_server.gp.subsets import SOME
 
-EXPLAINED = 0.01  # error, in standard deviations of the targets, below which no other structure is searched
+# If the leave-one-out error is below this, in standard deviations of the targets, no other structure is searched.
+EXPLAINED = 0.01
 
 
 class ManySamples(ABC):
-    """Strategy to fit a process of known structure to many points."""
+    """Strategy for fitting a process to many points, when its inputs and its kernel are already chosen."""
 
     @abstractmethod
     def fitted(
@@ -50,7 +51,8 @@ class ManySamples(ABC):
             options: options of the fit.
             theta: free parameters that were fitted to a subset of the points.
             mirror: symmetry of the process, or None.
-            at_limit: points for which only a bound is known, or None; they may help to choose hyperparameters.
+            at_limit: points at which only a bound of the function is known, or None; they may help to choose
+                hyperparameters.
 
         Raises:
             NumericalFailure: no jitter makes the covariance of the points positive definite.
@@ -84,10 +86,12 @@ class ManySamples(ABC):
 
 
 class BySubsets(ManySamples):
-    """Fit hyperparameters to subsets of the samples; the process is exact up to ``gp.sparse.MAX_EXACT`` points.
+    """Strategy that fits hyperparameters to subsets of the samples. Up to ``gp.sparse.MAX_EXACT`` points the process is
+    exact.
 
-    If there are more and some are predicted badly from the others, hyperparameters fitted to the worst points are tried
-    too. A process uses inducing points as soon as these lose no accuracy, see ``gp.bound.loses_nothing``.
+    With more points it has inducing points. If then the leave-one-out errors are large, hyperparameters fitted to the
+    worst points are tried too. A process with fewer points also has inducing points if these lose no accuracy, see
+    ``gp.bound.loses_nothing``.
     """
 
     def fitted(
@@ -118,7 +122,8 @@ class BySubsets(ManySamples):
 
 @dataclass(frozen=True)
 class ByBound(ManySamples):
-    """Fit hyperparameters that maximise the variational bound of all samples, through at most ``inducing`` points."""
+    """Strategy that chooses hyperparameters by maximising the variational bound of the evidence of all samples, with at
+    most ``inducing`` inducing points."""
 
     inducing: int
 
@@ -131,7 +136,7 @@ class ByBound(ManySamples):
         mirror: Reflection | None,
         at_limit: Censored | None,
     ) -> Posterior:
-        del at_limit  # it only helps to choose between candidates, and the bound yields a single one
+        del at_limit  # it helps to choose between candidate hyperparameters, and this strategy has only one
         return fit_bound(x, y, options, theta, self.inducing, mirror)
 
     def conditioned(self, hyper: Hyperparameters, x: Tensor, y: Tensor) -> Posterior:

@@ -19,26 +19,29 @@ from surrogym_server.models.gaussian_process.prediction.warp import PEAK_NOISE
 from surrogym_server.models.gaussian_process.settings import Settings
 from surrogym_server.models.port import Warm
 
-# Prior log odds of a feature map that reads the lead (the next value of a leading coordinate), that reads nothing else,
-# that has a parity, and that does not read the action. A map with the lead is also right where a limit cut a step off.
-# Without other inputs few samples look like noise. Data from one side are no evidence for symmetry. A reward that is
-# paid in one place seldom depends on the action.
+# Prior log odds of feature maps, in this order. A map that reads the lead (next value of a leading coordinate) is
+# likelier, because it is also right where a limit cuts a step off. One that reads nothing but the lead is less likely,
+# because few samples can look like noise of such a map. One with a parity (mirror symmetry) is less likely, because
+# samples on one side are no evidence for symmetry. One without the action is likelier, because a reward that is paid in
+# one place seldom depends on the action.
 LEAD_ODDS, ALONE_ODDS, PARITY_ODDS, PLACE_ODDS = 3.0, -6.0, -3.0, 3.0
 CONSTANT = 1e-9  # an output whose standard deviation is below this share of its mean's size counts as constant
-SMALLEST = 1e-100  # smallest standard deviation of an output that varies; squares of a smaller one underflow
+SMALLEST = 1e-100  # an output with a smaller standard deviation counts as constant, because its square would underflow
 PEAK = "reward peak"  # name of the output that learns the logarithm of a reward
 
 
 @dataclass
 class OutputLearner:
-    """Fitter of the outputs of one model. It keeps the hyperparameters of all fits for the next warm start."""
+    """Fitter of the outputs of one model. It stores the hyperparameters of all fits, at which the next fits can start
+    (warm start)."""
 
     definition: EnvironmentDefinition
     settings: Settings
     warm: Warm  # free parameters of the previous fits, by "output|feature map"
     thetas: dict[str, NDArray[np.float64]]  # free parameters of the present fits, by the same keys
-    many: ManySamples = field(default_factory=BySubsets)  # strategy for more than ``subsets.FEW`` samples
-    selections: dict[str, Selection] = field(default_factory=dict)  # by output name: inputs selected by evidence alone
+    many: ManySamples = field(default_factory=BySubsets)  # strategy for fits to more than ``subsets.FEW`` samples
+    # For each output name, the inputs that have the greatest evidence.
+    selections: dict[str, Selection] = field(default_factory=dict)
 
     def allowed(self, maps: tuple[FeatureMap, ...]) -> tuple[FeatureMap, ...]:
         """Return those of the maps that the settings allow."""
@@ -55,14 +58,16 @@ class OutputLearner:
     ) -> OutputModel:
         """Fit one output with each candidate feature map, and return the best.
 
-        All maps are compared on the same samples: first the maps with all lags, then shorter histories of the best.
+        All maps are compared on the same samples. First the maps that read all lags (coordinates that repeat past
+        values) are fitted, then the best of them with shorter histories of lags.
 
         Args:
             name: name of the output.
             target: targets (n,).
             inputs: features (n, d) of each candidate map.
             keep: (n,) bool, the samples to learn from.
-            keep_lead: (n,) bool, the samples to learn from if the best map reads a lead (a next value).
+            keep_lead: (n,) bool, the samples to learn from if the best map reads a lead (next value of another
+                coordinate).
             side: (n,) 1 for a sample that ended at the output's own upper limit, -1 at the lower, otherwise 0. If there
                 are many samples, those outside ``keep`` help to choose hyperparameters.
         """
@@ -96,7 +101,8 @@ class OutputLearner:
         return OutputModel(name, best, posterior, centre, scale, int((~rows).sum()), scores)
 
     def _fit(self, name: str, feature_map: FeatureMap, x: Tensor, y: Tensor, also: str = "") -> Fitted:
-        """Fit a process to x (n, d), y (n,), or to a subset of many points, with the score scaled up to all points."""
+        """Fit a process to x (n, d), y (n,). If there are many points, fit it to a subset, and scale its log evidence
+        up to the number of all points. ``also`` is appended to the key of the warm start."""
         key, rows = f"{name}|{feature_map}{also}", spread(len(y), subsets.FEW)
         mirror = reflection(self.definition, feature_map)
         result = fit(x[rows], y[rows], self.options(name), self.warm.get(key), mirror)
@@ -112,12 +118,14 @@ class OutputLearner:
         theta: NDArray[np.float64],
         at_limit: Censored | None = None,
     ) -> Posterior:
-        """Fit the process of all points x (n, d), y (n,), given a ``theta`` that was fitted to a subset."""
+        """Fit the process of an output to all points x (n, d), y (n,), starting at a ``theta`` that was fitted to a
+        subset. ``at_limit`` are points at which only a bound is known, or None."""
         mirror = reflection(self.definition, feature_map)
         return self.many.fitted(x, y, self.options(name), theta, mirror, at_limit)
 
     def options(self, name: str) -> FitOptions:
-        """Return the options of an output's fit: a linear kernel part for all, and a quadratic one for rewards."""
+        """Return the options of an output's fit. By default the kernel of every output has a linear part, and that of
+        rewards also a quadratic part."""
         options = FitOptions(quadratic=name in (REWARD, PEAK))
         if self.settings.kernel == "squared_exponential":
             options = FitOptions(linear=False)
@@ -125,10 +133,9 @@ class OutputLearner:
 
 
 def is_unexplained(posterior: Posterior) -> bool:
-    """Return whether a process leaves enough error that other structures are worth a search.
+    """Return whether a search for a better structure (other inputs, for example) is worthwhile.
 
-    It does not if it predicts each sample well from the others. Nor is a search worthwhile if inducing points represent
-    the samples with some loss.
+    It is not if the process predicts each sample well from the others, or if its inducing points lose accuracy.
     """
     return loses_nothing(posterior) and posterior.left_out.error > EXPLAINED
 

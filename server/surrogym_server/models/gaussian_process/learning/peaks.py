@@ -24,34 +24,40 @@ from surrogym_server.models.gaussian_process.learning.output_learner import PEAK
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 from surrogym_server.models.gaussian_process.prediction.warp import Warp
 
-FAINT = 0.1  # quantile of the rewards above the base whose height is compared with the greatest height
-# A peak is considered if the greatest height and the FAINT quantile are this many decades apart. Squares in one
-# dimension reach this spread at 6 %.
+FAINT = 0.1  # the greatest height above the base is compared with this quantile of the heights above 0
+# A peak is considered if the greatest height is this many decades above the FAINT quantile. A quadratic reward of one
+# input is no such peak: only its lowest 6 % are so far below the greatest height.
 SPREAD = 3.0
-DECADES = 10.0  # such a spread, in decades, is always a peak: neither noise nor rounding reaches it
+# Heights that spread over this many decades are always a peak, because neither noise nor rounding gives such a spread.
+DECADES = 10.0
 REFITS = 3  # greatest number of further fits, each with samples that contradict the previous one
-BELOW = 10.0  # if few samples have a reward, the logarithm of the others is assumed this many nats below theirs
-FEWEST = 3  # least number of samples with a reward that can predict the others
+# If few samples have a height above 0, the logarithms of the others are assumed this many nats below the lowest of
+# these.
+BELOW = 10.0
+FEWEST = 3  # least number of samples with a height above 0 from which a process of the logarithms is fitted
 EPS = 4 * torch.finfo(torch.float64).eps  # a reward within this share of the base equals the base
 RESOLUTION = 1e-3  # resolution at which explanations of the samples are compared, as a share of the largest reward
-GAIN = 3.0  # least log odds of a process of the logarithms over no structure, unless the spread alone decides
+# Least log odds of a process of the logarithms compared with no dependence on inputs, unless the spread alone decides.
+GAIN = 3.0
 
 
 def hides(reward: Tensor) -> bool:
-    """Return whether many of the rewards (n,) are nearly zero compared with the largest, or all are zero."""
+    """Return whether a peak may be hidden: all rewards (n,) are zero, or many are nearly zero compared with the
+    largest."""
     return bool((reward == 0).all()) or any(True for _ in _bases(reward))
 
 
 def with_peak(
     learner: OutputLearner, reward: Tensor, inputs: Mapping[FeatureMap, Tensor], going: Tensor, plain: OutputModel
 ) -> OutputModel:
-    """Learn the reward by its logarithm, and return the result if it explains the samples better than ``plain``.
+    """Learn the logarithm of the reward. Return the result if it explains the samples better than ``plain`` does,
+    otherwise ``plain``.
 
     Args:
         reward: rewards (n,).
         inputs: features (n, d) of each candidate map.
         going: (n,) bool, the samples to learn from.
-        plain: the output that was learned from the rewards themselves, returned if it explains them better.
+        plain: the output that was learned from the rewards themselves.
     """
     accounts = [_account_of(learner, reward, inputs, going, *base) for base in _bases(reward[going])]
     better = [account for account, structure in accounts if _better(account, structure, plain, reward, inputs, going)]
@@ -59,7 +65,8 @@ def with_peak(
 
 
 def _bases(reward: Tensor) -> Iterator[tuple[float, float]]:
-    """Yield candidate bases and signs of a peak of rewards (n,): above or below 0, above or below the median reward."""
+    """Yield candidates for a peak of the rewards (n,), as pairs of a base (0 or the median reward) and a sign (1 for a
+    peak above the base, -1 below)."""
     middle = float(reward.median())
     for base in dict.fromkeys((0.0, middle)):
         for sign in (1.0, -1.0):
@@ -69,20 +76,22 @@ def _bases(reward: Tensor) -> Iterator[tuple[float, float]]:
 
 
 def _heights(reward: Tensor, base: float, sign: float) -> Tensor:
-    """Return the heights of rewards (n,) above the base (below it for sign -1); 0 for a difference within rounding."""
+    """Return the heights of rewards (n,): their distance above the base, or below the base for sign -1. A difference
+    that may be a rounding error counts as 0."""
     height = sign * (reward - base)
     return torch.where(height.abs() <= EPS * abs(base), 0.0, height)
 
 
 def _trace(height: Tensor, base: float) -> bool:
-    """Return whether heights (n,) are an isolated peak that is invisible in float32, in which trainers compute."""
+    """Return whether heights (n,) above the reward ``base`` are an isolated peak that is too small for float32, in
+    which trainers compute."""
     float32, highest = torch.finfo(torch.float32), float(height.max())
     return 0 < highest < max(float32.eps * abs(base), float32.tiny) and float(height.median()) == 0
 
 
 def _spread(height: Tensor) -> float:
-    """Return the decades between the greatest of the heights (n,) above 0 and their lowest decile; 0 for fewer than
-    two."""
+    """Return the spread of the heights (n,) that are above 0: the number of decades (powers of ten) between the lowest
+    decile and the greatest. 0 if fewer than two are above 0."""
     heights = height[height > 0]
     if len(heights) < 2:
         return 0.0
@@ -98,11 +107,11 @@ def _account_of(
     base: float,
     sign: float,
 ) -> tuple[OutputModel, float]:
-    """Learn the logarithms of the rewards' heights above a base (below it for sign -1). Return the output, and its log
-    odds against targets that don't depend on the inputs.
+    """Learn the logarithms of the rewards' heights above a base, or below it for sign -1. Return the output, and the
+    log odds of its process compared with targets that don't depend on the inputs.
 
-    The process is fitted to the samples with a reward, and to those without one that would contradict it. It is then
-    conditioned on all samples of ``going``.
+    The process is fitted to the samples whose height is above 0, and to samples of height 0 at which it would predict
+    too much. Then it is conditioned on all samples ``going`` (n,).
     """
     height = _heights(reward, base, sign)
     positive = going & (height > 0)
@@ -135,9 +144,11 @@ def _better(
     inputs: Mapping[FeatureMap, Tensor],
     going: Tensor,
 ) -> bool:
-    """Return whether a process of the logarithms explains the samples better than ``plain``, a process of the values.
+    """Return whether ``account``, which learned the logarithms of the rewards, explains the samples better than
+    ``plain``, which learned the rewards themselves.
 
-    ``structure`` is the log odds of the logarithms' process against no structure; the others are as in ``with_peak``.
+    ``structure`` are the log odds of the process of ``account`` compared with targets that don't depend on the inputs.
+    The other arguments are those of ``with_peak``.
     """
     if account.posterior is None:
         return False
@@ -151,7 +162,7 @@ def _better(
 
 
 def _structure(output: OutputModel) -> float:
-    """Return the log odds of a fitted process against targets that don't depend on their inputs."""
+    """Return the log odds of a fitted process compared with targets that don't depend on the inputs."""
     if output.posterior is None:
         return 0.0
     count = output.posterior.points
@@ -159,13 +170,13 @@ def _structure(output: OutputModel) -> float:
 
 
 def _agreement(output: OutputModel, reward: Tensor, inputs: Mapping[FeatureMap, Tensor], going: Tensor) -> float:
-    """Return the log probability of all rewards, each predicted from the others and rounded to ``RESOLUTION`` of the
-    largest."""
+    """Return the sum of the log probabilities of the rewards, each predicted from the others. A probability is that of
+    an interval around the reward, as wide as ``RESOLUTION`` of the largest reward on either side."""
     posterior, warp = output.posterior, output.warp
     assert posterior is not None
     if posterior.sparse is None:
         mean, variance = posterior.leave_one_out()
-    else:  # of thousands of points each hardly influences its own prediction, so none is left out
+    else:  # with thousands of points, each hardly influences its own prediction, so it need not be left out
         mean, latent = posterior.mean_and_variance(inputs[output.feature_map][going])
         variance = latent + posterior.hyper.noise_variance
     centre, spread = output.centre + output.scale * mean, output.scale * variance.sqrt()

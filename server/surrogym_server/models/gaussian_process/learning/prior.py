@@ -19,16 +19,18 @@ from surrogym_server.gp import LeftOut
 from surrogym_server.models.gaussian_process.model import GaussianProcessModel
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 
-NOTHING = 1e-9  # a residual of the prior below this share of an output's standard deviation is rounding
+# Differences from the prior's mean below this share of an output's standard deviation are rounding errors.
+NOTHING = 1e-9
 BY_PRIOR = "with the prior, mean log density of a left-out sample"
-BESIDE = " beside prior"  # suffix of an output's name in the keys of warm starts: fits beside a prior
+# Suffix of an output's name in the keys of warm starts, for fits of the difference from a prior.
+BESIDE = " beside prior"
 Learn = Callable[[str, Tensor], OutputModel]  # function of an output's name and its targets (n,)
 ALONE = "without the prior, mean log density of a left-out sample"
 
 
 @dataclass(frozen=True)
 class Known:
-    """Predictions of a prior at n samples."""
+    """Predictions of a prior model at n samples."""
 
     change: Tensor  # (n, M) change of each transition output
     reward: Tensor  # (n,) reward without the terminal reward
@@ -36,7 +38,7 @@ class Known:
 
     @classmethod
     def of(cls, prior: GaussianProcessModel, samples: Samples) -> Self:
-        """Compute the predictions of a prior at the samples."""
+        """Compute the predictions of a prior model at the samples."""
         means = prior.means_before_end(samples.q, samples.u)
         return cls(means[:, :-1], means[:, -1], prior.terminal_reward)
 
@@ -44,13 +46,13 @@ class Known:
 def better_of(learn: Learn, name: str, target: Tensor, known: Tensor | None, keep: Tensor) -> OutputModel:
     """Learn an output from its targets (n,), with and without the prior, and return the better one.
 
-    That is the output with the greater density of left-out samples, in doubt the one with the prior.
+    The better one gives left-out samples a greater density. If they are equal, it is the one with the prior.
 
     Args:
         learn: function that fits an output.
         name: name of the output.
         target: targets (n,).
-        known: the prior's mean (n,), or None if there is no prior.
+        known: mean that the prior model predicts at the samples, (n,), or None if there is no prior.
         keep: (n,) bool, the samples to learn from.
     """
     alone = learn(name, target)
@@ -64,7 +66,8 @@ def better_of(learn: Learn, name: str, target: Tensor, known: Tensor | None, kee
 
 
 def beside(learn: Learn, name: str, target: Tensor, known: Tensor, keep: Tensor) -> OutputModel:
-    """Learn the residual of targets (n,) from the prior's mean ``known`` (n,), from the samples ``keep`` (n,)."""
+    """Learn how targets (n,) differ from the mean ``known`` (n,) that the prior model predicts, from the samples
+    ``keep`` (n,)."""
     left, size = target - known, float(target[keep].std(correction=0))
     is_rounding = float(left[keep].abs().max()) <= NOTHING * size
     output = learn(name + BESIDE, torch.zeros_like(left) if is_rounding else left)

@@ -16,7 +16,7 @@ from surrogym_server.models.gaussian_process.prediction.output_model import Outp
 from surrogym_server.tensors import EDGE, amplitude, bend
 
 ODDS = -3.0  # prior log odds of each rate
-FEWEST = 8  # least number of samples for each rate; fewer leave a rate uncertain, and its predictions too sure
+FEWEST = 8  # least number of samples for each rate; with fewer, rates are uncertain and predictions overconfident
 
 
 def output_with_rates(
@@ -28,14 +28,15 @@ def output_with_rates(
     keep_lead: Tensor,
     side: Tensor,
 ) -> OutputModel:
-    """Fit one output as ``OutputLearner.output`` does, then add rates to its best map if they are likelier.
+    """Fit one output as ``OutputLearner.output`` does. Then fit its best feature map with rates, with which the output
+    changes faster the larger an input is, and return this fit if it is likelier.
 
     Args:
         name: name of the output.
         target: targets (n,).
         inputs: features (n, d) of each candidate map.
         keep: (n,) bool, the samples to learn from.
-        keep_lead: (n,) bool, the samples to learn from if the best map reads a lead.
+        keep_lead: (n,) bool, the samples to learn from if the best map reads a lead (next value of another coordinate).
         side: (n,) 1 for a sample that ended at the output's own upper limit, -1 at the lower, otherwise 0.
     """
     output = learner.output(name, target, inputs, keep, keep_lead, side)
@@ -55,7 +56,8 @@ def output_with_rates(
 
 
 def inputs_of(output: OutputModel, inputs: Mapping[FeatureMap, Tensor]) -> Tensor:
-    """Return the inputs of an output's process, (n, d), from the features ``inputs`` of maps without rates."""
+    """Return the inputs of an output's process, (n, d). ``inputs`` are the features of the maps without rates; if the
+    output has rates, its features are transformed."""
     x, rates = inputs[replace(output.feature_map, rates=())], output.feature_map.rates
     return bend(x, torch.tensor(rates, dtype=x.dtype)) if rates else x
 
@@ -65,7 +67,7 @@ def _may_have_rates(
 ) -> Tensor:
     """Return which inputs of an output may have a rate, (d,) bool.
 
-    No input may if there are too few samples to determine the rates, or if the process has little error left.
+    No input may if there are too few samples to determine the rates, or if the process predicts well without rates.
     """
     plain, posterior = output.feature_map, output.posterior
     kinds = torch.tensor([feature.function == "affine" for feature in features(learner.definition, plain)])
@@ -89,7 +91,8 @@ def _growing(
     plain = output.feature_map
     z, t = inputs[plain][keep], (target[keep] - output.centre) / output.scale
     rows, among = spread(len(t), subsets.FEW), ",".join(map(str, may.nonzero().ravel().tolist()))
-    key = f"{output.name}|{plain}|rates of {among}"  # a warm start has a rate for each of these inputs, in this order
+    # Warm starts are stored by the inputs that may have a rate, because they contain one rate for each.
+    key = f"{output.name}|{plain}|rates of {among}"
     starts = [learner.thetas[f"{output.name}|{plain}"], *([learner.warm[key]] if key in learner.warm else [])]
     growth = fit_growing(z[rows], t[rows], may, learner.options(output.name), starts)
     learner.thetas[key] = growth.fitted.theta
@@ -104,9 +107,11 @@ def _growing(
 
 
 def _evidence(outputs: Sequence[OutputModel], inputs: Mapping[FeatureMap, Tensor], keep: Tensor) -> list[float]:
-    """Return the log density of the targets under each of the outputs, in the output's scale.
+    """Return the log density of the targets of the samples ``keep`` (n,) under each of the outputs, with targets
+    divided by the output's scale.
 
-    With inducing points, which give no evidence of all samples, it is the sum over the targets given all others.
+    If a process has inducing points, its evidence of all samples is unknown. Then the sum of the log densities of each
+    target given all others is used for all outputs.
     """
     pairs = [(output, posterior) for output in outputs if (posterior := output.posterior) is not None]
     exact = all(posterior.sparse is None for _, posterior in pairs)

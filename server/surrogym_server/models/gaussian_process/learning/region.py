@@ -15,14 +15,18 @@ from surrogym_server.models.gaussian_process.learning.thresholds import log_prob
 from surrogym_server.models.gaussian_process.model import GaussianProcessModel
 from surrogym_server.models.gaussian_process.prediction.regions import TERMINATION, Classifier, Form, Region, likely
 
-HANDICAP = 3.0  # log odds against the classifier, whose hyperparameters were fitted to the left-out labels as well
-FAINT = 0.05  # a form of the region is discarded if its weight is below this share of the best form's weight
+# Subtracted from the log probability of the classifier, because its hyperparameters were also fitted to the left-out
+# labels.
+HANDICAP = 3.0
+# A form of the region (classifier or thresholds) is discarded if its weight is below this share of the best form's
+# weight.
+FAINT = 0.05
 
 
 def learn_termination(learner: OutputLearner, samples: Samples, prior: GaussianProcessModel | None = None) -> Region:
     """Learn the region in which episodes end. It is empty while no sample has ended an episode.
 
-    If the samples agree with the region of a prior without exception, that region is returned.
+    If a ``prior`` model has learned such a region and all samples agree with it, that region is returned.
     """
     if prior is not None and prior.ending is not None:
         agrees = (prior.ending.probability(samples.q_next) > 0.5) == samples.terminated
@@ -34,7 +38,8 @@ def learn_termination(learner: OutputLearner, samples: Samples, prior: GaussianP
 def learn_region(learner: OutputLearner, name: str, q: Tensor, inside: Tensor) -> Region:
     """Learn the region of those states q (n, C) for which ``inside`` (n,) is true.
 
-    It combines thresholds and a classifier, weighted by how well each predicts left-out labels.
+    The region is a weighted mean of thresholds and a classifier. The better one of them predicts left-out labels, the
+    larger is its weight.
     """
     scored: list[tuple[Form, float]] = [_classifier(learner, name, q, inside)]
     scored += thresholds(learner.definition, q, inside)
@@ -55,7 +60,7 @@ def _classifier(learner: OutputLearner, name: str, q: Tensor, inside: Tensor) ->
         return Classifier(definition, process), 0.0
     if process.posterior.sparse is None:
         mean, variance = process.posterior.leave_one_out()
-    else:  # of thousands of points each hardly influences its own prediction, so none is left out
+    else:  # with thousands of points, each hardly influences its own prediction, so it need not be left out
         mean, latent = process.posterior.mean_and_variance(inputs[process.feature_map])
         variance = latent + process.posterior.hyper.noise_variance
     probability = likely(process.centre + process.scale * mean, process.scale * variance.sqrt())

@@ -14,22 +14,24 @@ from surrogym_server.models.gaussian_process.learning.dropping import WIN, map_w
 from surrogym_server.models.gaussian_process.learning.output_learner import OutputLearner, is_unexplained
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 
-ROLES = 4  # greatest number of inputs of a shared function
-MOST = subsets.FEW  # greatest number of own and shared samples of an output; beyond it, shared ones are left out
+ROLES = 4  # greatest number of inputs of a function that several outputs have in common
+# Greatest number of samples from which an output learns if it shares; samples of other outputs beyond it are left out.
+MOST = subsets.FEW
 
 
 @dataclass(frozen=True)
 class _Candidate:
-    """Output that may share samples with others, with what is needed to pool it."""
+    """Output that may share its samples with other outputs, and its data in the form that ``gp.pooling`` needs."""
 
     place: int  # index of the output in the model
     output: OutputModel
     part: Part
-    every: tuple[int, ...]  # indices of the inputs of ``part`` in the feature map that leaves nothing out
+    every: tuple[int, ...]  # indices of the inputs of ``part`` among all features of the map, dropped ones included
 
 
 def with_samples_of_others(learner: OutputLearner, outputs: Sequence[OutputModel]) -> tuple[OutputModel, ...]:
-    """Return the outputs; those that are the same function of different inputs learn from each other's samples too."""
+    """Return the outputs in the same order. Outputs that are the same function of different inputs have also learned
+    from each other's samples."""
     shared = list(outputs)
     if not learner.settings.repeated_parts or not any(_is_to_learn(learner, output) for output in outputs):
         return tuple(shared)
@@ -51,7 +53,8 @@ def with_samples_of_others(learner: OutputLearner, outputs: Sequence[OutputModel
 
 
 def _is_to_learn(learner: OutputLearner, output: OutputModel) -> bool:
-    """Return whether an output has error left to explain, and evidence about its inputs."""
+    """Return whether a search for outputs that are the same function as this one is worthwhile: its process does not
+    predict well yet, and its inputs were selected by evidence."""
     unexplained = output.posterior is not None and is_unexplained(output.posterior)
     return unexplained and output.name in learner.selections
 
@@ -86,7 +89,8 @@ def _candidate(learner: OutputLearner, place: int, output: OutputModel) -> _Cand
 
 
 def _sharing(members: Sequence[_Candidate], pool: Pool, member: int) -> OutputModel:
-    """Return a member of a pool with the samples of the pool, or unchanged if these predict its own samples worse."""
+    """Return a member of a pool, learned from the samples of all members, or unchanged if it then predicts its own
+    samples worse. ``member`` is its index in ``members``."""
     candidate, output = members[member], members[member].output
     assert output.posterior is not None
     x, y, hyper = pool.samples_of(member, MOST)

@@ -20,15 +20,17 @@ from surrogym_server.models.gaussian_process.learning.prior import Known, beside
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 from surrogym_server.models.gaussian_process.prediction.regions import Jump, jumped
 
-FEW = 2  # with fewer non-terminating steps than this, terminating steps are learned from too
+FEW = 2  # with fewer non-terminating steps than this, the reward is learned from terminating steps too
 
 
 def learn_reward(
     learner: OutputLearner, samples: Samples, prior: Known | None = None
 ) -> tuple[OutputModel, float, tuple[Jump, ...]]:
-    """Return the reward process of non-terminating steps, the additional reward of terminating steps, and the jumps.
+    """Learn the reward. Return the output for the reward of non-terminating steps, the reward that terminating steps
+    pay in addition, and the jumps of the reward.
 
-    A process of the residual of the ``prior`` is used if its leave-one-out errors are not larger.
+    With a ``prior``, the output is instead learned as the difference from the prior's prediction, if its leave-one-out
+    errors are then not larger.
     """
     definition = learner.definition
     if (declared := definition.declared_reward) is not None:
@@ -72,7 +74,8 @@ def _without_action(definition: EnvironmentDefinition, samples: Samples) -> dict
 
 
 def _declared(reward: DeclaredRewardDefinition, samples: Samples) -> OutputModel:
-    """Return the declared reward as an output without a process. Its score is the largest error over the samples."""
+    """Return an output without a process for a declared reward. Its score is the largest difference between declared
+    and sampled rewards."""
     rewards = reward(samples.q_next if reward.after else samples.q, samples.u) + reward.terminal * samples.terminated
     off = float((samples.reward - rewards).abs().max())
     scores = (("declared, largest error over the samples", off),)

@@ -18,17 +18,18 @@ Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 Rules = tuple[tuple[Cut, ...], ...]
 SLACK = 1e-9  # values closer than this share of an axis's range are equal
-RIVALS = 4  # greatest number of alternative cuts of one rule
-FAINT = 0.05  # least weight of an alternative cut
-LEFT_OUT = 100  # greatest number of samples that are left out, one by one, to score a rule
+RIVALS = 4  # greatest number of alternative cuts (thresholds on different axes) that explain the same samples
+FAINT = 0.05  # alternative cuts with a smaller weight than this are discarded
+LEFT_OUT = 100  # greatest number of samples that are left out, one by one, to test how well thresholds predict labels
 
 
 def thresholds(definition: EnvironmentDefinition, q: Tensor, inside: Tensor) -> list[tuple[Thresholds, float]]:
     """Find thresholds that explain which of the states q (n, C) lie inside, (n,) bool.
 
     Returns:
-        At most two forms with their leave-one-out log probabilities: a union of thresholds, and the complement of a
-        union of at least two (the complement of a single threshold would be a threshold again).
+        At most two pairs of thresholds and their leave-one-out log probability. In the first, a state is inside if it
+        exceeds any of the thresholds. In the second, it is inside if it exceeds none of at least two thresholds. (With
+        one threshold, that would again be a single threshold.)
     """
     values, labels = Axes.of(definition)(q).numpy(), inside.numpy()
     forms = []
@@ -41,13 +42,14 @@ def thresholds(definition: EnvironmentDefinition, q: Tensor, inside: Tensor) -> 
 
 
 def explain(values: Floats, inside: Bools) -> Rules:
-    """Return rules for samples with axis values (n, A) and labels ``inside`` (n,); () if no union of thresholds
-    fits."""
+    """Return rules that explain the labels ``inside`` (n,) of n states by their values on A axes (n, A): a state is
+    inside if it exceeds the threshold of any rule. Return () if no such rules fit."""
     if inside.all() or not inside.any():
         return ()
     width = np.maximum(values.max(0) - values.min(0), 1e-300)
     outside = values[~inside].max(0)
-    reached = values[inside] > outside + SLACK * width  # (i, A) for each state inside and axis
+    # (i, A) whether each state inside exceeds all states outside on each axis.
+    reached = values[inside] > outside + SLACK * width
     share = np.where(reached, (values[inside] - outside) / width, np.inf)
     axes = _cover(reached, share)
     if not axes:
@@ -62,18 +64,20 @@ def explain(values: Floats, inside: Bools) -> Rules:
 
 
 def log_probability(probability: Tensor, inside: Tensor) -> float:
-    """Return the log probability of labels inside (n,), each limited by the rule of succession to 1 / (n + 2)."""
+    """Return the log probability of labels ``inside`` (n,) that are predicted with ``probability`` (n,). The
+    probability of each label counts as at least 1 / (n + 2), as in the rule of succession."""
     right = torch.where(inside, probability, 1 - probability)
     return float(right.clamp(1 / (len(right) + 2), 1).log().sum())
 
 
 def _cover(reached: Bools, share: Floats) -> list[int]:
-    """Choose axes greedily that together explain every sample inside; () if there are none.
+    """Choose few axes, greedily, so that each of the i samples inside is separated from all samples outside by a
+    threshold on at least one of them. Return their indices; [] if this is impossible.
 
     Args:
-        reached: (i, A) whether each axis separates each sample inside from those outside.
-        share: (i, A) gap between the sample and those outside, as a share of the axis's range. Of axes that explain
-            equally many samples, the one with the widest gap is chosen.
+        reached: (i, A) whether a sample inside exceeds all samples outside on an axis.
+        share: (i, A) gap between the sample and those outside, as a share of the axis's range. Of axes that separate
+            equally many further samples, the one with the widest gap is chosen.
     """
     axes: list[int] = []
     left = np.ones(len(reached), dtype=bool)
@@ -88,10 +92,11 @@ def _cover(reached: Bools, share: Floats) -> list[int]:
 
 
 def _assign(reached: Bools, share: Floats, axes: list[int]) -> NDArray[np.int64]:
-    """Return which of the chosen axes explains each sample inside, (i,).
+    """Return for each of the i samples inside the position in ``axes`` of the axis whose threshold explains it, (i,).
 
-    It is the only possible one, or the one on which the sample lies farthest beyond the threshold, relative to the
-    samples that this axis alone explains. ``reached`` and ``share`` are as in ``_cover``.
+    If several axes are possible, it is the one on which the sample lies farthest beyond the samples outside. On each
+    axis this distance is divided by the smallest distance of the samples that only this axis explains. ``reached`` and
+    ``share`` are as in ``_cover``.
     """
     able, distance = reached[:, axes], share[:, axes]
     sole = able.sum(1) == 1
@@ -101,14 +106,15 @@ def _assign(reached: Bools, share: Floats, axes: list[int]) -> NDArray[np.int64]
 
 
 def _rivals(inner: Floats, outside: Floats, width: Floats, own: Bools, axes: list[int]) -> tuple[Cut, ...]:
-    """Return the cuts along ``axes`` that explain a rule's own samples, by descending weight.
+    """Return alternative cuts (thresholds on one axis) that all separate the samples of one rule from those outside, by
+    descending weight.
 
     Args:
         inner: axis values (i, A) of the samples inside.
         outside: greatest value of the samples outside on each axis, (A,).
         width: range of each axis, (A,).
-        own: (i,) bool, the samples that the rule explains.
-        axes: axes to consider.
+        own: (i,) bool, the samples inside that the rule explains.
+        axes: indices of the axes to consider.
     """
     inside = inner[own].min(0)
     weights = {axis: max(0.0, float((inside[axis] - outside[axis]) / width[axis])) for axis in axes}
@@ -123,7 +129,8 @@ def _rivals(inner: Floats, outside: Floats, width: Floats, own: Bools, axes: lis
 def _left_out(definition: EnvironmentDefinition, values: Floats, inside: Bools) -> float:
     """Return the leave-one-out log probability of the labels ``inside`` (n,), given axis values (n, A).
 
-    Of more than ``LEFT_OUT`` samples, only that many, evenly spaced, are left out one by one, and represent all.
+    If there are more than ``LEFT_OUT`` samples, only so many evenly spaced ones are left out, and the result is scaled
+    up to all samples.
     """
     count, rows = len(inside), torch.from_numpy(values)
     picked = np.unique(np.linspace(0, count - 1, min(count, LEFT_OUT)).astype(int))
