@@ -100,8 +100,8 @@ def snapshots(name: str, use: Use) -> SnapshotList:
 def drop_snapshots(
     name: str, body: Annotated[DropSnapshots, example(examples.DROP_SNAPSHOTS)], use: Use
 ) -> DroppedSnapshots:
-    """Remove snapshots that no sampler holds any more. Queries that begin at them are withdrawn, and the design chooses
-    new ones."""
+    """Remove snapshots that no sampler holds any more. Queries that begin at a removed snapshot are withdrawn, and the
+    design chooses new ones."""
     return DroppedSnapshots(dropped=use.samples.drop_snapshots(name, body.snapshots))
 
 

@@ -113,7 +113,7 @@ def requested(body: replies.AddQueries) -> list[Query]:
     """Return the queries of a request that adds queries: first the single steps, then the rollouts.
 
     Raises:
-        InvalidInput: rows have different lengths, or the numbers of coordinates and actions differ.
+        InvalidInput: rows have different lengths, or ``coordinates`` and ``action`` have different numbers of rows.
     """
     q, u = numbers("coordinates", body.coordinates or ()), numbers("action", body.action or ())
     if len(q) != len(u):

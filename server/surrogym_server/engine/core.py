@@ -49,7 +49,7 @@ class Models(Protocol):
         """Return version ``version`` of a surrogate's model, with its tensors on ``device``."""
 
     def latest(self, surrogate: int, /) -> int:
-        """Return the newest version of a surrogate's model, under which new episodes start."""
+        """Return the newest version of a surrogate's model, with which new episodes start."""
 
 
 def check_size(settings: VirtualSettings, max_lanes: int) -> None:
@@ -254,6 +254,6 @@ def _step(
 def _columns(action: Array, dimensions: int) -> Array:
     """Return actions with ``dimensions`` axes: add the last axis if it is missing.
 
-    Some transports omit it if an action has one entry. All transports must give the same fingerprint.
+    Some transports omit this axis if an action has one entry. All transports must give the same fingerprint.
     """
     return action[..., None] if action.ndim == dimensions - 1 else action

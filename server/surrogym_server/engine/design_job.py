@@ -167,7 +167,7 @@ def _samples(job: DesignJob) -> Samples:
 
 
 def _is_known(job: DesignJob) -> torch.Tensor:
-    """For each of the job's n samples, whether all lag coordinates of its first state are known; (n,) bool."""
+    """For each of the job's n samples, whether all lag coordinates of the sample's first state are known; (n,) bool."""
     return job.definition.known(torch.from_numpy(job.samples.coordinates))
 
 

@@ -94,7 +94,8 @@ class SessionEngine(ABC):
 
     @abstractmethod
     async def forget(self, surrogate: int) -> None:
-        """End all sessions of a deleted surrogate (``surrogate`` is its id), and remove its models."""
+        """End all sessions of a deleted surrogate (``surrogate`` is its id), and remove the surrogate's models from
+        memory."""
 
     @abstractmethod
     async def activity(self, surrogate: str) -> list[SessionActivity]:

@@ -164,7 +164,8 @@ class LiveSessions:
     def advance_now(
         self, id: str, seq: int | None, request: Fingerprint, work: Work, steps: int = 1, deadline: float | None = None
     ) -> Answer:
-        """Carry out a request like ``advance``, but at once in the caller's thread. Needs ``prompt`` to be True."""
+        """Carry out a request like ``advance``, but at once in the caller's thread. May only be called if ``prompt``
+        returns True."""
         live = self._get(id)
         live.last_use = self.clock()
         if repeat := replay(live.session, seq, request):

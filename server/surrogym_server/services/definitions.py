@@ -57,7 +57,7 @@ class Definitions:
 
         Raises:
             UnknownSurrogate: there is no surrogate of this name.
-            NotInstalled: the package of its model family is not installed.
+            NotInstalled: the package of the surrogate's model family is not installed.
         """
         definition = self.get(name)
         _require(name, MODELS.lack(definition.learning.model))
@@ -68,7 +68,7 @@ class Definitions:
 
         Raises:
             UnknownSurrogate: there is no surrogate of this name.
-            NotInstalled: the package of its model family or of its acquisition is not installed.
+            NotInstalled: the package of the surrogate's model family or acquisition is not installed.
         """
         definition = self.for_model(name)
         _require(name, ACQUISITIONS.lack(definition.design.acquisition))

@@ -56,7 +56,8 @@ class EventService:
                     await asyncio.sleep(CHANGE_SECONDS)
 
     async def follow(self, name: str, after: int) -> AsyncIterator[Page | None]:
-        """Yield a surrogate's events with an id above ``after``, page by page, until it is deleted or the server stops.
+        """Yield a surrogate's events with an id above ``after``, page by page, until the surrogate is deleted or the
+        server stops.
 
         Yields None after ``SILENCE_SECONDS`` without an event.
         """

@@ -30,7 +30,8 @@ class Listener:
         self._event.set()
 
     async def wait(self, seconds: float) -> bool:
-        """Wait at most ``seconds`` until a notice has come since the last wait. Return whether one has."""
+        """Wait at most ``seconds`` for a notice, and return whether one has come. A notice that came since the last
+        call counts."""
         with suppress(TimeoutError):
             async with asyncio.timeout(seconds):  # wait_for of Python 3.11 can swallow a cancellation
                 await self._event.wait()

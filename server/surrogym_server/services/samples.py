@@ -133,8 +133,8 @@ class SampleService:
         return self._storage.snapshots.all(name)
 
     def drop_snapshots(self, name: str, snapshots: Sequence[str]) -> int:
-        """Remove snapshots that no sampler holds any more, and return the number removed. Queries that begin at them
-        are replaced by new ones."""
+        """Remove snapshots that no sampler holds any more, and return the number removed. Queries that begin at a
+        removed snapshot are replaced by new queries."""
         count = self._storage.snapshots.drop(name, snapshots)
         self._notices.post(name)
         return count

@@ -12,7 +12,7 @@ Hear = Callable[[str | None], None]
 class Announcements(ABC):
     """Messages between the servers of one database that a surrogate has changed. Thread-safe.
 
-    A message may be lost, so a receiver has to compare the surrogates from time to time as well.
+    A message may be lost, so a receiver also has to look for changed surrogates from time to time.
     """
 
     @abstractmethod

@@ -275,7 +275,8 @@ class Queries(ABC):
     def fail(
         self, name: str, query_id: int, token: str, error: str, *, begun: bool = True, refused: bool = False
     ) -> QueryRecord:
-        """End the lease of a query that could not be answered. The query becomes pending again, or is set aside.
+        """End the lease of a query that could not be answered. The query becomes pending again, or is set aside after
+        its last attempt. A refused query is not leased again.
 
         A repeat changes nothing. If the query begins at a snapshot that was dropped during the lease, it is removed, or
         set aside if a step may have been taken.
@@ -296,8 +297,8 @@ class Queries(ABC):
 
     @abstractmethod
     def withdraw(self, name: str, query_ids: Sequence[int]) -> int:
-        """Remove those of the queries with these ids that are pending and of which surely no real step was taken.
-        Return the number removed."""
+        """Remove queries, given by their ids, and return the number removed. A query stays if it is not pending, or if
+        a real step of it may have been taken."""
 
     @abstractmethod
     def get(self, name: str, query_id: int) -> QueryRecord:
@@ -379,8 +380,8 @@ class Snapshots(ABC):
     def drop(self, name: str, snapshots: Sequence[str]) -> int:
         """Remove snapshots, and return the number removed. Unknown names are skipped.
 
-        Pending queries that begin at them are removed, or set aside if a real step may have been taken. A fit becomes
-        due, which chooses other queries.
+        Pending queries that begin at a removed snapshot are removed too, or set aside if a real step may have been
+        taken. A fit becomes due, which chooses other queries.
         """
 
 

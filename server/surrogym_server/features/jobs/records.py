@@ -28,8 +28,8 @@ class NewJob:
 
 @dataclass(frozen=True)
 class JobProgress:
-    """Progress of a job: its present ``state``, and its learning ``curve`` so far. Both replace those reported
-    earlier."""
+    """Progress of a job: its present ``state``, and its learning ``curve`` so far. Both replace the state and the curve
+    of earlier reports."""
 
     state: JSON = field(default_factory=dict)
     curve: list[JSON] = field(default_factory=list)

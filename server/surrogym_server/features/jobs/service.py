@@ -147,8 +147,8 @@ class JobService:
         return self._jobs.get(name, id)
 
     def list(self, name: str) -> tuple[list[JobRecord], dict[str, Offer]]:
-        """Return the jobs of a surrogate, newest first, and the offer of each connected worker, by the worker's
-        name."""
+        """Return the jobs of a surrogate, newest first, and the offer (accepted jobs) of each connected worker, by the
+        worker's name."""
         return self._jobs.list(name), self._workers.of(name)
 
     def _add(self, name: str, new: NewJob, key: str | None) -> JobRecord:

@@ -8,8 +8,8 @@ from surrogym_server.services.activity import Alive
 
 
 class Offer(NamedTuple):
-    """Which jobs a trainer worker accepts: the largest number of real episodes, and whether it has a reference
-    controller."""
+    """Which jobs a trainer worker accepts: the largest number of real episodes of an evaluation, and whether it has a
+    reference controller."""
 
     most_episodes: int = 0
     reference: bool = False
@@ -20,7 +20,7 @@ class Workers(Alive[Offer]):
 
     def heard(self, surrogate: str, worker: str, offer: Offer | None = None) -> bool:
         """Record a claim or report of a worker, and return whether the worker is new. An ``offer`` of None keeps the
-        earlier one."""
+        worker's earlier offer."""
         if offer is None:
             _, offer = self._heard.get(surrogate, {}).get(worker, (0.0, Offer()))
         return self.note(surrogate, worker, offer)

@@ -27,7 +27,8 @@ OLDER: JSON = {
 
 @dataclass(frozen=True)
 class PolicyFile:
-    """A file of a policy. ``blob`` is None if the file was announced but not sent, or was removed to free space."""
+    """A file of a policy. ``blob`` is the name of the stored file; None if it was announced but not sent, or was
+    removed to free space."""
 
     form: str
     bytes: int

@@ -301,8 +301,8 @@ class PolicyService:
     def _difference(self, name: str, spec: JSON | None) -> str | None:
         """Return the first field in which the specification of a policy's card differs from that of the surrogate.
 
-        Returns None if they are equal, or if the card has none. Raises ``SpecConflict`` if the observations or actions
-        differ.
+        Returns None if both are equal, or if the card has no specification. Raises ``SpecConflict`` if the observations
+        or actions differ.
         """
         own = self._complete(self._storage.surrogates.get(name).spec)
         if spec is None or own == spec:

@@ -69,7 +69,7 @@ class Policies:
     def add(self, name: str, card: JSON, curve: list[JSON], file: PolicyFile) -> tuple[int, bool, Freed]:
         """Store a policy whose ``file`` will be sent later. Return its version, and whether it is new.
 
-        Also returns the names of blobs that are no longer needed.
+        Also returns the names of stored files (blobs) that are no longer needed.
 
         A version never changes. A repeat with the same main file, card and curve returns the stored version. If there
         are more than ``MAX_POLICIES`` policies, one without an alias is removed: the oldest of those that the token
@@ -104,7 +104,7 @@ class Policies:
             return record
 
     def attach(self, name: str, version: int, file: PolicyFile, most: int) -> Freed:
-        """Store a file of a policy, and return the names of blobs that are no longer needed.
+        """Store a file of a policy, and return the names of stored files (blobs) that are no longer needed.
 
         If the files of the surrogate's policies then exceed ``most`` bytes together, files of policies without an alias
         are removed: the oldest of those that the token with the most bytes has stored. The policies themselves stay.
@@ -136,9 +136,9 @@ class Policies:
     def evaluate(self, name: str, version: int, new: NewEvaluation, most: int) -> tuple[EvaluationRecord, bool, Freed]:
         """Store an evaluation of a policy, once for each idempotency key. Return it, and whether it is new.
 
-        Also returns the names of blobs that are no longer needed. Beyond ``MAX_EVALUATIONS`` of the policy, older ones
-        are removed. If the files of the surrogate's policies then exceed ``most`` bytes together, files of policies
-        without an alias are removed.
+        Also returns the names of stored files (blobs) that are no longer needed. Beyond ``MAX_EVALUATIONS`` of the
+        policy, older ones are removed. If the files of the surrogate's policies then exceed ``most`` bytes together,
+        files of policies without an alias are removed.
         """
         table = policy_evaluations
         with self._database.write() as connection:
@@ -195,9 +195,10 @@ class Policies:
             append_event(connection, held, "policy", what="alias", alias=alias)
 
     def delete(self, name: str, version: int) -> Freed:
-        """Delete a policy with its evaluations and aliases. Return the names of its blobs, which can be removed.
+        """Delete a policy with its evaluations and aliases. Return the names of its stored files (blobs), which can be
+        removed.
 
-        The version is not used again.
+        The number of the version is not used again.
         """
         with self._database.write() as connection:
             held = hold(connection, name)
@@ -207,7 +208,7 @@ class Policies:
             return freed
 
     def blobs(self) -> set[str]:
-        """Return the names of all blobs that the policies of all surrogates need."""
+        """Return the names of all stored files (blobs) that the policies of all surrogates need."""
         with self._database.read() as connection:
             return {
                 name
@@ -253,7 +254,8 @@ def _without_owner(card: JSON) -> JSON:
 def _make_place(connection: Connection, surrogate: int, version: int, name: str) -> Freed:
     """Remove policies without an alias, except ``version``, until the surrogate has at most ``MAX_POLICIES`` policies.
 
-    Returns the names of blobs that are no longer needed. Raises ``TooLarge`` if too many policies have aliases.
+    Returns the names of stored files (blobs) that are no longer needed. Raises ``TooLarge`` if too many policies have
+    aliases.
     """
     own = sa.select(policies.c.version).where(policies.c.surrogate_id == surrogate)
     counts = dict.fromkeys(connection.execute(own).scalars(), 1)
@@ -271,7 +273,7 @@ def _make_place(connection: Connection, surrogate: int, version: int, name: str)
 def _within(connection: Connection, surrogate: int, version: int, most: int, name: str) -> Freed:
     """Remove files of policies without an alias, except ``version``, until all files have at most ``most`` bytes.
 
-    Returns the names of blobs that are no longer needed. Raises ``TooLarge`` if that is not enough.
+    Returns the names of stored files (blobs) that are no longer needed. Raises ``TooLarge`` if that is not enough.
     """
     sizes = _sizes(connection, surrogate)
     beyond = sum(sizes.values()) - most
@@ -294,7 +296,7 @@ def _within(connection: Connection, surrogate: int, version: int, most: int, nam
 
 
 def _sizes(connection: Connection, surrogate: int) -> dict[int, int]:
-    """Return the total size in bytes of each policy's blobs, by version."""
+    """Return the total size in bytes of each policy's stored files (blobs), by version."""
     sizes: defaultdict[int, int] = defaultdict(int)
     for table in OWNED:
         there = sa.select(table.c.version, table.c.bytes)
@@ -391,8 +393,9 @@ def _by_version(rows: Iterable[Row[Any]]) -> defaultdict[int, list[Row[Any]]]:
 def _displaced(summaries: Mapping[int, JSON]) -> list[int]:
     """Return the ids of a policy's evaluations to remove, so that ``MAX_EVALUATIONS`` remain.
 
-    There are three kinds: reports of drift, evaluations that can judge the promise, and others. The oldest of the most
-    frequent kind is removed first, so that many evaluations of one kind do not displace those of another.
+    There are three kinds: reports of drift, evaluations that can judge the policy's promise (interval of its return),
+    and others. The oldest of the most frequent kind is removed first, so that many evaluations of one kind do not
+    displace those of another.
 
     Args:
         summaries: summaries of the evaluations by id, oldest first.

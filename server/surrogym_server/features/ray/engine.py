@@ -230,7 +230,7 @@ class RayEngine(SessionEngine):
         return True
 
     def _note_away(self, host: int, what: str) -> None:
-        """Log that a host is dead or silent, once until it answers again."""
+        """Log that a host is dead or silent. This is logged once, until the host answers again."""
         if host not in self._away:
             self._away.add(host)
             logger.warning("session host %d %s: its sessions go on at another one when its lease has ended", host, what)

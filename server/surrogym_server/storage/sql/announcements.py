@@ -25,7 +25,8 @@ GAP_SECONDS = 0.05  # pause between announcements, so that several changes of a 
 
 
 class NotifiedAnnouncements(Announcements):
-    """Announcements by PostgreSQL. The threads start with ``listen``, because many programs need no announcements."""
+    """Announcements by messages of PostgreSQL (NOTIFY). Two threads send and receive them. They start only with
+    ``listen``, because many programs need no announcements."""
 
     def __init__(self, database: Database) -> None:
         self._database = database

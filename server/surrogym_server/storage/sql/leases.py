@@ -174,7 +174,7 @@ def give_back(
 
 
 def is_unbegun(surrogate_id: int) -> sa.ColumnElement[bool]:
-    """Return the SQL condition that a query of this surrogate is pending and that surely no real step of it was
+    """Return the SQL condition that a query of this surrogate is pending and that certainly no real step of it was
     taken."""
     leases_with_steps = sa.select(leases.c.id).where(
         leases.c.query_id == queries.c.id, leases.c.outcome.not_in(BEFORE_A_STEP)

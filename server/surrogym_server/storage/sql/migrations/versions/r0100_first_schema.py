@@ -17,7 +17,8 @@ OPEN = sa.text("outcome = 'open'")
 
 
 def _owner(table: str) -> sa.ForeignKeyConstraint:
-    """Return the foreign key of a table to the surrogate of a row. Rows are deleted with their surrogate."""
+    """Return the foreign key of a table to the surrogate to which a row belongs. Rows are deleted with their
+    surrogate."""
     return sa.ForeignKeyConstraint(
         ["surrogate_id"], ["surrogates.id"], name=f"fk_{table}_surrogate_id", ondelete="CASCADE"
     )
