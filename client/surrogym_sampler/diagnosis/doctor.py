@@ -144,7 +144,8 @@ def environment(
 
 
 def _access_of(original: IsolatedEnvironment | Executable | Simulated, spec: EnvironmentSpec) -> Iterator[Finding]:
-    """Report how exactly the environment can be set, reset and restored, and the recommended access."""
+    """Report how exactly the environment can be set, reset and restored, and at which states its queries should
+    begin."""
     try:
         access = examine(original, spec)
     except CheckFailed as error:
@@ -212,7 +213,8 @@ def _declaring(found: History) -> str:
 
 
 def _way_out(spec: EnvironmentSpec, access: Access) -> str | None:
-    """Return what to do if the environment lacks the access that its specification declares; None if it has it."""
+    """Return what to do if queries can't begin at the states that the specification declares (any state, or snapshots);
+    None if they can."""
     if spec.access == "any" and not access.can_set:
         other = "snapshot" if access.can_restore else "reset"
         return f"register it with --access {other}; what it remembers must be a coordinate for more"

@@ -172,8 +172,9 @@ def _changes(episode: _Episode, turning: Bools) -> Array:
 
 
 def _left_out_error(x: Array, y: Array) -> float:
-    """Return the leave-one-out error of a linear regression of changes y (n, M) on inputs x (n, d): the root mean
-    square as a share of the changes' standard deviation, the largest over the coordinates."""
+    """Return the leave-one-out error of a linear regression of changes y (n, M) on inputs x (n, d). For each
+    coordinate, it is the root mean square error as a share of the standard deviation of the coordinate's changes. The
+    largest of these is returned."""
     spread, size = x.std(0), y.std(0)
     z = np.hstack([np.ones((len(x), 1)), (x - x.mean(0)) / np.where(spread > 0, spread, 1.0)])
     gram = z.T @ z + RIDGE * len(z) * np.eye(z.shape[1])

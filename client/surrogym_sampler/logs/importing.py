@@ -42,7 +42,7 @@ class Imported:
         log: the log that was read, with its usable and its rejected rows.
         surrogate: name of the surrogate; None if no step was sent.
         sent: number of steps that were sent.
-        duplicates: number of those that the surrogate had already.
+        duplicates: number of the sent steps that the surrogate had already.
         rejected_file: file of the rejected rows; None if there is none.
     """
 

@@ -27,9 +27,10 @@ def require_outputs(outputs: Files, inputs: Files, perhaps: Files | None = None)
     """Refuse outputs that would overwrite an input or each other, or that can't be written.
 
     Args:
-        outputs: files to write, by the words for each in a message; None is ignored.
-        inputs: files to read, by the same kind of words.
-        perhaps: files that are written only if needed, by the same kind of words. Their folder may be write-protected.
+        outputs: files to write, by the words that name each in a message. A file that is None is ignored.
+        inputs: files to read, by the words that name each in a message.
+        perhaps: files that are written only if needed, by the words that name each in a message. Their folder may be
+            write-protected.
 
     Raises:
         UnusableLog: an output is an input, equals another output, or can't be written to its folder.

@@ -202,7 +202,7 @@ def open_episode(name: str, spec: EnvironmentSpec | None, factory: Factory) -> E
 
     Args:
         name: the environment's name.
-        spec: a specification that replaces the environment's own; None keeps that.
+        spec: a specification that replaces the environment's own; None keeps the own one.
         factory: makes the environment, unless the name is that of a built-in Gymnasium task.
     """
     episode = _open(name, spec, factory)

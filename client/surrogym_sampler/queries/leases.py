@@ -16,7 +16,7 @@ from surrogym_shared.wire import Query
 
 AWAY = (ServerUnreachable, Unavailable)
 ONE_ATTEMPT = Retries(seconds=0)  # no retries, for requests that are repeated anyway
-NEARLY_OVER = 0.1  # remaining share of a lease that counts as nearly over
+NEARLY_OVER = 0.1  # a lease counts as nearly over if at most this share of it is left
 
 
 class LeaseEnded(Exception):

@@ -40,7 +40,7 @@ class SamplerPlan:
         token: the server's access token.
         surrogate: name of the surrogate.
         environment: a name that ``isolated`` can open; its modules must be importable on the machines.
-        spec: a specification that replaces the environment's own; None keeps that.
+        spec: a specification that replaces the environment's own; None keeps the own one.
         step_limit: seconds that one real step may take.
         settings: settings of the sampler.
         version: version of surrogym, which must be the same on all machines.

@@ -72,7 +72,8 @@ class Returning:
         """Return to a snapshot.
 
         Raises:
-            SnapshotGone: the snapshot can't be used, or the environment died or hung at it twice; it is deleted.
+            SnapshotGone: the snapshot can't be used, or the environment died or hung twice when it was to return there.
+                The snapshot is deleted.
             StepTimedOut, EnvironmentDied: the environment hung or died, and can't be reset either.
         """
         try:

@@ -138,7 +138,8 @@ def scores(decision: Decision, observation: Array) -> Array:
 
 
 def _placed(controller: Controller, memory: Memory, read: Array, sound: Bools) -> Array:
-    """Return the coordinates (N, C).
+    """Return the coordinates (N, C) of this step: the measurements, wrapped or clipped, and the lags, which repeat
+    earlier values.
 
     Args:
         controller: the controller.

@@ -33,9 +33,9 @@ class Vector:
 def vectors_of(controller: Controller, seed: int = 0) -> list[Vector]:
     """Return the test vectors: random walks, ends of the sensors' ranges, and each kind of fault with steps after it.
 
-    A measurement whose rounding to float32 would change the action, such as one at half a turn, is left out. If this
-    leaves none without a fault, such measurements are kept: then float is not precise enough for this policy, and the
-    test fails.
+    A measurement whose rounding to float32 would change the action, such as an angle at half a turn, is left out. If no
+    measurement without a fault is left then, such measurements are kept: then float is not precise enough for this
+    policy, and the test fails.
     """
     vectors = _vectors_of(controller, np.random.default_rng(seed), only_steady=True)
     if all(vector.status for vector in vectors):
@@ -58,7 +58,7 @@ def _vectors_of(controller: Controller, rng: np.random.Generator, *, only_steady
                 if step == 5:
                     read = (low if rng.random() < 0.5 else high).copy()
                 elif judged(controller, read[None], np.zeros(1))[0]:
-                    continue  # rounding moved it beyond the end of its range
+                    continue  # rounding moved the measurement beyond the end of its range
                 if _is_steady(controller, memory, read) or not only_steady:
                     walk = read
                     memory, vector = _answered(controller, memory, first, read, 0.0)

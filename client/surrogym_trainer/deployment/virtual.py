@@ -39,7 +39,7 @@ class VirtualEpisode(Episode):
             raise SurrogymClientError(f"the check of the controller lost its session: {step.lost}; start it again")
         result = step.result
         ended = bool(result.terminated[0] or result.truncated[0])
-        # after its end, the environment is already in the next episode
+        # when an episode has ended, the environment is already in the next one
         at = np.zeros(0) if ended else self._coordinates()
         return Moment(
             np.asarray(result.observation[0]),

@@ -358,7 +358,8 @@ def gaps(spec: EnvironmentSpec, q: Array, u: Array, samples: tuple[Array, Array]
 
 
 def differences(spec: EnvironmentSpec, real: Array, predicted: Array) -> Array:
-    """Return real minus predicted coordinates (..., C). Angles differ by the shorter way."""
+    """Return real minus predicted coordinates (..., C). The difference of angles is taken by the shorter way around the
+    circle."""
     difference = real - predicted
     for index, coordinate in enumerate(spec.coordinates):
         if coordinate.kind == "angle":

@@ -83,8 +83,8 @@ def _expected(claim: OutputFidelity, matters: float) -> float:
 
 
 def _alone(claim: OutputFidelity) -> float:
-    """Return the error of an output on left-out samples, noise included; its tolerance if the family of models has no
-    such error."""
+    """Return the error of an output on left-out samples, which includes the noise. If the family of models can't
+    compute this error, return the output's tolerance."""
     known = claim.tolerance if claim.leave_one_out_error is None else claim.leave_one_out_error
     return max(known, claim.noise, LEAST * claim.tolerance, LEAST_ERROR)
 

@@ -86,7 +86,8 @@ def _parts(returns: Array) -> _Parts:
     observed = float(means.var(ddof=1))
     explained = max(observed - within / len(returns), 0.0)
     scale = np.sqrt(explained / observed) if observed > 0 else 0.0
-    scale *= 1 + 1.5 / len(means)  # first-order correction to Student's t, for one further function than those drawn
+    # first-order correction to Student's t distribution, for a further function that was not drawn
+    scale *= 1 + 1.5 / len(means)
     return _Parts(means.mean() + scale * (means - means.mean()), float(np.sqrt(within)))
 
 

@@ -19,10 +19,10 @@ Array = NDArray[np.float64]
 
 
 def range_left(spec: EnvironmentSpec, q: Array) -> RangeLeft | None:
-    """Return the end of a sampling range that most of a policy's states q (m, C) exceed; None if at most ``LITTLE`` of
-    them exceed any.
+    """Return the end of a sampling range that a policy's states q (m, C) exceed most often; None if no end is exceeded
+    by more than a share of ``LITTLE`` of the states.
 
-    Angles have no ends, and constants and lags follow from the other coordinates.
+    Angles have no ends. Constants and lags are not tested, because they follow from the other coordinates.
     """
     found = [_left(coordinate, values, side) for coordinate, values in _with_ends(spec, q) for side in SIDES]
     worst = max(found, key=lambda one: one.share, default=None)

@@ -43,7 +43,7 @@ class Video:
 
 @dataclass(frozen=True)
 class _Panel:
-    """One episode of a video, and its heading."""
+    """One episode of a video, and the heading over it."""
 
     title: str
     trace: Trace

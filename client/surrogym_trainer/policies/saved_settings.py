@@ -91,7 +91,7 @@ class PolicySettings(BaseModel):
         Raises:
             ValueError: the experience needs more memory.
         """
-        # 4 for the reward, the end, the value and the like
+        # 4 further numbers in each step: the reward, the end, the value and the like
         numbers = 2 * _size(observation_space) + _size(action_space) + 4
         steps = max(self.buffer_size or 0, (self.n_steps or 0) * num_envs)
         if (needed := 4 * numbers * steps) > MAX_EXPERIENCE_BYTES:

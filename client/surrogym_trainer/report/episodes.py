@@ -93,8 +93,8 @@ def draw_ranges(ranges: Sequence[Range], label: str) -> Figure:
 
 
 def unbroken(coordinate: Coordinate, values: Array, meet: Meet, to: float) -> Array:
-    """Return the values (n,) of a coordinate; an angle without jumps from pi to -pi, and at the step ``meet`` as near
-    to ``to`` as full turns allow."""
+    """Return the values (n,) of a coordinate for a picture. An angle is continued without jumps from pi to -pi, and
+    shifted by full turns so that it is as near to ``to`` as possible at the step ``meet``."""
     if coordinate.kind != "angle":
         return values
     turned = np.unwrap(values)

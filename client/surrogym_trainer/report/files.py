@@ -31,7 +31,7 @@ def write(out: Path, page: str) -> int:
 
 
 def as_pdf(page: str) -> bytes:
-    """Return a page as PDF, printed by a headless Chromium. Raises ``NoPdf`` if it is not installed or fails."""
+    """Return a page as PDF, printed by a headless Chromium. Raises ``NoPdf`` if Chromium is not installed or fails."""
     browser = next((path for name in BROWSERS if (path := shutil.which(name))), None)
     if browser is None:
         raise NoPdf("a PDF needs Chromium, which is not installed: install it, or write HTML with --out report.html")

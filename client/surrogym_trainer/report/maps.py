@@ -28,7 +28,7 @@ class Cut:
 
     across: int
     up: int
-    uncertainty: Array  # (S, S) standard deviation in tolerances; the rows go upwards
+    uncertainty: Array  # (S, S) standard deviation as a multiple of the tolerance; rows are ordered from bottom to top
     occupancy: Array  # (S, S) density of visited states
     log_index: Array  # (S, S) natural logarithm of the design's index
 

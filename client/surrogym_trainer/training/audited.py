@@ -163,13 +163,14 @@ class AuditedTraining:
         return self._best(_joined(result, later))
 
     def _shifted(self, done: int) -> Callable[[TrainProgress], None] | None:
-        """Return a function that reports the progress of a training that follows ``done`` virtual steps."""
+        """Return a function that reports the progress of a training that follows ``done`` virtual steps of earlier
+        trainings; None if nobody wants reports."""
         progress = self.progress
         return None if progress is None else lambda now: progress(after(now, done))
 
 
 def _joined(before: TrainResult, after: TrainResult) -> TrainResult:
-    """Return the later result, with the steps and seconds of both trainings."""
+    """Return the result of the later training, with the virtual steps and seconds of both trainings."""
     return replace(
         after,
         virtual_steps=before.virtual_steps + after.virtual_steps,

@@ -102,15 +102,17 @@ class Checks:
 
     @property
     def _nothing(self) -> float:
-        """The imagined return up to which a network counts as having learned nothing."""
+        """The imagined return up to which a network counts as having learned nothing: that of an untrained network and
+        a small share of the largest gain so far."""
         return self.untrained + LEARNED * (self._seen - self.untrained)
 
 
 def checked(port: SurrogatePort, predict: Predict, settings: TrainSettings) -> Returns:
-    """Return the returns (episodes,) of a policy in a check: whole virtual episodes from always the same starts."""
+    """Return the returns (episodes,) of a policy in a check: whole virtual episodes, from the same starts in every
+    check."""
     return imagined_returns(port, predict, CHECK_EPISODES, settings.seed, **settings.judging)
 
 
 def _of_many(returns: Returns) -> float:
-    """Return the lowest return of the best quarter of the episodes."""
+    """Return the return that the best quarter of the episodes reaches or exceeds."""
     return float(np.quantile(returns, 1 - MANY))

@@ -237,7 +237,8 @@ def _answers(
 def _consequence(
     subject: Subject, beside: Compared, before: Promise, view: SurrogateView, inputs: Inputs
 ) -> Consequence | None:
-    """Test the audit's errors together, and compute the effect on the return of the part that all steps share.
+    """Test whether the model's errors in an audit have a part that all steps share, and compute how this part changes
+    the return.
 
     Returns None if there is no step in a state that the policy visits.
 

@@ -45,9 +45,10 @@ class TrainSettings:
     start_visited: float | None = None  # share of episodes that start at a state of a real step; None takes 0
     horizon: int | None = None  # longest training episode, in steps; None takes the time limit
     start_from: Path | None = None  # saved policy to continue from
-    trust_policy: bool = False  # whether to unpickle that policy's objects, which may run code
+    trust_policy: bool = False  # whether to unpickle the objects of the policy in ``start_from``, which may run code
     anew: bool = False  # whether to begin with a new network, and use the saved policy only if the new one stays worse
-    prolong: bool | None = None  # whether to take cycles while they gain, and to refine; None lets prolongs decide
+    # whether to add cycles while the return rises, and to refine the policy; None lets prolongs decide
+    prolong: bool | None = None
     threads: int = 1
     tracker: Tracker | None = None  # tracker of curves, for searches that log them
     # folder of TensorBoard's files; None takes one beside the policy, if the tracker has such files

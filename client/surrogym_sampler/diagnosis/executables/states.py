@@ -55,9 +55,9 @@ def get_gives_the_state_that_was_set(subject: Subject) -> None:
 
 
 def a_step_depends_on_nothing_but_state_and_action(subject: Subject) -> None:
-    """Take a step three times in a row, then once more after other steps. Any difference means that the program
-    remembers more than its state. If the second and third differ already, the plant is noisy and the check does not
-    apply."""
+    """Take the same step from the same state three times in a row, then once more after other steps. If the last result
+    differs, the program remembers more than its state. If already the second and the third result differ, the plant is
+    noisy and the check does not apply."""
     for _ in range(PLACES):
         state, action = subject.random_state(), subject.random_action()
         _, first, again = (_step_from(subject, state, action) for _ in range(3))

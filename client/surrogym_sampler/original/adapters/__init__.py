@@ -27,8 +27,8 @@ class Adapter(NamedTuple):
     Attributes:
         module: Python module of the adapter, which is imported when it is needed.
         names: pattern of the names of environments that the adapter opens.
-        trusted: pattern of the names that a client also opens if only a server gave the name. Such names can open
-            nothing but the package's own environments.
+        trusted: pattern of the names that a client opens even if they come from a server and no person has agreed. Such
+            names can open nothing but the package's own environments.
         extra: pip extra that installs the package.
         separate: whether its simulators run in processes of their own.
     """

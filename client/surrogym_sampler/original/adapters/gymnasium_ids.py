@@ -190,7 +190,7 @@ def _entries(given: Any, whose: str, expected: tuple[str, ...]) -> tuple[Any, ..
         expected: the names of the values that Gymnasium prescribes.
 
     Raises:
-        StepFailed: ``given`` is not a tuple of that many values.
+        StepFailed: ``given`` is not a tuple with as many values as ``expected``.
     """
     if isinstance(given, tuple) and len(given) == len(expected):
         return given

@@ -72,8 +72,8 @@ class Counted:
         return self.read(), taken
 
     def close(self) -> tuple[str, ...]:
-        """Close the environment. Returns a sentence about a failure, instead of an error, because the steps taken are
-        still valid."""
+        """Close the environment. If this fails, return a sentence about the failure instead of raising an error,
+        because the steps taken are still valid."""
         try:
             self.simulator.close()
         except RAISED as error:

@@ -335,6 +335,6 @@ class _Draft:
 
 
 def _raw(term: Term) -> set[str]:
-    """Return the names of coordinates that a term reads directly, without cosine or sine. Such a term jumps where an
-    angle wraps."""
+    """Return the names of the coordinates that a term reads directly, not as cosine or sine. If such a coordinate is an
+    angle, the term jumps where the angle is wrapped."""
     return {name for part in term.parts if part.function == "linear" for name in part.weights}

@@ -14,7 +14,7 @@ from surrogym_sampler.original.protocol import Array
 from surrogym_shared.spec import EnvironmentSpec, ObservationEntry, Term
 from surrogym_shared.terms import evaluate
 
-TOLERANCE = 1e-7  # largest error of an expression, as a share of the entry's largest value
+TOLERANCE = 1e-7  # largest error of a term that expresses an observation entry, as a share of the entry's largest value
 DIGITS = 6  # decimal digits of a rounded weight, which is used if it still explains the entry
 FEW_TURNS = 4  # largest number of angles with which sums of three angles are tried as well
 CLIPPED = 0.02  # an entry counts as clipped if more than this share of the states has its smallest or largest value
@@ -88,8 +88,8 @@ def _sum(basis: Sequence[Term], weights: Array) -> Term | None:
 
 
 def _clip_of(frame: EnvironmentSpec, coordinates: Array, entry: Array) -> Term | None:
-    """Return the term of the one coordinate that an entry shows, clipped at the entry's limits; None if
-    there is none."""
+    """Return the term of an observation entry that is one coordinate, clipped to the entry's smallest and largest
+    value; None if the entry is not of this kind."""
     low, high = float(entry.min()), float(entry.max())
     for index, name in enumerate(frame.coordinate_names):
         if np.allclose(np.clip(coordinates[:, index], low, high), entry, atol=TOLERANCE):

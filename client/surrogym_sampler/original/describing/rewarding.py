@@ -27,7 +27,7 @@ from surrogym_shared.spec.terms import Part
 from surrogym_shared.terms import evaluate
 
 MOST = 120  # largest number of coefficients of a fit
-ENOUGH = 1.5  # smallest number of steps for each coefficient
+ENOUGH = 1.5  # smallest number of steps for each coefficient of a fit
 MOSTLY = 0.9  # share of steps that a reward must explain; the others may depend on a schedule that is not in the state
 TRIMS = 5  # number of repeated fits, each to the steps that the previous fit explained best
 NOTHING = 1e-10  # size below which a term is rounding, as a share of the reward's range
@@ -74,7 +74,7 @@ class Paid:
 
 
 def coefficients(spec: EnvironmentSpec) -> int:
-    """Return the number of coefficients of the quadratic function of this environment."""
+    """Return the number of coefficients of a quadratic reward in this environment."""
     k = len(_quantities(spec))
     return (k + 1) * (k + 2) // 2
 

@@ -28,9 +28,10 @@ def require_variables(name: str, variables: Sequence[Variable]) -> None:
 
 
 def require_few(name: str, variables: Sequence[Variable], moved: NDArray[np.bool_]) -> None:
-    """Raise ``UnknownEnvironment`` if too many variables moved, given which of them did (V,).
+    """Raise ``UnknownEnvironment`` if too many variables moved; ``moved`` (V,) marks those that did.
 
-    Variables that a description may leave out don't count: those that are held, and slides without limits.
+    Variables that a drafted specification may leave out don't count: those that are held through an episode, and slides
+    without limits.
     """
     needed = np.array([v.motion != "held" and (v.motion != "slide" or v.limited) for v in variables])
     _require_at_most(name, int((moved & needed).sum()))

@@ -57,7 +57,7 @@ def read_choices(name: str) -> tuple[Path, Choices]:
     """Return the path of the FMU that a name stands for, and the settings in its JSON file.
 
     Raises:
-        UnknownEnvironment: the name has neither form, or its JSON file can't be used.
+        UnknownEnvironment: the name is neither that of an FMU nor that of a JSON file, or the JSON file can't be used.
     """
     path = Path(name.removeprefix(PREFIX))
     if path.suffix == ".fmu":

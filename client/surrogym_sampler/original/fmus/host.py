@@ -26,7 +26,8 @@ Fields = dict[str, Any]
 
 
 class Host:
-    """The methods that answer requests, and the state that they share."""
+    """The methods with which an FMU's own process answers the requests of its parent process, and the state that they
+    share."""
 
     def __init__(self) -> None:
         self._instance: Instance | None = None
@@ -123,7 +124,8 @@ class Host:
 
     def _values(self) -> Fields:
         values = self._open_instance.read(self._reads)
-        named = dict(zip(self._names, values, strict=True))  # a variable that is a state and an output is read twice
+        # by name, because a variable that is both state and output is read twice
+        named = dict(zip(self._names, values, strict=True))
         wrong = [f"{name} is {value}" for name, value in named.items() if not math.isfinite(value)]
         if wrong:
             raise Refused(

@@ -16,7 +16,7 @@ import numpy as np
 from surrogym_trainer.deployment.controller import Array, Controller, Decision, Observed, Part
 
 PER_LINE = 6  # number of constants in a line of an array
-UNROLLED = 4  # number of inputs of a layer that one pass over its outputs adds
+UNROLLED = 4  # number of a layer's inputs whose products are added in one pass over its outputs
 
 WRAPPED = """
 /* An angle in [-pi, pi). */
@@ -232,8 +232,8 @@ def _network(decision: Decision) -> str:
 
 
 def _products(weights: str, inputs: int, outputs: int) -> list[str]:
-    """Return the C loops that add x @ weights to y: first four inputs at a time, which halves the duration, then the
-    remaining inputs."""
+    """Return the C loops that add the product x @ weights to y. The first loop adds ``UNROLLED`` inputs in each pass,
+    which halves the duration; the second adds the remaining inputs one by one."""
     together = inputs // UNROLLED * UNROLLED
     lines = []
     if together:

@@ -154,7 +154,8 @@ class Learner:
         log = self.distribution.log_probability(outputs, self.further, batch.actions)
         ratio = np.exp(log - batch.log_probabilities)
         clip = np.float32(objective.clip_range)
-        free = np.where(advantages > 0, ratio <= 1 + clip, ratio >= 1 - clip)  # outside of this the loss is flat
+        # where the ratio is not clipped; elsewhere the loss is flat
+        free = np.where(advantages > 0, ratio <= 1 + clip, ratio >= 1 - clip)
         by = -(advantages * ratio * free) / np.float32(size)
         by_outputs, self._further_gradient[:] = self.distribution.slopes(outputs, self.further, batch.actions, by)
         self.actor.backward(by_outputs)

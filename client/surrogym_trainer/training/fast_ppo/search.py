@@ -78,8 +78,10 @@ class FastPpo(PolicySearch):
     n_steps: int = 16  # number of steps of each lane in a rollout
     n_epochs: int = 10
     batch_size: int | None = None  # None takes about 1,024
-    learning_rate: float | None = None  # None decreases it from 3e-3 to a fiftieth of that
-    gamma: float | None = None  # None derives it from the time limit, or from that of short training episodes
+    learning_rate: float | None = None  # None lets the learning rate fall from 3e-3 to a fiftieth of that
+    # None derives the discount factor from the length of the episodes: the time limit, or that of short training
+    # episodes
+    gamma: float | None = None
     gae_lambda: float = 0.97
     clip_range: float = 0.2
     vf_coef: float = 0.5

@@ -47,8 +47,8 @@ def learn(task: SearchTask) -> Stage:
 def refine(task: SearchTask) -> Stage:
     """Return the stage of whole episodes from the declared starts.
 
-    Returns from anywhere can be a thousand times those from the declared starts. Then critic and advantages can't
-    resolve the latter.
+    Episodes that start anywhere can have returns a thousand times as large as those from the declared starts. Critic
+    and advantages are then not precise enough for the declared starts.
     """
     settings = task.settings
     session = {**settings.session, **DECLARED}

@@ -20,8 +20,8 @@ PROJECT = "surrogym"  # project or experiment of the runs in Weights & Biases an
 def tracking(settings: TrainSettings, out: Path) -> Iterator[list[BaseCallback]]:
     """Context manager that returns the callbacks of a training's tracker. The tracker's run ends with the context.
 
-    TensorBoard needs no callback. Addresses and keys come from the trackers' own variables, such as ``WANDB_MODE`` and
-    ``MLFLOW_TRACKING_URI``.
+    TensorBoard needs no callback. Addresses and keys come from the trackers' own environment variables, such as
+    ``WANDB_MODE`` and ``MLFLOW_TRACKING_URI``.
 
     Raises:
         ModuleNotFoundError: the tracker is not installed.
@@ -69,4 +69,4 @@ class MlflowWriter(KVWriter):
         mlflow.log_metrics(numbers, step=step)
 
     def close(self) -> None:
-        """Do nothing, because the context of the run closes it."""
+        """Do nothing: the context manager of the run closes the run."""

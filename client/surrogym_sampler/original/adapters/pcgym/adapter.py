@@ -94,10 +94,11 @@ def _require_model(name: str, model: str, classes: Any) -> None:
 
 
 def parameters_of(which: str) -> dict[str, Any]:
-    """Return the parameters for ``pcgym.make_env``: those of ``cstr``, or those in a JSON file.
+    """Return the parameters for ``pcgym.make_env``: those of the built-in process ``cstr``, or those in a JSON file.
 
     Raises:
-        UnknownEnvironment: ``which`` is neither of these, or the file has parameters that can't be used.
+        UnknownEnvironment: ``which`` is neither ``cstr`` nor an existing file, or the file has parameters that can't be
+            used.
     """
     given = STIRRED_TANK if which == "cstr" else _read(which)
     for key, why in REFUSED.items():
