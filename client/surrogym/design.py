@@ -214,7 +214,7 @@ class Design:
 
         Args:
             steps: number of real steps.
-            visited: states that a policy visits, (v, C), at least one. Queries are then chosen for these states.
+            visited: states that a policy visits, (v, C), at least one. The queries then improve the model there.
 
         Raises:
             InvalidInput: the budget has fewer steps left, or the states have the wrong shape or are not finite.

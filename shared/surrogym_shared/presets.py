@@ -52,7 +52,7 @@ class Preset:
             coordinates: number of the state's coordinates.
             observations: number of the observation's entries.
             actions: number of the action's entries.
-            by_steps: whether a query is one step from a state that can be set, or that the environment returns to.
+            by_steps: whether a query is one step from a state to which the environment is set or returns.
         """
         if self.name == "paper":
             return 10 * (observations + actions)  # section 3.1 of the paper

@@ -155,7 +155,7 @@ class SurrogateFile:
         return cls(name, spec, model, samples, tolerances, ledger, predictions, about)
 
     def about_as_json(self) -> str:
-        """Return as JSON what a prior was made from. Without a description, name this surrogate as its source."""
+        """Return as JSON what a prior was made from. If ``about`` is empty, its source is this surrogate."""
         return json.dumps(self.about or {"source": self.name})
 
     @classmethod

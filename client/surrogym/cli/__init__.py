@@ -54,7 +54,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def run(built: Callable[[], typer.Typer], name: str, arguments: Sequence[str] | None = None) -> None:
-    """Build a command-line app, run one of its commands, and exit with the statuses of ``main``.
+    """Build a command-line app, run one of its commands, and exit.
+
+    The exit status is 0 for success, 1 for failure, 2 for wrong usage, and 130 after Ctrl-C.
 
     Args:
         built: builds the app.

@@ -169,7 +169,8 @@ def _require_fit(predict: Predict, spec: EnvironmentSpec, misfit: str) -> None:
 
 
 def _of_another(card: PolicyCard) -> PolicyCard:
-    """Return a policy's card without the fields that only hold for the surrogate that the policy was trained on."""
+    """Return a policy's card for an audit on another surrogate than the one of its training: without the fields that
+    only hold for the latter, such as the imagined return."""
     empty = {"server": None, "spec": None, "imagined_return": None, "untrained": None, "visited_confidence": ()}
     return card.model_copy(update={**empty, "settings": {}})
 

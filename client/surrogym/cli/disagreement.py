@@ -271,8 +271,8 @@ class Differing:
     broken: bool = False
 
     def in_words(self, spec: EnvironmentSpec | None) -> list[str]:
-        """Describe the result: a line about all steps, a line for each of the worst episodes, and for each of the worst
-        steps."""
+        """Describe the result: a line about all steps, and a line for each of the episodes and of the steps that differ
+        most from the model."""
         from surrogym_trainer.evaluation.comparing import SHOWN
 
         found = self.found

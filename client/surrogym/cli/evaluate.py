@@ -309,7 +309,7 @@ def _keep(
 ) -> None:
     """Write the episodes to files beside the policy, from which they are sent to the server.
 
-    Episodes that the server can't store, such as those with an infinite return, are reported and left out.
+    Episodes that the server can't store, such as those with an infinite return, are left out, and a remark says so.
     """
     from uuid import uuid4
 

@@ -274,8 +274,8 @@ def _as_json(imported: Imported, view: SurrogateView | None) -> dict[str, Any]:
 
 
 def _covered(log: ReadLog) -> dict[str, float]:
-    """Return the share of the cells of a grid that the log has visited, for each pair of coordinates or action
-    entries."""
+    """Return how much of the sampling range a log covers, for each pair of coordinates or action entries: the share of
+    the cells of a grid in which the log has steps."""
     from surrogym_trainer.report.coverage import coverage_of
 
     coverage = coverage_of(log.spec, log.steps.q, log.steps.u)
@@ -329,6 +329,6 @@ def _specified(spec: EnvironmentSpec, notes: tuple[str, ...]) -> list[str]:
 
 
 def _origin(ledger: dict[str, int]) -> str:
-    """Describe the counts of real steps on the server that a file was exported from; empty without any."""
+    """Describe how many real steps the server that exported a file had counted, by purpose; empty if there are none."""
     steps = ", ".join(f"{count} {purpose}" for purpose, count in ledger.items() if count)
     return f" (there {steps})" if steps else ""

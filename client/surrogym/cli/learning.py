@@ -70,7 +70,7 @@ class Learning:
 
 
 def learning_of(option: str, surrogate: str | None, server: str | None, token: str | None) -> Learning:
-    """Return a surrogate that will learn from real steps, after a check on the server, before any step is taken.
+    """Check on the server, before any real step, that a surrogate can learn from the steps, and return the surrogate.
 
     Raises:
         CommandError: no surrogate is named, or ``--learn`` was given and the surrogate has no model to compare with.

@@ -140,7 +140,7 @@ def token_from(context: typer.Context, token: str | None, file: Path | None) -> 
 
 
 def awaited_surrogate(api: Api, name: str, wait: float, *, quiet: bool) -> SurrogateView:
-    """Return the surrogate, and wait up to ``wait`` seconds until it is registered. The terminal shows what the command
+    """Wait up to ``wait`` seconds until a surrogate is registered, and return it. The terminal shows what the command
     waits for.
 
     Raises:

@@ -199,7 +199,8 @@ def _period(view: SurrogateView) -> str:
 
 
 def _steps(seen: SurrogateSummary) -> str:
-    """Describe the number of real steps of the budget, and of logged steps, which don't count towards it."""
+    """Describe how many real steps of the budget were taken, and how many steps come from logs, which the budget does
+    not include."""
     ledger = seen.ledger
     taken = f"{ledger.total} of {seen.budget}" if seen.budget or ledger.total else ""
     logged = f"{ledger.logged} logged" if ledger.logged else ""

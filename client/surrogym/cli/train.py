@@ -234,8 +234,8 @@ def _words_without_model(view: SurrogateView) -> str:
 
 @contextmanager
 def _recording(path: Path | None, curve: list[CurvePoint], update: Update) -> Iterator[Record]:
-    """Context of a training's progress. Yields a function that shows it, adds a point to ``curve``, and appends a line
-    to the file ``path``, which other processes can watch."""
+    """Context that records a training's progress. Yields a function that shows the present progress, adds it as a point
+    to ``curve``, and appends it as a line to the file ``path``, which other processes can watch."""
     from surrogym_shared.wire import CurvePoint
     from surrogym_trainer.training.course import Course
     from surrogym_trainer.training.words import words_of

@@ -115,7 +115,7 @@ def _logs(log: Path, mapping: Path | None, spec: EnvironmentSpec, *, follow: boo
 
 
 class _Seen:
-    """Rows of a log that were read so far: the steps of the last reading, and unusable rows."""
+    """Rows of a log that is read repeatedly: the usable steps of the last reading, and all unusable rows so far."""
 
     def __init__(self) -> None:
         self.steps: list[StepOfEpisode] = []  # usable steps of the last reading

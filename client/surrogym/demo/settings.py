@@ -22,7 +22,7 @@ class DemoSettings:
 
     task: str = "pendulum"
     seed: int = 0
-    budget: int | None = None  # most real steps of the design
+    budget: int | None = None  # most real steps of the design and the rounds together
     steps: int | None = None  # virtual steps of all rounds of training together
     episodes: int = 100
     pictures: bool = True

@@ -87,5 +87,6 @@ def design_budget(budget: int) -> int:
 
 
 def queries_a_round(budget: int) -> int:
-    """Return the real steps of each round of the closed loop for a whole ``budget``; 0 if the design takes it all."""
+    """Return how many real steps each round of the closed loop takes, if design and rounds together have ``budget``
+    steps; 0 if the design takes all of them."""
     return (budget - design_budget(budget)) // ROUNDS

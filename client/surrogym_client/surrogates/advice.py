@@ -14,7 +14,7 @@ from surrogym_shared.wire import DoubtfulRegion, ModelView, OutputFidelity, Reac
 NEARLY = 0.9  # share of the target that counts as nearly reached
 MOST_STEPS = 10.0  # most real steps that a forecast may need, as a multiple of the present samples
 NOTICEABLE = 0.9  # real steps helped if they multiplied the leave-one-out error by less than this factor
-FEWEST_MODELS = 4  # fewest models from which to estimate a rate
+FEWEST_MODELS = 4  # fewest models from which the speed of learning is estimated
 NOISY_SLACK = 1.25  # factor on the allowed leave-one-out error once noise is confirmed
 NOISE_BAND = 1.5  # standard deviations of the noise that the server adds to a tolerance in the confidence index
 MOSTLY_NOISE = 0.8  # share of noise in the squared leave-one-out error from which more real steps hardly help
@@ -131,7 +131,7 @@ def _of_limit(limit: ReachedLimit) -> str:
 
 
 def _widen(view: SurrogateView, output: OutputFidelity) -> str:
-    """Return the command that declares the tolerance with which the output would be certain."""
+    """Return the command that declares the tolerance with which the output would reach its target."""
     return f"surrogym change {view.name} --tolerance {output.name}={_within_reach(view, output):.2g}"
 
 
@@ -236,7 +236,7 @@ def _forecast(samples: Sequence[float], values: Sequence[float], limit: float) -
 
 
 def _within_reach(view: SurrogateView, output: OutputFidelity) -> float:
-    """Return the tolerance with which the output would be certain, assuming the same standard deviation everywhere.
+    """Return the tolerance with which the output would reach its target, if its standard deviation is even everywhere.
 
     The server adds the noise to a tolerance, but does not count noise that is much smaller than the tolerance.
     """

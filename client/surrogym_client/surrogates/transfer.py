@@ -45,8 +45,8 @@ def import_surrogate(
 ) -> SurrogateView:
     """Create a surrogate from a file. It serves the same model at once, with the same tolerances.
 
-    Its design is paused. Its samples count as manual ones, and those of a log as logged. If anything fails, or Ctrl-C
-    is pressed, the new surrogate is deleted again. A surrogate that another request created is never changed.
+    Its design is paused. Samples of a log stay logged ones, and all others count as manual ones. If anything fails, or
+    Ctrl-C is pressed, the new surrogate is deleted again. A surrogate that another request created is never changed.
 
     Args:
         api: the server; the token needs the role admin.

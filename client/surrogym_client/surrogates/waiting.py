@@ -49,7 +49,7 @@ def _words_of_fit(view: SurrogateView) -> str:
 
 
 def words_of_waiting(view: SurrogateView, start: str) -> str:
-    """Describe what a training waits for: a sampler, which the command ``start`` starts, the answers of a running
+    """Describe what a training waits for: a sampler (which the command ``start`` starts), the answers of a running
     sampler, or a model."""
     if view.phase == "fitting" and not _under_way(view):
         return words_of_design(view)

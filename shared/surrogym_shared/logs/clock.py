@@ -107,8 +107,8 @@ def _restarts(time: Floats) -> Bools:
 
 
 def _overlapping(time: Floats, number: Ints, restarts: Ints) -> set[int]:
-    """Return the numbers of the episodes that begin at a row in ``restarts``, at a later time than the episode before
-    them began."""
+    """Return the numbers of the episodes that begin at a row in ``restarts``, at a later time than the beginning of the
+    previous episode."""
     start = {int(number[row]): time[row] for row in range(len(time) - 1, -1, -1)}
     return {int(number[row]) for row in restarts if time[row] > start[int(number[row]) - 1]}
 
@@ -171,7 +171,7 @@ class Ticks:
     Attributes:
         tick: time between two values of the clock.
         interval: time between two rows.
-        irregular: rows at a time with another number of rows than the others, so that rows may be missing there, (n,).
+        irregular: mask (n,) of the rows at times that have an unusual number of rows, so that rows may be missing.
     """
 
     tick: float

@@ -17,7 +17,7 @@ EQUAL = 1e-6  # largest relative difference between the steps of a regular clock
 
 
 def measured(cells: Cells) -> Floats | None:
-    """Return a column of numbers or times (n,); None if a cell is neither."""
+    """Return a column of numbers or times as numbers (n,); None if a cell is neither, or if there are few cells."""
     try:
         values, faults = times("", cells)
     except UnusableLog:
@@ -28,7 +28,8 @@ def measured(cells: Cells) -> Floats | None:
 def numbering(cells: Cells) -> Numbering | None:
     """Return what a column of whole numbers counts; None if it counts nothing.
 
-    ``rows``: all rows. ``episodes``: the rows of each episode. ``gaps``: one of these, with some rows missing.
+    ``rows``: it numbers all rows. ``episodes``: it numbers the rows of each episode, and then restarts. ``gaps``: it
+    numbers rows in one of these two ways, but some numbers are missing.
     """
     values = measured(cells)
     if values is None or cells.dtype.kind in (DATES, DURATIONS) or (values != np.floor(values)).any():

@@ -378,7 +378,7 @@ def _about(roles: Roles, steps: Transitions) -> list[str]:
 
 
 def lost_ends(steps: Transitions) -> list[str]:
-    """Return a note if the log has no states after the last steps of episodes, so that no step shows how one ends."""
+    """Return a note if the log lacks the states in which episodes ended, so that no step shows how an episode ends."""
     if not steps.lost_ends:
         return []
     count = "1 episode ends" if steps.lost_ends == 1 else f"{steps.lost_ends} episodes end"

@@ -29,7 +29,8 @@ class Rows:
         episode: number of the episode, (n,); None without a column.
         time: times, (n,); None without a column.
         faults: reason for each row that can't be used, by the row's index.
-        sound: whether the row's state can be used, (n,), at least as the next state of the row before.
+        sound: whether the row's state can be used, (n,). In a row that can't be used for another reason, the state can
+            still be the next state of the row before.
     """
 
     roles: Roles

@@ -144,8 +144,8 @@ def _backwards(
 
 
 def _going_on(rows: Rows, follower: dict[int, int], rejected: dict[int, str]) -> dict[int, str]:
-    """Return a reason for each row that is marked as the end of its episode although another row of it follows, by the
-    row's index."""
+    """Return a reason for each row that is marked as the end of its episode although a row of the same episode follows,
+    by the row's index."""
     return {
         row: f"{rows.roles.terminated}: expected 0, as line {rows.lines[after]} continues the episode, got 1"
         for row, after in follower.items()

@@ -27,7 +27,7 @@ def require_units(q: Floats, spec: EnvironmentSpec, which: str = "") -> None:
         which: words before the name of a coordinate in a message, such as "next ".
 
     Raises:
-        UnusableLog: the middle half of a column lies outside the coordinate's range, or is far wider than it.
+        UnusableLog: the middle half of a column lies outside the coordinate's range, or is far wider than the range.
     """
     for index, coordinate in enumerate(spec.coordinates):
         column = q[np.isfinite(q[:, index]), index]
