@@ -26,7 +26,7 @@ from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import NewSample
 from surrogym_shared.words import counted
 
-BATCH = 2_000  # steps between two reports of progress
+BATCH = 2_000  # number of steps that are sent before each report of progress
 SAMPLER = "log"
 MOST_KNOWN = 2_000  # number of a surrogate's samples whose rewards are compared with those of the log
 
@@ -158,8 +158,8 @@ def import_log(
     Raises:
         ValueError: both ``register`` and ``to`` are given, or ``to`` with ``spec``.
         UnusableLog: the file is not a log, the role of a column is not clear, ``register`` is not a valid name,
-            ``rejected`` is the log or the mapping, the file beside the log is not one of rejected rows, or ``draft`` is
-            a file with another specification.
+            ``rejected`` is the log or the mapping, an existing file beside the log does not contain rejected rows, or
+            ``draft`` is a file with another specification.
         TooFewSteps: no step is usable; or only one is, and a specification has to be drafted from it.
         SurrogymClientError: the server can't be reached, or refuses a request.
 

@@ -232,7 +232,7 @@ def draw(spec: EnvironmentSpec, rng: np.random.Generator, *, wide: bool, scale: 
         spec: the environment's specification.
         rng: random generator.
         wide: whether to draw from the sampling range.
-        scale: factor on the distance from the middle of each start distribution; bounds are kept.
+        scale: factor by which starts are moved away from the middle of the start distribution; bounds are kept.
     """
     if spec.starts and not wide and scale == 1:
         return np.array(spec.starts[rng.integers(len(spec.starts))])

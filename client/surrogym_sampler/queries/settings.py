@@ -24,7 +24,7 @@ class SamplerSettings:
     """Settings of a sampler.
 
     Attributes:
-        name: name of the sampler, which its samples are stored with.
+        name: name of the sampler; it is stored with each sample.
         batch: number of queries to claim at once.
         wait_seconds: seconds that a claim waits for queries.
         lease_seconds: seconds for which a claimed query is reserved for this sampler.

@@ -26,7 +26,7 @@ ALARM = 0.01  # probability that the test of output errors fails for a right mod
 # probability that the errors of a right model ever seem to have a part that all steps share, however many steps are
 # taken
 SHIFT_ALARM = 0.05
-# if the return leaves the promised interval with a larger probability, an audit takes more steps and widens the
+# if the return leaves the promised interval with more than this probability, an audit takes more steps and widens the
 # interval
 UNDECIDED = 0.05
 MISPLACED_ENDS = 2  # an audit fails if the model predicted the termination of this many steps wrongly

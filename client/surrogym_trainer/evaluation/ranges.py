@@ -10,7 +10,7 @@ from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.spec.coordinates import Coordinate, limits
 from surrogym_trainer.policies.evidence import RangeLeft
 
-LITTLE = 0.05  # share of a policy's states that may lie beyond an end without a warning
+LITTLE = 0.05  # share of a policy's states that may lie beyond an end of a sampling range without a warning
 # share of a policy's states to which the original environment may be unable to be set, without a warning
 MOST_UNTESTABLE = 0.2
 SIDES: tuple[Side, ...] = ("lower", "upper")

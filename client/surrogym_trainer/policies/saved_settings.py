@@ -16,7 +16,7 @@ MAX_EXPERIENCE_BYTES = 2 * 1024**3
 Count = Annotated[int, Field(ge=0, le=2**53)]
 Positive = Annotated[int, Field(ge=1, le=2**53)]
 Batch = Annotated[int, Field(ge=1, le=2**20)]
-# Passes over the experience, or gradient steps; -1 means as many as environment steps.
+# Number of passes over the experience, or of gradient steps; -1 means one for each environment step.
 Passes = Annotated[int, Field(ge=-1, le=10_000)]
 Share = Annotated[float, Field(ge=0, le=1)]
 

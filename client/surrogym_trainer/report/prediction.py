@@ -18,9 +18,9 @@ class Outcome(NamedTuple):
     """The result of comparing a prediction with reality.
 
     Attributes:
-        verdict: ``better`` or ``worse`` if the interval of the real average lies beyond the predicted one, ``perhaps
-            worse`` if only the real average itself lies below, and ``as predicted`` otherwise.
-        beyond: distance of the real average from the predicted interval.
+        verdict: ``better`` if the whole interval of the real average lies above the predicted interval, ``worse`` if it
+            lies below, ``perhaps worse`` if only the real average itself lies below, and ``as predicted`` otherwise.
+        beyond: distance of the real average from the predicted interval; 0 if it is inside.
     """
 
     verdict: Literal["as predicted", "better", "worse", "perhaps worse"]

@@ -132,9 +132,9 @@ class AuditedTraining:
         """Take the remaining steps of the budget, or an unused round of the closed loop, in states that the policy
         visits.
 
-        If ``needed`` is false, the steps are only taken if the model is not certain in these states. Only a token of
-        the role admin may raise the budget for such a round. Returns whether more than ``taken`` real steps have been
-        counted by now.
+        If ``needed`` is false, the steps are only taken if the model is not certain in these states. An unused round
+        may raise the budget, which needs a token of the role admin. Returns whether more than ``taken`` real steps have
+        been counted by now.
         """
         view = self.api.surrogate(self.name)
         if not needed and view.phase == "ready" and (view.confidence_index or 0.0) >= view.target:

@@ -156,7 +156,7 @@ def take(
 
     If no test has failed, but the errors may have a part that all steps share and that moves the return out of the
     promised interval, more steps are taken, up to ``MOST_STEPS``. Returns None if there was no step to take. If the
-    original environment failed to take all steps, the audit has failed.
+    original environment failed at every step, the audit has failed.
 
     Args:
         subject: the policy.

@@ -118,7 +118,8 @@ def noise_of(view: SurrogateView) -> dict[str, Any]:
 def prolongs(settings: TrainSettings, spec: EnvironmentSpec) -> bool:
     """Return whether a training takes more cycles while its return rises, and refines its policy.
 
-    By default it does if the user did not choose the number of steps. With preset ``paper``, the paper's maximum holds.
+    The setting decides; without it, the training does so if the user chose no number of steps and the preset is not
+    ``paper``.
     """
     if settings.prolong is not None:
         return settings.prolong

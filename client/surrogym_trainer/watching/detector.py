@@ -36,12 +36,12 @@ from numpy.typing import NDArray
 FALSE_ALARM_STEPS = 10_000  # average number of steps until a false alarm
 SHIFTS = (0.5, 1.0, 2.0)  # sizes of a change of the mean error that are tested, in standard deviations
 SPREADS = (0.25, 0.5)  # tested increases of the errors' variance: by a factor of 1 / (1 - g) for each g
-BIAS = 3.0  # standard deviations of the model up to which a mean error counts as the model's own
+BIAS = 3.0  # a mean error up to this number of the model's standard deviations is the model's own error, no drift
 SHARE = 1.5  # factor on the model's standard deviation, which together with the noise gives that of an error
 MOST = 4.0  # standard deviations to which an error is limited, so that one spike gives no alarm
 OUTLYING = 3.0  # standard deviations to which an error is limited before mean and noise are learned from it
 NOISE_STEPS = 20.0  # for the noise, the model's error on left-out samples counts as much as this number of steps
-PAID_STEPS = 100.0  # a bet's average factor on the evidence begins as if it had been 1 in this number of steps
+PAID_STEPS = 100.0  # prior of a bet's average factor on the evidence: 1, with the weight of this number of steps
 # largest average factor of a bet on the evidence that is attributed to heavy tails of the noise, not to a change
 MOST_PAID = 1.5
 NEGLIGIBLE = 0.1  # share of the tolerance below which an error is negligible

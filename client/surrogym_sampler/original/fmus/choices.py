@@ -198,10 +198,10 @@ def _of_type(variable: Declared, value: Value) -> Value:
 
 
 def step_of(archive: Archive, choices: Choices) -> float:
-    """Return the seconds of one action: the chosen ones, or else those of the FMU's default experiment.
+    """Return the seconds of one action: those that a person chose, or else those of the FMU's default experiment.
 
     Raises:
-        UnknownEnvironment: neither is given.
+        UnknownEnvironment: neither a person nor the FMU gives them.
     """
     step = choices.step or archive.step
     if not step or step <= 0:

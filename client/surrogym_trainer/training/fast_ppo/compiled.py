@@ -66,7 +66,8 @@ def activate(y: Floats, bias: Floats, relu: bool) -> None:
 
 @compiled
 def through(slope: Floats, y: Floats, relu: bool) -> None:
-    """Multiply a derivative by the activation's derivative, in place; y (n, O) is the activation's output."""
+    """Multiply ``slope`` (n, O), the derivative of a loss with respect to an activation's output y (n, O), by the
+    activation's derivative, in place."""
     rows, columns = y.shape
     for i in range(rows):
         if relu:
