@@ -110,7 +110,8 @@ def examine(environment: IsolatedEnvironment | Executable | Simulated, spec: Env
 
     Args:
         environment: the opened original environment; some 20 real steps are taken in it.
-        spec: its specification; states are set only if it declares step queries.
+        spec: specification of the environment. States are set only if it declares ``query="step"``, so that queries may
+            begin in any state.
 
     Raises:
         CheckFailed: a step failed, though the specification declares the access that it needs.

@@ -207,8 +207,8 @@ def _require_name(name: str) -> None:
 
 
 def _require_reward_unit(log: ReadLog, api: Api, name: str) -> None:
-    """Refuse a log whose rewards seem to be in another unit than those of the surrogate's samples. A declared reward is
-    computed and not learned, so then the rewards of the log don't matter."""
+    """Refuse a log whose rewards seem to be in another unit than those of the surrogate's samples. If the specification
+    declares the reward, any log is accepted, because its rewards are not learned from."""
     if log.spec.reward.kind == "learned" and not log.table.evaluated:
         known = [sample.reward for sample in islice(api.samples(name), MOST_KNOWN)]
         require_reward_unit(log.reward, np.array(known), name)

@@ -42,8 +42,8 @@ def format_of(path: Path) -> Format:
     """Return the format of the log at a path, or ``surrogate`` if it is an exported surrogate.
 
     Raises:
-        FileNotFoundError: there is neither such a file nor a Minari data set of this name.
-        UnusableLog: it is a folder without a Minari data set.
+        FileNotFoundError: neither a file nor a Minari data set has this name.
+        UnusableLog: the path is a folder without a Minari data set.
     """
     if path.suffix == SURROGATE:
         return "surrogate"

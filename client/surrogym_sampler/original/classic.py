@@ -95,8 +95,8 @@ def cartpole() -> EnvironmentSpec:
 
 
 def cartpole_of_the_paper() -> EnvironmentSpec:
-    """Return the specification of CartPole as in the paper's section 5.2: twice the range, a learned reward of 0 or 1,
-    no termination."""
+    """Return the specification of CartPole as in the paper's section 5.2: ranges of position and angle that are twice
+    as wide as those of CartPole-v1, a learned reward of 0 or 1, and no termination."""
     return _cartpole(x=4.8, pole=math.radians(24), termination=(), time_limit=200, min_steps=195)
 
 

@@ -27,8 +27,8 @@ from surrogym_shared.spec import EnvironmentSpec, Fixed, Normal, Uniform, limits
 
 
 class GymnasiumEpisode(Episode):
-    """An episode of a Gymnasium task with a built-in specification. The observation is the environment's own if the
-    specification declares the same one."""
+    """An episode of a Gymnasium task with a built-in specification. If the specification declares the same observation
+    as the environment, observations come from the environment itself; otherwise they are computed as declared."""
 
     parallel = True
 
@@ -86,7 +86,8 @@ class GymnasiumEpisode(Episode):
 class SimulatedEpisode(Episode):
     """An episode of a simulator that an adapter opened. ``perturb`` changes the masses of all bodies.
 
-    The observation is the environment's own if the built-in specification shows the same.
+    If the built-in specification declares the same observation as the environment, observations come from the
+    environment itself; otherwise they are computed as declared.
     """
 
     def __init__(self, environment: Simulated) -> None:

@@ -204,8 +204,8 @@ class _Ending:
 def _serve(pipe: Connection, factory: Factory, step_limit: float) -> None:
     """Run the child process: make the environment, and answer requests until the parent closes.
 
-    The first answer (ok, value) is that of the start; one for each request follows. What the environment prints goes to
-    standard error, because the output of a command may be JSON.
+    The first answer (ok, value) says whether the environment was made. Then one answer to each request follows. What
+    the environment prints goes to standard error, because the output of a command may be JSON.
     """
     sys.stdout = sys.stderr
     for number in PARENTS_BUSINESS:

@@ -20,8 +20,8 @@ from surrogym_shared.spec import (
 
 
 def inverted_pendulum() -> EnvironmentSpec:
-    """Return the specification of InvertedPendulum-v5. Episodes also terminate at the ends of the rail, unlike
-    Gymnasium's, because nothing beyond them is worth learning."""
+    """Return the specification of InvertedPendulum-v5. Other than in Gymnasium, episodes also terminate at the ends of
+    the rail, because nothing beyond them is worth learning."""
     sampling = {
         "slider": Uniform(low=-0.95, high=0.95),
         "hinge": Uniform(low=-0.2, high=0.2),

@@ -103,7 +103,7 @@ class OriginalPort:
         )
 
     def reset(self, session: str, *, seed: int | Sequence[int] | None = None, mask: Bools | None = None) -> ResetResult:
-        """Begin new episodes in all lanes, or only in those of the mask (N,)."""
+        """Begin new episodes in all lanes, or only in the lanes that ``mask`` (N,) marks."""
         lanes = self._lanes(session)
         for i, lane in enumerate(lanes):
             if mask is None or mask[i]:
@@ -120,7 +120,8 @@ class OriginalPort:
         mask: Bools | None = None,
         deviations: bool = False,  # noqa: ARG002  nothing is predicted here
     ) -> StepResult:
-        """Take one real step in all lanes, or only in those of the mask (N,). Lanes whose episode ends are reset."""
+        """Take one real step in all lanes, or only in the lanes that ``mask`` (N,) marks. Lanes whose episode ends are
+        reset."""
         lanes = self._lanes(session)
         reward, terminated, truncated = np.zeros(len(lanes)), *np.zeros((2, len(lanes)), dtype=np.bool_)
         final: dict[int, Array] = {}

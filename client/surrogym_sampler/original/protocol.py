@@ -157,8 +157,8 @@ class SnapshotEnvironment(Protocol):
 
 
 def runs_in_parallel(environment: object) -> bool:
-    """Return whether several instances of an environment may be open at once: its attribute ``parallel``, False without
-    one.
+    """Return whether several instances of an environment may be open at once. This is the environment's attribute
+    ``parallel``; without the attribute, it is False.
 
     Examples:
         A simulator sets the attribute; a machine leaves it out::

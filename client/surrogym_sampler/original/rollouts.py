@@ -179,7 +179,8 @@ def answering(environment: object) -> Environment:
 
 
 def keeping_limits(environment: Environment) -> Environment:
-    """Return an environment that keeps the limits of its specification, or the same one if it has none."""
+    """Return an environment that keeps the limits of its specification. An environment without limits is returned
+    unchanged."""
     if environment.spec().limits is None:
         return environment
     from surrogym_sampler.original.limits import guarded

@@ -174,7 +174,8 @@ class Attribute(StatePart):
 
 
 def _like(old: Any, new: float) -> Any:
-    """Return a number in the type of the old one: a bool, an int if it is whole (such as an index), or a float."""
+    """Return the number ``new`` in the type of ``old``. For a bool, this is whether it is at least 0.5. For an int,
+    such as an index, it is an int if ``new`` is whole. Otherwise it is a float."""
     if isinstance(old, bool | np.bool_):
         return new >= 0.5
     return int(new) if isinstance(old, int | np.integer) and new == int(new) else new

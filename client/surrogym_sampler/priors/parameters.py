@@ -128,7 +128,7 @@ def read_parameters(texts: Sequence[str], plant: Adjustable) -> tuple[Parameter,
 
 
 def _layers(simulator: Any) -> list[Any]:
-    """Return the environment and the ones inside it that it wraps, from the outermost to the innermost."""
+    """Return the environment and the environments inside it that it wraps, from the outermost to the innermost."""
     layers = [simulator]
     while (inner := getattr(layers[-1], "wrapped", None) or getattr(layers[-1], "simulator", None)) is not None:
         layers.append(inner)

@@ -77,8 +77,8 @@ class SimulatorPrior(ABC):
             inputs.
 
     Raises:
-        UnknownEnvironment: the simulator can't be opened, or can't be set to a state; or the plant's coordinates have
-            lags.
+        UnknownEnvironment: the simulator can't be opened, or can't be set to a state; or some coordinates of the plant
+            repeat earlier values (lags).
         ValueError: the simulator has no such parameter, or a range is invalid.
     """
 

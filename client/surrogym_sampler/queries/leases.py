@@ -24,8 +24,8 @@ class LeaseEnded(Exception):
 
 
 def seconds_awake_or_asleep() -> float:
-    """Return the seconds of a monotonic clock, which includes the time that the machine was suspended if the system has
-    such a clock."""
+    """Return the seconds of a monotonic clock. If the system has such a clock, it also counts the time in which the
+    machine was suspended."""
     if not hasattr(time, "clock_gettime"):
         return time.monotonic()
     return time.clock_gettime(getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC))

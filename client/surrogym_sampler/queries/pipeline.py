@@ -135,7 +135,7 @@ class Pipeline(Generic[T]):
         return held
 
     def settle(self) -> None:
-        """Wait until the answer that is being sent is acknowledged. Raises the error of sending it."""
+        """Wait until the answer that is being sent is acknowledged. If sending it failed, this raises the error."""
         if self._answer is not None:
             wait([self._answer])  # Ctrl-C ends this wait, while the answer continues to be sent
             answer, self._answer = self._answer, None
@@ -143,8 +143,8 @@ class Pipeline(Generic[T]):
             self._flows = self._settle(answer.result())
 
     def close(self) -> None:
-        """Return queries that were claimed ahead, and wait for the answer that is being sent. Raises the error of
-        sending it."""
+        """Return queries that were claimed ahead, and wait for the answer that is being sent. If sending it failed,
+        this raises the error."""
         try:
             self.give_back()
         finally:

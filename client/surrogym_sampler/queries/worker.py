@@ -138,7 +138,7 @@ class Sampler:
         """Let ``run`` end after the running step. Call this from another thread or a signal handler.
 
         The sampler then no longer waits for a server that does not answer, except for ``LAST_SECONDS`` to send its last
-        real step. Retries of a single request by ``api`` add to that.
+        real step. The time in which ``api`` retries a single request adds to this.
         """
         self._stopping = True
 

@@ -141,12 +141,13 @@ class Decision:
 
 @dataclass(frozen=True)
 class KeptLimit:
-    """A limit of the specification: the range [low, high] of a term of the coordinates, infinite without an end.
+    """A limit of the specification: the range [low, high] in which a term of the coordinates must stay. A missing end
+    is infinite.
 
     Attributes:
-        term: the term; its name is the limit's.
+        term: the term, with the name of the limit.
         low, high: ends of the range.
-        margin: distance from an end within which the fallback acts.
+        margin: distance from an end within which the fallback acts instead of the policy.
     """
 
     term: Observed

@@ -25,7 +25,7 @@ class LimitsKept:
         violations: number of episodes that left a limit.
         fallbacks: number of steps in which the fallback acted in the place of the policy.
         steps: number of all steps.
-        least_room: smallest distance to an end of each limit, by its name; negative beyond it.
+        least_room: by name of the limit, the smallest distance from an end of it; negative if the limit was left.
         probability: declared share of episodes that may leave a limit.
     """
 

@@ -49,7 +49,7 @@ class PolicyCard(BaseModel):
     spec: EnvironmentSpec | None = None
     seed: int | None = None
     virtual_steps: int | None = None
-    model: str = ""  # hash of the samples of the model that the promise comes from
+    model: str = ""  # hash of the samples from which the promise's model was learned
     seconds: float | None = None
     imagined_return: float | None = None
     visited_confidence: tuple[float | None, ...] = ()

@@ -86,7 +86,8 @@ def push(api: Api, policy: Path, surrogate: str | None = None) -> Pushed:
 
 
 def _push_video(api: Api, name: str, sent: wire.PushedPolicy, policy: Path) -> str:
-    """Send the video beside a policy, unless the server has it. Returns why it was refused; empty if it was not."""
+    """Send the video beside a policy, unless the server has it. Returns why the server refused the video; empty if it
+    did not."""
     for form in VIDEOS:
         path = policy.with_suffix(f".{form}")
         if not path.is_file():

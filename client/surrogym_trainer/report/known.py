@@ -105,8 +105,8 @@ def collect(api: Api, name: str, which: str | None = None, controller: Path | No
 
 
 def with_whole_traces(detail: EvaluationDetail, spec: EnvironmentSpec, missing: list[str]) -> EvaluationDetail:
-    """Return an evaluation without the traces that don't have the shape of this specification, which earlier servers
-    accepted. The number of those is added to ``missing``."""
+    """Return an evaluation without the traces whose shape does not fit the specification, which earlier servers
+    accepted. A sentence with their number is added to ``missing``."""
     whole = [
         trace
         for trace in detail.traces

@@ -102,8 +102,8 @@ class Checks:
 
     @property
     def _nothing(self) -> float:
-        """The imagined return up to which a network counts as having learned nothing: that of an untrained network and
-        a small share of the largest gain so far."""
+        """The imagined return up to which a network counts as having learned nothing: that of an untrained network,
+        plus a small share of the largest gain so far."""
         return self.untrained + LEARNED * (self._seen - self.untrained)
 
 

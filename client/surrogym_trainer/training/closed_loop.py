@@ -118,8 +118,8 @@ class ClosedLoop:
         return self.result()
 
     def round(self) -> bool:
-        """Run one round: train for a while, submit the visited states, and query there. Returns whether another round
-        may follow."""
+        """Run one round: train for a while, submit the visited states, and query in these states. Returns whether
+        another round may follow."""
         view = self.api.surrogate(self.name)
         if view.phase == "ready":
             return False

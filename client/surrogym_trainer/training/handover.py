@@ -67,7 +67,7 @@ class Handover:
         audit: audit of the policy; None if there was none.
         trusted: whether the promise is trusted.
         reason: why it is trusted or not, in one sentence.
-        model: hash of the samples of the promise's model.
+        model: hash of the samples from which the promise's model was learned.
     """
 
     promise: Promise | None

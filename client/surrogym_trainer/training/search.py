@@ -132,11 +132,11 @@ def name_of(settings: TrainSettings) -> str:
 
 
 def with_algorithm(settings: TrainSettings, spec: EnvironmentSpec) -> TrainSettings:
-    """Return the settings with a search. If they name none, it is ``FAST``, or ``REFERENCE`` if only that one supports
-    the settings.
+    """Return the settings with the name of a search. If they name none, it is ``FAST``, or ``REFERENCE`` if ``FAST``
+    does not support the settings.
 
-    Only ``REFERENCE`` has trackers and some of the hyperparameters, and can continue a policy of Stable-Baselines3. It
-    is also the search of the paper's preset.
+    Only ``REFERENCE`` has trackers and some of the hyperparameters, and can continue a policy of Stable-Baselines3.
+    ``REFERENCE`` is also the search of the preset ``paper``.
     """
     if settings.algorithm is not None:
         return settings

@@ -132,8 +132,8 @@ class _Growing:
         self._dropped = 0  # number of dropped lines between the heading and the latest rows
 
     def add(self, chunk: bytes) -> ReadLog | None:
-        """Return the latest rows including those of a chunk; None if it completes no line, or there is no
-        usable step."""
+        """Add a chunk to the text, and return the latest rows including its rows; None if the chunk completes no line,
+        or no row is a usable step."""
         complete, end, self._rest = (self._rest + chunk).rpartition(b"\n")
         if not complete.strip():
             return None

@@ -125,7 +125,8 @@ def run_episodes(
     reporter: Reporter,
     gathered: Gathered,
 ) -> None:
-    """Run real episodes of a stored policy, and those of its comparisons. Then draw a video, if the task requests one.
+    """Run real episodes of a stored policy, and of the controllers that it is compared with. Then draw a video, if the
+    task requests one.
 
     The real steps are in ``gathered`` even if the episodes fail or are stopped.
 

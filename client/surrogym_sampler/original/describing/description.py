@@ -319,8 +319,8 @@ class _Draft:
         return list(shown.values())
 
     def _observed(self, frame: EnvironmentSpec, rng: np.random.Generator) -> tuple[Array, Array]:
-        """Return states (n, C) and the simulator's observations in them (n, D): random states of the sampling ranges if
-        states can be set, else those of the explored steps."""
+        """Return states (n, C), and the simulator's observations in these states (n, D). They are random states of the
+        sampling ranges if the simulator's state can be set, else the states of the explored steps."""
         counted = self._counted
         if not (self._simulator.shows and self._probed.settable):
             return self._seen.next_states[:, self._kept], self._seen.observations

@@ -91,7 +91,7 @@ def _choices(path: Path, given: _File) -> Choices:
 
 
 def driven(archive: Archive, choices: Choices) -> tuple[Declared, ...]:
-    """Return the inputs that an action sets: the chosen ones, or all real inputs.
+    """Return the inputs that an action sets: those that a person chose, or else all real inputs.
 
     Raises:
         UnknownEnvironment: there are none, or a chosen variable is not a real input.

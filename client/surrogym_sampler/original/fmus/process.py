@@ -90,7 +90,8 @@ class Process:
         return self._values
 
     def initialise(self, start: Sequence[Start] = ()) -> None:
-        """Start the simulation again at time 0, with the values in ``start`` set in addition to the usual ones."""
+        """Start the simulation again at time 0. The values in ``start`` are set in addition to those that every
+        initialisation sets."""
         self._revive()
         self._take(self._ask("initialise", start=[*self._start, *start]))
 

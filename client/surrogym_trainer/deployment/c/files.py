@@ -120,7 +120,7 @@ def _header(controller: Controller) -> dict[str, Any]:
 
 
 def _limits(controller: Controller) -> dict[str, str]:
-    """Return the parts of the header about limits; empty ones without limits."""
+    """Return the parts of the header that concern limits; they are empty if the controller has no limits."""
     if controller.guard is None:
         return {"limited_bit": "", "rooms": "", "keeps": ""}
     names = ", ".join(source.plain(limit.term.name) for limit in controller.guard.limits)
