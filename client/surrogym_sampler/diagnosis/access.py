@@ -22,7 +22,7 @@ from surrogym_shared.spec import BoxAction, EnvironmentSpec, limits
 PLACES = 3  # number of states to set, and of steps in each test episode
 EXACT = 1e-6  # share of a coordinate's range; a smaller difference is rounding
 CLOSE = 1e-2  # a state counts as set if it is read back with an error of at most this share of a coordinate's range
-FEW = 3.0  # a difference may be this multiple of the measured noise, because few steps show the noise
+FEW = 3.0  # a difference may be this multiple of the noise, which is measured in few steps only
 
 
 class CheckFailed(StepFailed):

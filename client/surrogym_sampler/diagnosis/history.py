@@ -28,10 +28,10 @@ LONGEST = 5  # largest number of earlier changes or actions that is tried
 EPISODE = 20  # largest number of steps in an episode
 HELD = 4  # largest number of steps for which a random action is held
 RIDGE = 1e-6  # ridge term of the regression, relative to the inputs' variance
-ENOUGH = 0.05  # share of a change's standard deviation; a smaller error needs no longer history
+ENOUGH = 0.05  # share of a change's standard deviation; with a smaller error, the history need not be longer
 SLACK = 1.2  # a history is good enough if its error is below this multiple of the smallest error
 EXPLAINED = 0.5  # share of a change's standard deviation; a regression with a larger error shows nothing
-WIDER = 1.5  # factor on the largest observed change, for the range of a declared change
+WIDER = 1.5  # factor on a coordinate's largest observed change, which gives the range to declare for its changes
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ from surrogym_shared.presets import PresetName
 from surrogym_shared.spec import Access, BoxAction, EnvironmentSpec
 
 Choose = Callable[[EnvironmentSpec], EnvironmentSpec]
-ACCESS: dict[Access, dict[str, Any]] = {  # Fields of a specification for each access.
+ACCESS: dict[Access, dict[str, Any]] = {  # Fields of a specification for each kind of access (where a query may begin).
     "any": {"query": "step", "snapshots": False},
     "snapshot": {"query": "rollout", "snapshots": True},
     "reset": {"query": "rollout", "snapshots": False},

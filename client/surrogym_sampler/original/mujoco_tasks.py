@@ -20,7 +20,7 @@ from surrogym_shared.spec import (
 
 
 def inverted_pendulum() -> EnvironmentSpec:
-    """Return the specification of InvertedPendulum-v5. Other than in Gymnasium, episodes also terminate at the ends of
+    """Return the specification of InvertedPendulum-v5. Unlike in Gymnasium, episodes also terminate at the ends of
     the rail, because nothing beyond them is worth learning."""
     sampling = {
         "slider": Uniform(low=-0.95, high=0.95),

@@ -22,9 +22,9 @@ from surrogym_shared.spec import EnvironmentSpec
 
 FEWEST = 2  # smallest number of real steps
 STARTS = 5  # largest number of starting points; the first is the simulator's own values
-EXPECTED = 1e-3  # share of the changes; with a smaller error no further starting point is tried
+EXPECTED = 1e-3  # share of the coordinates' changes; with a smaller error no further starting point is tried
 EDGE = 0.01  # share of a range: smallest distance of a starting point from the range's ends
-SMALLEST = 1e-9  # share of the changes; a smaller error counts as rounding
+SMALLEST = 1e-9  # share of the coordinates' changes; a smaller error counts as rounding
 FAR = 1e3  # error of a step that the simulator can't take, in standard deviations of the changes
 CONFIDENCE = 0.9  # probability of each parameter's interval
 NUDGE = 1e-5  # share of a parameter's range: step size of numerical derivatives

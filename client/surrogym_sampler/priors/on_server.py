@@ -19,8 +19,8 @@ from surrogym_shared.wire import SurrogateView
 
 BATCH = 64  # number of queries in one claim
 LONGEST_FIT = 1_800.0  # largest number of seconds for fitting the simulator's model
-MARK = ".simulator-"  # in the name of the temporary surrogate with which the server learns the simulator's model
-TOKEN = 8  # number of random hexadecimal digits at the end of that name
+MARK = ".simulator-"  # part of the name of the temporary surrogate that learns the simulator's model
+TOKEN = 8  # number of random hexadecimal digits at the end of the temporary surrogate's name
 MOST_OF_NAME = 64 - len(MARK) - TOKEN
 
 

@@ -9,7 +9,8 @@ from typing import Any, Protocol, Self, runtime_checkable
 
 from surrogym_sampler.original.errors import UnknownEnvironment
 
-AROUND = 2.0  # the default range reaches from the simulator's own value divided by this factor to the value times it
+# the default range of a parameter goes from its own value divided by this factor to its own value times this factor
+AROUND = 2.0
 
 
 @runtime_checkable

@@ -147,7 +147,7 @@ class _Member:
 
     name: str
     actor: Any
-    run: Any  # Ray's reference to the result of its run
+    run: Any  # Ray's reference to the result of the sampler's run
     asked: Any  # Ray's reference to the requested result of ``look``, which has not arrived yet
     # the last known report of each process that ran this sampler, by its start id
     reports: dict[str, SamplerReport] = field(default_factory=dict)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from surrogym_sampler.original.errors import SnapshotGone, SnapshotNotKept, UnusableFolder
 from surrogym_shared.spec import EnvironmentSpec, limits
 
-FORM = 1  # version of the files' form
+FORM = 1  # version of the format of snapshot files
 ENDING = ".snapshot"
 UNFINISHED = ".part"
 ABANDONED_SECONDS = 60.0  # seconds without a change after which an unfinished file counts as abandoned by its writer
@@ -63,7 +63,7 @@ class SnapshotFolder:
         self._environment, self._names = spec.environment, list(spec.coordinate_names)
         self._angles = np.array([c.kind == "angle" for c in spec.coordinates])
         self._widths = np.array([np.ptp(limits(c.sampling)) for c in spec.coordinates])
-        self._kept: dict[str, _Kept | None] = {}  # by name; None if the snapshot can't be used
+        self._kept: dict[str, _Kept | None] = {}  # what is known about each snapshot, by name; None if it can't be used
         self._unknown: Collection[str] = ()
         self._require_room()
 

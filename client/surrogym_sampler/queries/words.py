@@ -8,7 +8,7 @@ from surrogym_sampler.original.fitting import action_ranges
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import Query, QueryView
 
-BARS = "▁▂▃▄▅▆▇█"  # from the lowest to the highest value of an entry
+BARS = "▁▂▃▄▅▆▇█"  # bars for the values of an action entry, from the lowest to the highest
 
 
 def words_of_query(spec: EnvironmentSpec, query: Query | QueryView) -> list[str]:

@@ -22,7 +22,8 @@ from surrogym_shared.spec.actions import Action
 Array = NDArray[np.float64]
 Activation = Literal["none", "tanh", "relu"]
 
-NOT_FINITE, OUT_OF_RANGE, LATE, NO_ACTION = 1, 2, 4, 8  # bits of a status; 0 means that the action is the policy's
+# bits of a controller's status; 0 means that the action is the policy's
+NOT_FINITE, OUT_OF_RANGE, LATE, NO_ACTION = 1, 2, 4, 8
 LIMITED = 16  # status of a step in which the fallback of the specification's limits acts
 PERIODS = 2  # default timeout in sampling periods, because the duration of a period varies
 LARGEST = 1e37  # largest number in a controller, so that sums of a few still fit in a C float
@@ -311,7 +312,8 @@ def _require_small(decision: Decision) -> None:
             f"expected a network of at most {MOST_WEIGHTS:,} weights, got {size:,}, which need {8 * size // 10**6} MB: "
             "surrogym export-policy writes it for a larger machine"
         )
-    if not (decision.deviation >= 1 / LARGEST).all():  # their inverse would be too large for a C float
+    # the inverse of a smaller deviation would be too large for a C float
+    if not (decision.deviation >= 1 / LARGEST).all():
         raise NotDeployable(
             "expected standard deviations of the observations above 0 in the policy, got one that is 0 or almost 0: "
             "train the policy without the entries that never change"

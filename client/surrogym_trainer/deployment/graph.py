@@ -172,7 +172,7 @@ def _chosen(graph: _Graph, scores: str, controller: Controller) -> tuple[str, in
     for count in counts:
         where = [
             np.array([i], dtype=np.int64) for i in (first, first + count, 1)
-        ]  # starts, ends and axes of ONNX's Slice
+        ]  # inputs of ONNX's operator Slice: starts, ends and axes
         group = graph.add("Slice", scores, *where)
         chosen.append(graph.add("ArgMax", group, axis=1, keepdims=1))
         first += count

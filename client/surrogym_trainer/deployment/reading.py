@@ -36,7 +36,8 @@ if TYPE_CHECKING:
     from torch import nn
 
 CHECKS = 1_000  # number of random observations on which the controller is compared with the policy
-TOLERANCE = 1e-4  # largest difference, as a share of an action's range; torch computes in float32
+# largest difference of controller and policy, as a share of an action's range; torch computes in float32
+TOLERANCE = 1e-4
 CAN = (
     "a deterministic feed-forward network can be deployed: a policy of surrogym train, or one of PPO, A2C, SAC, TD3, "
     "DDPG or DQN with layers of tanh or ReLU"

@@ -21,7 +21,8 @@ from surrogym_trainer.evaluation.systematic import Inputs, Systematic, columns, 
 from surrogym_trainer.policies.evidence import Audit, Promise
 
 AUDIT_STEPS = 8
-MOST_STEPS = 40  # largest number of steps of an audit that is undecided
+# largest number of steps of an audit; more than the usual ones are taken only while the result is undecided
+MOST_STEPS = 40
 ALARM = 0.01  # probability that the test of output errors fails for a right model
 # probability that the errors of a right model ever seem to have a part that all steps share, however many steps are
 # taken

@@ -20,7 +20,8 @@ from surrogym_trainer.evaluation.evaluator import ROUNDING, Trace, span
 from surrogym_trainer.evaluation.systematic import LEAST
 
 MOST = 400  # largest number of real steps to compare
-LEAST_ERROR = 1e-12  # smallest error in an output's unit, so that an exact output can be tested
+# smallest expected error in an output's unit, so that an output that is predicted exactly can be tested
+LEAST_ERROR = 1e-12
 SHOWN = 3  # number of worst steps, and of worst episodes, to show
 
 

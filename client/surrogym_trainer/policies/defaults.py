@@ -1,7 +1,8 @@
 """Default settings of policies and their training, for all libraries. Importing this module does not import torch."""
 
 HIDDEN = 32  # units of the single layer of the paper's actor
-WIDER = (64, 64)  # units of the layers of the default actor; the paper's has a return that is lower by 20 on Pendulum
+# units of the layers of the default actor; on Pendulum, the paper's actor has a return that is lower by 20
+WIDER = (64, 64)
 CRITIC = (64, 64)
 EXPLORATION = 0.5  # initial standard deviation of a continuous action, as a share of half its range
 LANES = 128  # number of environments in a session of an on-policy algorithm

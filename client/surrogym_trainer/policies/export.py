@@ -30,7 +30,7 @@ from surrogym_trainer.policies.onnx_files import from_onnx
 from surrogym_trainer.policies.predict import Predict
 
 CHECKS = 1_000  # number of random observations on which policy and export are compared
-TOLERANCE = 1e-5  # largest difference of actions, as a share of their range
+TOLERANCE = 1e-5  # largest difference between the actions of policy and export, as a share of their range
 Form = Callable[[ExportedProgram], bytes]
 
 

@@ -20,7 +20,7 @@ from surrogym_shared.faults import first_fault
 from surrogym_trainer.policies.card import PolicyCard, UnusablePolicy, read_card
 
 MAX_WAITING_BYTES = 64 * 1024 * 1024
-MAX_VIDEO_BYTES = 32 * 1024 * 1024  # largest size of a file on the server
+MAX_VIDEO_BYTES = 32 * 1024 * 1024  # largest size of a video that the server stores
 VIDEOS: tuple[wire.PolicyForm, ...] = ("mp4", "gif")
 CURVE_POINTS = 200
 _WAITING = TypeAdapter(list[wire.AddEvaluation])

@@ -24,7 +24,7 @@ from surrogym_trainer.report.maps import Cut, pairs
 COLOURS = {"logged": "#8c8c8c", "initial": "#4c72b0", "adaptive": "#dd8452", "manual": "#55a868", "audit": "#c44e52"}
 WIDTH = 6.0  # width of a figure in inches
 SMALLEST = 1e-9  # smallest value that is drawn on a logarithmic axis
-DECADES = 6  # powers of ten below the largest index that are drawn
+DECADES = 6  # number of powers of ten below the largest value of the design's index that are drawn
 LOG_10 = math.log(10)
 
 

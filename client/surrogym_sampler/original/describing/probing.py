@@ -20,8 +20,8 @@ from surrogym_sampler.original.simulator import Taken
 
 PLACES = 4  # number of states in each test
 EXACT = 1e-6  # share of a variable's observed range; a smaller difference is rounding
-SETTABLE = 1e-3  # share of a variable's observed range: the largest error of a state that counts as set
-FEW = 3.0  # a difference may be this multiple of the measured noise, because few steps show the noise
+SETTABLE = 1e-3  # a state counts as set if the next step differs by at most this share of a variable's observed range
+FEW = 3.0  # a difference may be this multiple of the noise, which is measured in few steps only
 FARTHEST = 3.0  # largest shift of a position in a test, in the simulator's unit
 TURN = 2 * np.pi
 PART = 1.0  # shift of a variable by a part of a turn, in radians
@@ -156,7 +156,7 @@ class _Shifted:
         for shift in (TURN, -2 * TURN):
             for alike in self._compared(index, shift):
                 if not (alike.itself and alike.others):
-                    return False  # not an angle, so the steps from the other states can be saved
+                    return False  # not an angle, so no steps from the other states are needed
                 whole.append(alike.shown)
         part = list(self._compared(index, PART))
         return not all(alike.others for alike in part) or (all(whole) and not all(alike.shown for alike in part))

@@ -186,7 +186,8 @@ class Program:
             self._guard.dismiss()
         for number in (signal.SIGTERM, signal.SIGKILL):
             with suppress(ProcessLookupError, PermissionError):
-                os.killpg(process.pid, number)  # processes that the program started may outlive it
+                # the whole group, because processes that the program started may outlive it
+                os.killpg(process.pid, number)
             with suppress(subprocess.TimeoutExpired):
                 process.wait(END_SECONDS)
         for pipe in (process.stdin, process.stdout):

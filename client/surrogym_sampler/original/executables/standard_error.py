@@ -8,7 +8,7 @@ import threading
 from typing import IO
 
 OWN = 2  # file descriptor of this process's standard error
-TAIL = 4096  # number of last bytes that are kept
+TAIL = 4096  # number of last bytes of the program's standard error that are kept
 SHOWN = 200  # largest number of characters of the last line in an error
 PATIENCE = 0.1  # seconds that this process's standard error has to accept a piece
 LAST_SECONDS = 1.0  # seconds to read the output of an ended program; a process that it started may hold the pipe open

@@ -47,15 +47,15 @@ RANGES = {  # Allowed range of each setting; settings with integer bounds must b
     "max_grad_norm": (0.0, 1e6),
 }
 
-CYCLES = 3  # number of cycles of the stage "learn" in the suggested steps
-LEARNING = 2  # largest multiple of the suggested steps that a training takes before the stage "refine"
-REFINING = 1 / 2  # length of the stage "refine", as a share of a cycle of the stage "learn"
+CYCLES = 3  # number of cycles of the stage ``learn`` in the suggested steps
+LEARNING = 2  # largest multiple of the suggested steps that a training takes before the stage ``refine``
+REFINING = 1 / 2  # length of the stage ``refine``, as a share of a cycle of the stage ``learn``
 PATIENT_ROLLOUTS = 32  # smallest number of rollouts before a network is replaced
 HELD = 16  # number of steps for which every second network's noise stays the same
-FINE = 0.1  # learning rate of the stage "refine", as a share of the usual one
-QUIET = 0.1  # noise at the end of the stage "refine", as a share of that at its beginning
+FINE = 0.1  # learning rate of the stage ``refine``, as a share of the usual one
+QUIET = 0.1  # noise at the end of the stage ``refine``, as a share of that at its beginning
 LOOKS = 1 / 8  # largest share of the suggested steps that only collects observations
-CRITIC_ROLLOUTS = 8  # number of rollouts in the stage "refine" from which only the critic learns
+CRITIC_ROLLOUTS = 8  # number of rollouts in the stage ``refine`` from which only the critic learns
 STAGE_SEED = 2_000_003  # difference between the noise seeds of two stages
 
 
@@ -129,7 +129,7 @@ class _Training:
         self._objective = Objective(search.clip_range, search.vf_coef, search.max_grad_norm)
         self._planned = max(task.steps // self._rollout, 1)  # number of planned rollouts
         self._cycle = max(self._planned // CYCLES, 1) if task.prolong else self._planned
-        # number of rollouts left before the stage "refine"
+        # number of rollouts left before the stage ``refine``
         self._left = self._planned * (LEARNING if task.prolong else 1)
         saved = self._imagined(self._saved) if settings.anew and self._saved is not None else None
         self._checks = Checks(self._imagined(self._new), saved)
@@ -171,7 +171,7 @@ class _Training:
                 own, self._left = own + taken, self._left - taken
 
     def _refine(self) -> None:
-        """Run the stage "refine": train the best policy further."""
+        """Run the stage ``refine``: train the best policy further."""
         assert self._kept is not None
         learner, stage = self._made(), refine(self._task)
         learner.take_up(self._kept)

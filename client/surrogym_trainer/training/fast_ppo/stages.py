@@ -10,8 +10,8 @@ from surrogym_trainer.training.proportions import suggested_gamma
 from surrogym_trainer.training.search import SearchTask
 from surrogym_trainer.training.settings import TrainSettings
 
-SHORTER = 5  # factor by which a training episode of the stage "learn" is shorter than the time limit
-SHORTEST = 40  # smallest number of steps in a training episode of the stage "learn"
+SHORTER = 5  # factor by which a training episode of the stage ``learn`` is shorter than the time limit
+SHORTEST = 40  # smallest number of steps in a training episode of the stage ``learn``
 SIGHT = 1 / 2  # discount horizon of short episodes, 1 / (1 - gamma), as a share of their length
 
 

@@ -82,7 +82,7 @@ def _as_before() -> None:
     it otherwise."""
     from casadi import GlobalOptions
 
-    with suppress(AttributeError):  # older versions have no such setting and always behave so
+    with suppress(AttributeError):  # older versions of CasADi lack the setting, and always behave in this way
         GlobalOptions.setNumpyMode(-1)
 
 
