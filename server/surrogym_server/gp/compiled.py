@@ -269,7 +269,7 @@ def predict(
     """Predict one output at inputs x (d, B), each a column, and write the results to ``mean`` and ``std``, (B,) each.
 
     Args:
-        numbers, places: the tables.
+        numbers, places: tables of matrices, see ``compiled.tables``.
         at: index of the process's first matrix in the tables.
         x: all inputs of the model.
         wanted: whether to write latent standard deviations to ``std``.

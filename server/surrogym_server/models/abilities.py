@@ -179,7 +179,7 @@ class OutputOutlook(ABC):
     """Forecast of one output's standard deviations at m candidates, in the output's unit, as if certain queries had
     been answered."""
 
-    learns: Tensor  # (m,) bool: whether a sample at the candidate would improve this output
+    learns: Tensor  # (m,) bool: whether the output would learn from a sample at the candidate
 
     @property
     @abstractmethod
@@ -202,7 +202,7 @@ class PathOutlook(ABC):
     """Forecast of one output along b predicted paths of T steps: its standard deviations at these steps, and the
     information that real steps along the paths would give about the output."""
 
-    learns: Tensor  # (b, T) bool: whether a real step at that point of a path would improve this output
+    learns: Tensor  # (b, T) bool: whether the output would learn from a real step at that point of a path
 
     @property
     @abstractmethod

@@ -24,20 +24,21 @@ POINTS = 16  # number of samples at which a new model is checked
 
 
 def failure_of(definition: EnvironmentDefinition, error: BaseException) -> SurrogymError:
-    """Return the error that reports ``error``, raised by a family's code, in one sentence that names the family."""
+    """Return an error whose message is one sentence: it names the model family, whose code raised ``error``, and says
+    what ``error`` was."""
     return failed(_family(definition), PluginFailed, error)
 
 
 def plugin_calls(definition: EnvironmentDefinition, *, interrupts: bool = False) -> AbstractContextManager[None]:
-    """Context in which every error of the definition's model family becomes ``PluginFailed``; ``interrupts`` is
-    explained in ``guarded``."""
+    """Return a context in which every error that the code of the definition's model family raises becomes
+    ``PluginFailed``. ``interrupts`` is passed to ``guarded``, which explains it."""
     return guarded(_family(definition), PluginFailed, interrupts=interrupts)
 
 
 def learn(
     definition: EnvironmentDefinition, samples: Samples, warm: Warm | None, prior: DynamicsModel | None = None
 ) -> Learned:
-    """Learn a model of the specified family, and check its predictions at a few of its own samples.
+    """Learn a model of the family that the definition names, and check its predictions at a few of the samples.
 
     Raises:
         InvalidInput: too few samples to learn from.
@@ -114,7 +115,7 @@ def require_stds(model: DynamicsModel, std: Tensor) -> None:
 
 
 def require_numbers(definition: EnvironmentDefinition, what: str, values: Tensor, shape: tuple[int, ...]) -> None:
-    """Raise ``PluginFailed`` unless a tensor has this shape and finite numbers; ``what`` names it in the message."""
+    """Raise ``PluginFailed`` unless a tensor has this shape and finite numbers; ``what`` is its name in the message."""
     _require_shape(definition, what, values, shape)
     if not bool(torch.isfinite(values).all()):
         raise _wrong(definition, f"{what}: expected finite numbers", f"{_worst(values):g}")

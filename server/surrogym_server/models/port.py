@@ -27,7 +27,7 @@ from surrogym_server.environment.samples import Samples
 from surrogym_server.errors import InvalidInput
 from surrogym_server.tensors import to_device
 
-Warm = Mapping[str, NDArray[np.float64]]  # named arrays that one fit leaves for a warm start of the next
+Warm = Mapping[str, NDArray[np.float64]]  # named arrays of one fit, from which the next fit can start (warm start)
 MOST_SAMPLES = 2**31 - 1  # greatest number of samples of a model, the limit of a database's integer column
 
 
@@ -36,7 +36,8 @@ class Transition:
     """Predicted step from each of m points."""
 
     q_next: Tensor  # (m, C) coordinates after the step
-    reward: Tensor  # (m,) mean, without the penalty and without the terminal reward; see ``paid``
+    # (m,) mean reward without the terminal reward, which ``step_rules.paid`` adds, and without a penalty.
+    reward: Tensor
     std: Tensor | None  # (m, M) standard deviation of each transition output, if requested
     reward_std: Tensor | None  # (m,) standard deviation of the reward, if requested
 
@@ -48,12 +49,12 @@ class DynamicsModel(ABC):
 
     - It is immutable, and a pure function of its samples and settings: the same call gives the same numbers.
     - Predictions of a point do not depend on the points beside it, except for the last bits.
-    - Next states are within the environment's limits: they have passed ``step_rules.settle``.
-    - Deviations are standard deviations of the unknown function, in each output's own unit: finite, not negative, and
-      without the noise of a single step.
-    - What the definition declares is not learned: a declared reward is exact and has a standard deviation of 0.
-    - A frozen dataclass of tensors, tuples, mappings and dataclasses moves to a device by itself; other classes
-      override ``on``.
+    - Next states obey the environment's rules: ``step_rules.settle`` has been applied to them.
+    - Standard deviations are those of the unknown function, without the noise of a single step. They are finite, not
+      negative and in the unit of each output.
+    - What the definition declares is not learned. So a declared reward has a standard deviation of 0 at a known state.
+    - A model that is a frozen dataclass of tensors, tuples, mappings and dataclasses inherits ``on``; other classes
+      override it.
     """
 
     definition: EnvironmentDefinition
@@ -72,15 +73,16 @@ class DynamicsModel(ABC):
         stds: bool = False,
         reward_std: bool = False,
     ) -> Transition:
-        """Predict the step from q (m, C) under u (m, F): by the mean, or as a sample if ``noise`` is given.
+        """Predict the step from q (m, C) under u (m, F). By default the outputs have their mean values; with ``noise``
+        they are sampled.
 
         Args:
             q: coordinates before the step.
             u: action, in the model's units.
-            noise: standard normal numbers (m, M). Each transition output is mean + std * noise instead of its
-                mean. An output that depends on the prediction of another uses the other's draw.
-            process: standard normal numbers (m, M). Each output is also moved by its learned noise (w of eq. 2). A
-                family that learns no noise ignores them.
+            noise: standard normal numbers (m, M). Each transition output is mean + std * noise instead of its mean. If
+                an output depends on the predicted value of another output, it uses the other's sampled value.
+            process: standard normal numbers (m, M), by which the learned noise (w of eq. 2) moves each transition
+                output. A family that learns no noise ignores them.
             stds: whether to return the standard deviations of the transition outputs.
             reward_std: whether to return the standard deviation of the reward.
         """
@@ -89,7 +91,7 @@ class DynamicsModel(ABC):
     def means(self, q: Tensor, u: Tensor) -> Tensor:
         """Predict the mean of every output at q (m, C) and u (m, F), (m, O).
 
-        These are the increments before any limit is applied, and the reward including the terminal reward.
+        The outputs are the increments before limits are applied, and the reward with the terminal reward.
         """
 
     @abstractmethod
@@ -98,7 +100,7 @@ class DynamicsModel(ABC):
         learned."""
 
     def termination_probability(self, q: Tensor) -> Tensor:
-        """Return the probability (m,) that an episode ends on arriving at q (m, C): 0 or 1 if termination is
+        """Return the probability (m,) that an episode ends on arriving at q (m, C). It is 0 or 1 if termination is
         declared."""
         return self.learned_termination(q) if self.definition.learns_termination else self.terminated(q).to(q.dtype)
 
@@ -131,7 +133,7 @@ class DynamicsModel(ABC):
 
 @dataclass(frozen=True)
 class Learned:
-    """A fitted model, and named arrays for the warm start of the next fit."""
+    """Result of a fit: the model, and named arrays from which the next fit can start (warm start)."""
 
     model: DynamicsModel
     warm: dict[str, NDArray[np.float64]]
@@ -197,14 +199,14 @@ class ModelCodec(ABC):
 class Learner(ABC):
     """Learning algorithm of a family of models.
 
-    The settings are the fields of a frozen dataclass: numbers, booleans and strings, as in the specification. An
+    A learner is a frozen dataclass. Its fields are the settings in the specification: numbers, booleans and strings. An
     invalid setting raises a ValueError that states the allowed values.
 
     Laws:
 
     - ``learn`` is a pure function of its arguments and the settings: any randomness in it is seeded.
-    - A warm start changes how long a fit takes and which optimum it finds, not what the result means. An empty one
-      always works. It consists of named arrays of an earlier fit of the same definition, with fewer samples.
+    - A warm start consists of named arrays from an earlier fit of the same definition to fewer samples; it may be
+      empty. It changes how long a fit takes and which optimum it finds, not what the result means.
     """
 
     @property

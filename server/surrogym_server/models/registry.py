@@ -8,7 +8,7 @@ from surrogym_server.models.port import Learner
 from surrogym_server.plugins import Choice, Registry
 
 GAUSSIAN_PROCESS = "gaussian_process"
-# Names that stand for a family with some settings; see ``in_full``.
+# Short names, each of which stands for a family with some settings; see ``in_full``.
 SHORT: dict[str, Choice] = {"sparse_gaussian_process": Choice(GAUSSIAN_PROCESS, (("inducing", 300),))}
 BUILT_IN: dict[str, type[Learner] | str] = {
     GAUSSIAN_PROCESS: GaussianProcesses,
@@ -24,9 +24,9 @@ def learner_of(choice: Choice) -> Learner:
 
 
 def in_full(choice: Choice) -> Choice:
-    """Replace a short name, which stands for a family with some settings, by that family and these settings.
+    """Replace a short name by the family and the settings for which it stands.
 
-    A choice by any other name is returned unchanged. Settings of the choice override those of the short name.
+    Settings that ``choice`` gives itself override those. A choice whose name is no short name is returned unchanged.
     """
     if (short := SHORT.get(choice.name.casefold())) is None:
         return choice

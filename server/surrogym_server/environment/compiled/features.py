@@ -50,9 +50,9 @@ def encode(
     """Compute features ``begin`` to ``end``, and write them to the same rows of x (d, B).
 
     Args:
-        numbers, places: the tables.
-        at: index of the encoder's first matrix.
-        observe: index of the terms of the observation.
+        numbers, places: tables of matrices, see ``compiled.tables``.
+        at: index of the encoder's first matrix in the tables.
+        observe: index, in the tables, of the terms that compute the observation.
         raw: coordinates, action and lead (next values of the L leading coordinates), (C + F + L, B).
         size: number of coordinates, C.
         x: array for the features.

@@ -53,7 +53,7 @@ from surrogym_shared import compiled
 if TYPE_CHECKING:
     from surrogym_server.models.gaussian_process.prediction.compiled.step import StepsOfModel
 
-COMPILED_SOLVES = 300  # with more points than this, a library of linear algebra is faster than compiled code
+COMPILED_SOLVES = 300  # if a process has more points than this, a linear algebra library is faster than compiled code
 
 
 @dataclass(frozen=True)
@@ -70,17 +70,19 @@ class GaussianProcessModel(
     CompiledSteps,
     WrittenInC,
 ):
-    """Model with one process for each output, and regions in which an episode ends or the reward jumps."""
+    """Model with one Gaussian process for each output. It can also contain learned regions of states: one in which
+    episodes end, and others inside which the reward is higher or lower."""
 
     definition: EnvironmentDefinition
     transitions: tuple[OutputModel, ...]  # the M transition outputs, in the order of definition.outputs
     reward: OutputModel
-    terminal_reward: float  # reward that terminating steps pay in addition to the reward process
+    terminal_reward: float  # reward that terminating steps pay in addition to the prediction of the reward process
     samples: int
     digest: str
     ending: Region | None = None  # region in which episodes end, if termination is learned
-    jumps: tuple[Jump, ...] = ()  # jumps of the reward, added to the reward process
-    prior: GaussianProcessModel | None = None  # its mean is added to those outputs that have a ``size_with_prior``
+    jumps: tuple[Jump, ...] = ()  # jumps of the reward, which are added to the prediction of the reward process
+    # Prior model; its predictions are added to those outputs that have a ``size_with_prior``.
+    prior: GaussianProcessModel | None = None
 
     @property
     def outputs(self) -> tuple[OutputModel, ...]:
@@ -105,7 +107,8 @@ class GaussianProcessModel(
         return torch.cat([change, reward[:, None]], -1)
 
     def means_before_end(self, q: Tensor, u: Tensor) -> Tensor:
-        """Predict as ``means`` does, (m, O), but without the terminal reward."""
+        """Return the predicted mean of every output at q (m, C) and u (m, F), (m, O), as ``means`` does, but without
+        the terminal reward."""
         change, _, reward = self._predictor.means(q, u)
         return torch.cat([change, reward[:, None]], -1)
 
@@ -223,7 +226,8 @@ class GaussianProcessModel(
         return self.reward.warp is not None and self.reward.warp.sign > 0
 
     def promise(self, q: Tensor, u: Tensor) -> Tensor:
-        """Return the mean plus one standard deviation of the reward, in the unit in which its process is learned."""
+        """Return an optimistic score of the reward, (m,): the mean plus one standard deviation of the reward's process,
+        which predicts the reward or its logarithm."""
         steps = PredictedSteps(q, u, self._predictor.transition(q, u, None, None, None, False, False).q_next)
         mean, std = self.reward.target(process_inputs(self.definition, self.reward, steps))
         return mean + std
@@ -244,7 +248,8 @@ class GaussianProcessModel(
         return step_source(self.definition, tables_of(self._predictor, self.ending))
 
     def _learns(self, column: int, q_next: Tensor) -> Tensor:
-        """Return which samples that end at q_next (m, C) the output ``column`` would learn from, (m,) bool."""
+        """Return from which samples, ending at q_next (m, C), the output with index ``column`` would learn, (m,)
+        bool."""
         if column == len(self.transitions):
             return ~self.terminated(q_next)
         output = self.transitions[column]

@@ -12,19 +12,21 @@ FEWEST, MOST = 10, 2_000  # allowed numbers of inducing points
 
 @dataclass(frozen=True)
 class Settings:
-    """Settings of the learner: which structures are compared by evidence, and how many inducing points are used.
+    """Settings of the learner of Gaussian processes: which structures are compared by evidence, and how many inducing
+    points are used.
 
     Attributes:
         kernel: kernel of every process; ``composite`` adds a linear part, and for the reward a quadratic one.
-        reward_jumps: whether the reward may jump at the edge of a learned region.
+        reward_jumps: whether the reward may be higher or lower by a constant inside learned regions of states.
         symmetry: ``auto`` also compares feature maps with mirror symmetry, ``none`` does not.
-        rates: whether the size of a transition may grow along its inputs; see ``gp.growth``.
+        rates: whether a transition output may change faster the larger an input is; see ``gp.growth``.
         reward_peaks: whether the reward may be learned by its logarithm, if it is nearly zero almost everywhere.
         drop_inputs: whether an output may ignore inputs that don't matter to it; see ``gp.selection``.
         repeated_parts: whether outputs that are the same function of different inputs may share samples; see
             ``gp.pooling``. Needs ``drop_inputs``.
         inducing: greatest number of inducing points of a process. With more samples than that, hyperparameters maximise
-            a bound over all samples; with fewer the process is exact. 0 selects ``learning.many.BySubsets``.
+            the variational bound of all samples. 0 selects ``learning.many.BySubsets`` instead, which fits them to
+            subsets.
     """
 
     kernel: str = "composite"

@@ -12,8 +12,8 @@ from surrogym_server.models.gaussian_process.prediction.output_model import Outp
 
 
 def describe(definition: EnvironmentDefinition, output: OutputModel) -> dict[str, Any]:
-    """Return the structure and hyperparameters of an output, as JSON. ``features`` and ``lengthscale`` have the same
-    order."""
+    """Return the structure and hyperparameters of an output, as values for JSON. The lists ``features`` and
+    ``lengthscale`` have the same order."""
     described: dict[str, Any] = {
         "name": output.name,
         "inputs": str(output.feature_map),
@@ -52,7 +52,7 @@ def describe(definition: EnvironmentDefinition, output: OutputModel) -> dict[str
 
 
 def _inputs(definition: EnvironmentDefinition, feature_map: FeatureMap) -> dict[str, Any]:
-    """Return the names of the features, of those left out, and the rate of each feature that has one."""
+    """Return the names of the features that a map contains, the names of those left out, and the rates, for display."""
     names = feature_names(definition, feature_map)
     every = feature_names(definition, replace(feature_map, rates=(), dropped=()))
     rates = {name: rate for name, rate in zip(names, feature_map.rates, strict=False) if rate}

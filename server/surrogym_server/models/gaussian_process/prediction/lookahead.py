@@ -28,28 +28,30 @@ from surrogym_server.models.gaussian_process.prediction.output_model import Outp
 
 BLOCK = 4_000_000  # greatest number of covariances held at once
 ROUNDING = 1e-12
-SMALLEST = 1e-300  # avoids a division by 0 where every slope is 0
+SMALLEST = 1e-300  # lower limit of the largest slope, to avoid a division by 0 if all slopes are 0
 
 
 @dataclass(frozen=True)
 class ProcessOutlook(OutputOutlook):
-    """Forecast of one output's standard deviations at candidates, in the output's unit."""
+    """Forecast of one output's standard deviations at candidates for queries, in the output's unit, as if certain
+    queries had been answered."""
 
     joint: Joint  # process at m candidates, r reference points and the assumed queries, in this order
-    learns: Tensor  # (m,) bool: whether a sample at the candidate would improve the output
+    learns: Tensor  # (m,) bool: whether the output would learn from a sample at the candidate
     shared: Tensor  # (r, m) standardised covariance of reference points and candidates
     scale: float
-    slope: Tensor | None = None  # (m + r,) derivative of the output over its process, in scales; None if 1 everywhere
+    # (m + r,) derivative of the output with respect to its process, divided by ``scale``; None if it is 1 everywhere.
+    slope: Tensor | None = None
 
     @classmethod
     def of(cls, output: OutputModel, x: Tensor, learns: Tensor, spans: tuple[int, int]) -> ProcessOutlook:
-        """Build the outlook of an output.
+        """Build the forecast for an output.
 
         Args:
             output: an output with a process.
             x: inputs (m + r + p, d) of m candidates, r reference points and p queries that are assumed answered.
-            learns: (m + r + p,) bool: whether a sample at the point would improve the output.
-            spans: (m, m + r), the ends of candidates and reference points in x.
+            learns: (m + r + p,) bool: whether the output would learn from a sample at the point.
+            spans: (m, m + r), the rows of x at which the candidates and the reference points end.
         """
         assert output.posterior is not None
         joint = Joint.of(output.posterior, x)
@@ -65,10 +67,13 @@ class ProcessOutlook(OutputOutlook):
         return std if self.slope is None else std * self.slope[:count]
 
     def reduction(self, weights: Tensor) -> Tensor:
-        """Return sum_r w_r k(x_r, x)^2 / (k(x, x) + sigma_n^2) at each candidate x, (m,), with weights w (r,).
+        """Return by how much a sample at each candidate x would lower the weighted sum of the variances at the
+        reference points x_r: sum_r w_r k(x_r, x)^2 / (k(x, x) + sigma_n^2), (m,), with the posterior covariance k and
+        weights w (r,).
 
-        Cohn (NIPS 1993), in closed form for a Gaussian process. With a slope each reference point is also weighted by
-        its squared slope relative to the steepest. Only the order of the values matters.
+        This is Cohn's criterion (NIPS 1993) in closed form for a Gaussian process. If the output is a nonlinear
+        function of its process, each reference point is also weighted by the squared derivative of this function,
+        relative to the largest. Only the order of the values matters.
         """
         if self.slope is not None:
             steep = self.slope[len(self.learns) :]
@@ -86,12 +91,13 @@ class ProcessOutlook(OutputOutlook):
 
 @dataclass(frozen=True)
 class ProcessAlongPaths(PathOutlook):
-    """Forecast of one output along paths of predicted steps."""
+    """Forecast of one output's standard deviations, and of the information from real steps, along paths of predicted
+    steps."""
 
     definition: EnvironmentDefinition
     output: OutputModel
     x: Tensor  # (b, T, d) inputs of the output's process
-    learns: Tensor  # (b, T) bool: whether a real step at that point would improve the output
+    learns: Tensor  # (b, T) bool: whether the output would learn from a real step at that point
 
     @property
     def std(self) -> Tensor:
@@ -104,27 +110,29 @@ class ProcessAlongPaths(PathOutlook):
         if (slope := slope_at(output, self.x.flatten(0, 1))) is not None:
             weight = weight * slope.reshape(weight.shape)
         blocks = zip(torch.split(self.x, room), torch.split(weight, room), strict=True)
-        # Below the noise floor a covariance is rounding, which a very small tolerance would scale up beyond 1.
+        # Covariances below the noise floor are rounding errors. With a very small tolerance they would be scaled up to
+        # more than 1, so the ratio is limited.
         ratio = min((output.scale / tolerance) ** 2, 1 / output.noise_floor)
         return torch.cat([_log_determinants(ratio * output.posterior.joint_covariance(b), w) for b, w in blocks])
 
 
 def process_inputs(definition: EnvironmentDefinition, output: OutputModel, steps: PredictedSteps) -> Tensor:
-    """Return the inputs (..., d) that one output's process reads at the given steps."""
+    """Return the inputs (..., d) of one output's process at predicted steps."""
     state = steps.q_next if output.feature_map.after else steps.q
     return encode(definition, output.feature_map, state, steps.u, steps.q_next[..., leading(definition)])
 
 
 def slope_at(output: OutputModel, x: Tensor) -> Tensor | None:
-    """Return the derivative of an output over its process, in scales, at inputs x (m, d): (m,), or None if it is 1
-    everywhere."""
+    """Return the derivative of an output with respect to its process at inputs x (m, d), divided by the output's scale,
+    (m,); None if it is 1 everywhere."""
     if output.warp is not None:
         return output.warp.slope(*output.target(x))
     return output.amplitude(x) if output.feature_map.rates else None
 
 
 def as_if_answered(output: OutputModel, x: Tensor) -> OutputModel:
-    """Condition an output on observations of its own mean at inputs x (k, d): the variance shrinks, the mean stays."""
+    """Condition an output on k assumed observations at inputs x (k, d), each equal to the output's mean there: the
+    variance decreases, the mean stays."""
     if (posterior := output.posterior) is not None:
         for point in x:
             posterior = posterior.extend(point, posterior.mean(point[None])[0])
@@ -132,11 +140,11 @@ def as_if_answered(output: OutputModel, x: Tensor) -> OutputModel:
 
 
 def _log_determinants(covariance: Tensor, weight: Tensor) -> Tensor:
-    """Return 1/2 log det(1 + W S W) for the first t points of each path, t = 1 to T, (b, T).
+    """Return 1/2 log det(I + W S W), computed from the first t points of each path, for t = 1 to T, (b, T).
 
     Args:
-        covariance: S (b, T, T).
-        weight: diagonal of W, (b, T).
+        covariance: covariance S of the points of each path, (b, T, T).
+        weight: diagonal of the diagonal matrix W of each path, (b, T).
     """
     one = torch.eye(weight.shape[1], dtype=weight.dtype)
     factor: Tensor = torch.linalg.cholesky(one + weight[:, :, None] * covariance * weight[:, None, :])

@@ -16,7 +16,8 @@ from surrogym_server.tensors import amplitude
 
 @dataclass(frozen=True)
 class Drawn:
-    """Where the weights of one output's sampled functions are among the W weights of all outputs."""
+    """Sampler of functions of one output, and the place of this output's weights among the W weights of a sampled
+    function of all outputs."""
 
     column: int
     span: slice  # where the weights of this output are
@@ -27,7 +28,8 @@ class Drawn:
 
 @dataclass(frozen=True)
 class Grown:
-    """Output with rates: its amplitude grows along its inputs."""
+    """Output with rates: its distance from ``centre`` is multiplied by an amplitude that grows along its inputs, see
+    ``gp.growth``."""
 
     column: int
     inputs: Tensor  # columns of x that the output reads
@@ -58,7 +60,7 @@ class OutputGroup:
         begin: int,
         grown: tuple[Grown, ...] = (),
     ) -> OutputGroup:
-        """Compile some outputs of a model.
+        """Compile some outputs of a model for prediction.
 
         Args:
             encoder: encoder of the features x.
@@ -66,7 +68,7 @@ class OutputGroup:
             columns: number O of columns of a prediction.
             lead: whether the outputs read the next values of leading coordinates.
             begin: index of the group's first weight in a sampled function.
-            grown: those of the outputs that have rates.
+            grown: rates of those outputs that have rates, see ``Grown``.
         """
         device = encoder.definition.device
         noise, samplers = torch.zeros(columns, dtype=torch.float64, device=device), []
@@ -85,14 +87,15 @@ class OutputGroup:
     def predict(
         self, x: Tensor, columns: tuple[int, ...], kick: Tensor | None, process: Tensor | None, paths: Tensor | None
     ) -> tuple[Tensor, Tensor]:
-        """Return values at features x (m, d), and latent standard deviations of ``columns``, (m, O) each.
+        """Return predicted values at features x (m, d), (m, O), and standard deviations without noise, (m, O).
 
         Args:
             x: features.
-            columns: columns whose standard deviations are needed; if (), the second result is (m, 0).
-            kick: (m, O) latent standard deviations to add to the mean, or None.
-            process: (m, O) standard deviations of the noise to add, or None.
-            paths: (m, W) a sampled function for each row, whose value replaces the mean, or None.
+            columns: indices of the outputs whose standard deviations are needed; if there are none, the second result
+                is (m, 0).
+            kick: (m, O) numbers of standard deviations to add to the mean, or None.
+            process: (m, O) standard normal numbers, by which the learned noise moves the values, or None for no noise.
+            paths: (m, W) weights of a sampled function for each row, whose value replaces the mean, or None.
         """
         if columns:
             value, spread = self.serving.mean_and_std(x, columns)

@@ -27,13 +27,14 @@ from surrogym_server.tensors import cached, in_blocks
 
 @dataclass(frozen=True)
 class Predictor:
-    """Predictor of the transition and reward of one environment."""
+    """Predictor of the steps (next coordinates and rewards) of one environment from the models of its outputs."""
 
     definition: EnvironmentDefinition
     transitions: tuple[OutputModel, ...]  # the M transition outputs, in the order of definition.outputs
     reward: OutputModel
-    jumps: tuple[Jump, ...]  # jumps of the reward, added to its process
-    prior: Predictor | None = None  # its mean is added to those outputs that have a ``size_with_prior``
+    jumps: tuple[Jump, ...]  # jumps of the reward, which are added to the prediction of its process
+    # Prior model; its predictions are added to those outputs that have a ``size_with_prior``.
+    prior: Predictor | None = None
 
     def transition(
         self,
@@ -45,9 +46,10 @@ class Predictor:
         stds: bool,
         reward_std: bool,
     ) -> Transition:
-        """Predict as ``DynamicsModel.transition`` does, in blocks of rows, with variances only where requested.
+        """Predict as ``DynamicsModel.transition`` does, in blocks of rows. Standard deviations are computed only where
+        they are requested.
 
-        ``paths`` (m, W) are sampled functions that the rows follow, or None for the mean.
+        ``paths`` (m, W) are the weights of the sampled function that each row follows, or None for the mean.
         """
         columns = self._columns if stds or noise is not None else ()
         columns += (self._reward_column,) if reward_std else ()
@@ -73,8 +75,8 @@ class Predictor:
         return sum(one.pathwise.size for group in self._groups if group for one in group.drawn)
 
     def draw(self, noise: Tensor) -> Tensor:
-        """Sample functions from the posteriors of all outputs, one for each row of standard normal ``noise`` (N, W):
-        (N, W)."""
+        """Return the weights (N, W) of N functions sampled from the posteriors of all outputs, each computed from one
+        row of standard normal numbers ``noise`` (N, W)."""
         samplers = [one for group in self._groups if group for one in group.drawn]
         return torch.cat([noise[:, :0], *(one.pathwise.draw(noise[:, one.span]) for one in samplers)], 1)
 
@@ -87,10 +89,11 @@ class Predictor:
         process: Tensor | None,
         paths: Tensor | None,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return next coordinates (m, C), means of all columns, and standard deviations of ``columns``, (m, all) each.
+        """Return next coordinates (m, C), predicted values of all columns, and standard deviations, which are computed
+        for ``columns`` only. There is a column for each coordinate or observation entry, and one for the reward.
 
-        The outputs are predicted in up to three stages. Each fills its own columns and leaves the others 0, so that
-        their results can be added.
+        Outputs are predicted in up to three stages. The result of a stage is 0 in the columns of other stages, so that
+        the results can be added.
         """
         first, second, after = self._groups
         kick, shake = self._in_columns(noise), self._in_columns(process)
@@ -109,7 +112,8 @@ class Predictor:
         return q_next, mean, spread
 
     def _by_prior(self, prior: Predictor, q: Tensor, u: Tensor) -> Tensor:
-        """Return the prior's mean for those columns that use it, 0 in the others, at q (m, C) and u (m, F)."""
+        """Return the prior model's predictions at q (m, C) and u (m, F) for the columns to which they are added, 0 in
+        the others."""
         change, _, reward = prior.means(q, u)
         added = change.new_zeros(len(q), self._reward_column + 1)
         added[:, [*self._columns, self._reward_column]] = torch.cat([change, reward[:, None]], 1)
@@ -117,7 +121,8 @@ class Predictor:
 
     @cached
     def uses_prior(self) -> Tensor:
-        """1 for each column to which the prior's mean is added, 0 for the others, (columns,)."""
+        """Mask of the columns to which the prior model's predictions are added, (columns,): 1 for these, 0 for the
+        others."""
         uses = torch.zeros(self._reward_column + 1, dtype=torch.float64, device=self.definition.device)
         outputs = (*self.transitions, self.reward)
         for column, output in zip((*self._columns, self._reward_column), outputs, strict=True):
@@ -125,10 +130,10 @@ class Predictor:
         return uses
 
     def _rewards(self, q: Tensor, u: Tensor, q_next: Tensor, mean: Tensor) -> tuple[Tensor, Tensor | float]:
-        """Return the rewards (m,) of steps from q (m, C) under u (m, F) to q_next (m, C), and the variance (m,) that
-        uncertain edges of jumps add.
+        """Return the rewards (m,) of steps from q (m, C) under u (m, F) to q_next (m, C), and their variance (m,) due
+        to jumps of the reward whose edges are uncertain.
 
-        ``mean`` (m,) is the mean of the reward's process, to which jumps and the declared reward are added.
+        ``mean`` (m,) is the prediction of the reward's process. Jumps and a declared reward are added to it.
         """
         state = q_next if self.reward.feature_map.after else q
         if self.reward.warp is not None:
@@ -141,8 +146,8 @@ class Predictor:
         return mean + added, variance
 
     def _reward_spread(self, mean: Tensor, spread: Tensor, edges: Tensor | float) -> Tensor:
-        """Return the standard deviation of the reward, (m,), given mean and standard deviation (m,) of its process and
-        the variance ``edges`` from uncertain edges of jumps."""
+        """Return the standard deviation of the reward, (m,). ``mean`` and ``spread`` (m,) are those of the reward's
+        process; ``edges`` is the variance due to jumps of the reward whose edges are uncertain."""
         if self.reward.warp is not None:
             spread = self.reward.warp.std(mean, spread)
         return (spread.square() + edges).sqrt()
@@ -166,8 +171,8 @@ class Predictor:
 
     @cached
     def _groups(self) -> tuple[OutputGroup, OutputGroup | None, OutputGroup | None]:
-        """Groups of outputs: those that read (q, u), those that also read next values of leading coordinates, and a
-        reward that reads the next state; None for an empty group."""
+        """Three groups of outputs: those that read only coordinates and action, those that also read the next values of
+        leading coordinates, and the reward if it reads the next state. An empty second or third group is None."""
         after = self.reward.feature_map.after
         outputs = list(zip(self._columns, self.transitions, strict=True))
         reward = [(self._reward_column, self.reward)]

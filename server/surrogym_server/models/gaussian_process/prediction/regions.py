@@ -21,13 +21,13 @@ from surrogym_server.models.gaussian_process.prediction.output_model import Outp
 from surrogym_server.tensors import cached, to_device
 
 TERMINATION = "termination"  # name of the region where episodes end
-Side = Literal["above", "below", "beyond"]  # of a threshold on t: t > level, -t > level, |t| > level
+Side = Literal["above", "below", "beyond"]  # side of a threshold on a term t: t > level, -t > level, or |t| > level
 SIDES: tuple[Side, ...] = ("above", "below", "beyond")
 
 
 @dataclass(frozen=True)
 class Axes:
-    """Axes along which a threshold can lie: x, -x and |x| for each x of T coordinates and observation entries.
+    """Axes on which a learned threshold can lie: x, -x and |x| for each x among T coordinates and observation entries.
 
     There are A = 3 T axes.
     """
@@ -37,7 +37,8 @@ class Axes:
 
     @classmethod
     def of(cls, definition: EnvironmentDefinition) -> Axes:
-        """Build the axes of the moving coordinates, and of those observation entries that are not one of them."""
+        """Build the axes for the moving coordinates, and for those observation entries that are not simply one of these
+        coordinates."""
         size, names = len(definition.coordinates), {}
         for index in definition.moving:
             weights = tuple(float(i == index) for i in range(size))
@@ -50,7 +51,7 @@ class Axes:
         return 3 * len(self.names)
 
     def __call__(self, q: Tensor) -> Tensor:
-        """Return the values of all axes at q (m, C), (m, A)."""
+        """Return the values of states q (m, C) on all axes, (m, A)."""
         value = self.terms(q)
         return torch.cat([value, -value, value.abs()], -1)
 
@@ -68,25 +69,27 @@ class Cut:
     lie between ``outside`` and ``inside``."""
 
     axis: int
-    outside: float  # greatest value on the axis of a state seen outside
-    inside: float  # least value on the axis of a state seen inside
-    weight: float  # probability of this axis among those that explain the same samples
+    outside: float  # greatest value on the axis of all samples outside
+    inside: float  # least value on the axis of the samples inside that this cut explains
+    weight: float  # probability of this cut among the alternative cuts of its rule
 
 
 @dataclass(frozen=True)
 class Thresholds:
-    """Region of the states for which any rule holds. A rule lists alternative cuts that explain the same samples."""
+    """Region of the states for which any rule holds. A rule consists of alternative thresholds (cuts) that explain the
+    same samples, each with the probability that it is the right one."""
 
     definition: EnvironmentDefinition
     rules: tuple[tuple[Cut, ...], ...]
     complement: bool = False  # if true, the region consists of the states for which no rule holds
 
     def probability(self, q: Tensor) -> Tensor:
-        """Return the probability that q (m, C) lies inside, (m,), if each level is uniform within its gap."""
+        """Return the probability that states q (m, C) lie inside, (m,). Each threshold is uniformly distributed over
+        the gap between the nearest samples outside and inside."""
         return self.at(self._axes(q))
 
     def at(self, values: Tensor) -> Tensor:
-        """Return the probability of lying inside, (m,), at given values of all axes (m, A)."""
+        """Return the probability that m states lie inside, (m,), given their values on all axes (m, A)."""
         columns, outside, width, membership = self._compiled
         reached = ((values[:, columns] - outside) / width).clamp(0, 1)
         union = 1 - (1 - reached @ membership).clamp(0, 1).prod(-1)
@@ -94,7 +97,8 @@ class Thresholds:
 
     @property
     def description(self) -> Mapping[str, Any]:
-        """Rules in words, with the gaps in which their thresholds lie."""
+        """The rules as values for JSON: the inequality of each threshold in words, the gap in which the threshold lies,
+        and its weight."""
         rules = [
             [
                 {
@@ -115,8 +119,8 @@ class Thresholds:
 
     @cached
     def _compiled(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Axis, outside value and width of the gap of every cut, (K,) each, and each cut's weight in its rule,
-        (K, R)."""
+        """Tensors of all K cuts: axis, value outside the gap and width of the gap, (K,) each; and the weight of each
+        cut in each of the R rules, (K, R), 0 in the rules of other cuts."""
         cuts = [(row, cut) for row, rule in enumerate(self.rules) for cut in rule]
         outside = torch.tensor([cut.outside for _, cut in cuts], dtype=torch.float64)
         inside = torch.tensor([cut.inside for _, cut in cuts], dtype=torch.float64)
@@ -129,8 +133,8 @@ class Thresholds:
 
 @dataclass(frozen=True)
 class Classifier:
-    """Region learned by a process of labels +-1 (least-squares classification, Rasmussen and Williams (2006), section
-    6.5)."""
+    """Region learned by a process that is fitted to labels, 1 inside and -1 outside (least-squares classification,
+    Rasmussen and Williams (2006), section 6.5)."""
 
     definition: EnvironmentDefinition
     process: OutputModel
@@ -152,7 +156,8 @@ Form = Thresholds | Classifier
 
 @dataclass(frozen=True)
 class Region:
-    """Learned set of states: a mixture of forms that explain the labels. Where they disagree, it is uncertain."""
+    """Learned region of states: a weighted mean of forms (thresholds or a classifier) that each explain the labels of
+    the samples. Where the forms disagree, the probability lies between 0 and 1."""
 
     forms: tuple[tuple[float, Form], ...]  # forms with their weights, which add up to 1
     scores: tuple[tuple[str, float], ...]  # leave-one-out log probability of every form that was compared
@@ -164,23 +169,25 @@ class Region:
 
     @property
     def description(self) -> dict[str, Any]:
-        """All forms of the region in words, with their scores, for display."""
+        """All forms of the region and their scores, as values for JSON."""
         forms = [{"weight": weight, **form.description} for weight, form in self.forms]
         return {"forms": forms, "scores": dict(self.scores)}
 
 
 @dataclass(frozen=True)
 class Jump:
-    """Region inside which the reward is higher by ``size`` (lower if negative)."""
+    """Jump of the reward: a region of states inside which the reward is higher by ``size``, or lower if ``size`` is
+    negative."""
 
     region: Region
     size: float
 
 
 def jumped(jumps: Sequence[Jump], q: Tensor) -> tuple[Tensor, Tensor]:
-    """Return what jumps add to the reward of states q (m, C), and its variance from uncertain edges, (m,) each.
+    """Return what jumps add to the reward of states q (m, C), (m,), and the variance of this amount where it is
+    uncertain whether a state lies inside, (m,).
 
-    If the regions of jumps overlap, the first one counts.
+    If a state lies inside several regions, only the first of these jumps counts.
     """
     added, variance, free = q.new_zeros(len(q)), q.new_zeros(len(q)), q.new_ones(len(q), dtype=torch.bool)
     for jump in jumps:

@@ -28,17 +28,21 @@ from surrogym_server.models.gaussian_process.prediction.output_model import Outp
 from surrogym_server.models.port import Transition
 
 MODELS = 8  # number of models with different hyperparameters, from which functions are sampled
-MOST_POINTS = 128  # a process with more points has certain enough hyperparameters, which are not sampled
-NEGLIGIBLE = 0.01**2  # noise variance, as a share of the output's variance, below which misfit does no harm
-AT_MOST = 3.0**2  # greatest credible ratio of learned noise variance to that of repeated steps, which may be few
+MOST_POINTS = 128  # hyperparameters of a process with more points are certain enough, so they are not sampled
+# Noise variance, as a share of the output's variance, below which it does not matter whether noise is misfit.
+NEGLIGIBLE = 0.01**2
+# Greatest plausible ratio of learned noise variance to that of repeated steps; it is large because repeats may be few.
+AT_MOST = 3.0**2
 
 Floats = NDArray[np.float64]
 
 
 def uncertain_outputs(outputs: Sequence[OutputModel], *, repeatable: bool) -> list[list[OutputModel]]:
-    """Copy the outputs (O,) ``MODELS`` times, on the CPU, with sampled hyperparameters for processes with few points.
+    """Return ``MODELS`` copies of all outputs (O,), computed on the CPU. In each copy, processes with few points have
+    other, sampled hyperparameters.
 
-    Return [] if no process has few points. ``repeatable``: whether steps can be repeated, which would show noise.
+    Return [] if no process has few points. ``repeatable`` says whether the same real step can be taken again, which
+    would show noise. If it can, learned noise that repeats don't confirm is left out.
     """
     if not any(_uncertain(output) for output in outputs):
         return []
@@ -61,7 +65,7 @@ def _sampled(output: OutputModel, seed: int, repeatable: bool) -> list[OutputMod
 
 
 def _misfits(posterior: Posterior) -> bool:
-    """Return whether a process has learned more noise than its equal points show."""
+    """Return whether a process has learned clearly more noise than its points with equal inputs show."""
     return posterior.hyper.noise_variance > max(NEGLIGIBLE, AT_MOST * (posterior.noise_seen or 0.0))
 
 
@@ -75,8 +79,8 @@ def _conditioned(posterior: Posterior, hyper: Hyperparameters) -> Posterior:
 
 @dataclass(frozen=True)
 class FunctionsOfSeveral(FunctionDraws, CompiledSteps):
-    """Functions of several models, chosen with equal probability. Functions of all models have the same number of
-    weights."""
+    """Sampler of functions of several models: it chooses one of the models with equal probability, then samples a
+    function of this model. Functions of all models have the same number of weights."""
 
     models: tuple[FunctionDraws, ...]
 
@@ -136,7 +140,7 @@ class FunctionsOfSeveral(FunctionDraws, CompiledSteps):
 
 @dataclass(frozen=True, eq=False)
 class StepsOfSeveral(ArraySteps):
-    """Compiled steps of several models, for sampled functions only."""
+    """Compiled steps along functions that were sampled from several models."""
 
     definition: EnvironmentDefinition
     models: tuple[ArraySteps, ...]
@@ -172,8 +176,8 @@ class StepsOfSeveral(ArraySteps):
 
 
 def _members(number: Tensor, count: int) -> list[tuple[int, Tensor]]:
-    """Return pairs of a model's index and its rows, given the index of the model of each row, (m,); models without
-    rows are omitted."""
+    """Return a pair (index of a model, indices of its rows) for each model that has rows. ``number`` (m,) is the index
+    of the model to which each row belongs; ``count`` is the number of models."""
     rows = [(index, (number == index).nonzero()[:, 0]) for index in range(count)]
     return [(index, which) for index, which in rows if len(which)]
 

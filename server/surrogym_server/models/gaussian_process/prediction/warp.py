@@ -16,13 +16,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-LARGEST = 300.0  # greatest y whose exponential is computed, to avoid overflow
-PEAK_NOISE = 1e-10  # least noise, as a share of the variance of y: y spans hundreds, a reward needs 1 % resolution
+LARGEST = 300.0  # greatest logarithm y whose exponential is computed; a larger one is replaced by it to avoid overflow
+# Least noise variance, as a share of that of y; y may span hundreds of units, but rewards need a resolution of 1 %.
+PEAK_NOISE = 1e-10
 
 
 @dataclass(frozen=True)
 class Warp:
-    """Transformation of one output between its values r and their logarithms y: r = base + sign exp(y).
+    """Transformation between rewards r and the logarithms y by which they are learned: r = base + sign exp(y).
 
     Attributes:
         base: reward far from the peak.
@@ -35,7 +36,7 @@ class Warp:
     size: float
 
     def value(self, y: Tensor) -> Tensor:
-        """Return the reward of y (m,)."""
+        """Return the rewards with logarithms y (m,), (m,)."""
         return self.base + self.sign * y.clamp_max(LARGEST).exp()
 
     def std(self, y: Tensor, spread: Tensor) -> Tensor:
@@ -43,7 +44,8 @@ class Warp:
         return 0.5 * ((y + spread).clamp_max(LARGEST).exp() - (y - spread).clamp_max(LARGEST).exp())
 
     def slope(self, y: Tensor, spread: Tensor) -> Tensor:
-        """Return the derivative of the reward over y, (m,), one standard deviation ``spread`` (m,) above y."""
+        """Return the absolute derivative of the reward with respect to y, (m,), evaluated one standard deviation
+        ``spread`` (m,) above y."""
         return torch.exp((y + spread).clamp_max(LARGEST))
 
     def __str__(self) -> str:
@@ -52,5 +54,5 @@ class Warp:
 
     @property
     def finite(self) -> bool:
-        """Whether all numbers are finite and valid, since a file may contain anything."""
+        """Whether all numbers are finite and valid. This has to be checked because they may come from a file."""
         return math.isfinite(self.base) and self.sign in (1.0, -1.0) and math.isfinite(self.size) and self.size > 0

@@ -30,21 +30,22 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
-# Columns of a region's matrix, one row for each form: its weight, whether it is a classifier, and three more numbers.
-# For thresholds: index of the axes, index of the cuts and rules, and whether the form is a complement.
-# For a classifier: index of the features, index of the process, and number of features. If the process is constant, its
-# index is -i - 1, with i the index of the constant.
+# Columns of a region's matrix, one row for each form (thresholds or classifier): weight of the form, whether it is a
+# classifier, and three more numbers. For thresholds: index of the axes, index of the cuts and rules, and whether the
+# form is a complement. For a classifier: index of the features, index of the process, and number of features. If the
+# process is constant, its index is -i - 1, with i the index of the constant.
 WEIGHT, CLASSIFIES, FIRST, SECOND, THIRD = range(5)
 LEAST_STD = 1e-9  # lower limit of a standard deviation, to avoid a division by 0
 
 
 def add_region(tables: TablesBuilder, region: Region) -> int:
-    """Add a region to the tables, and return the index of its matrix."""
+    """Add a learned region of states to the tables, and return the index of its matrix."""
     return tables.add([(weight, *_add_form(tables, form)) for weight, form in region.forms])
 
 
 def add_jumps(tables: TablesBuilder, jumps: Sequence[Jump]) -> int:
-    """Add jumps to the tables, the size and the region of each, and return the index of their matrix."""
+    """Add the jumps of a reward to the tables. Return the index of a matrix with a row (size, index of the region) for
+    each jump."""
     return tables.add(np.array([(jump.size, add_region(tables, jump.region)) for jump in jumps]).reshape(-1, 2))
 
 
@@ -113,9 +114,9 @@ def probability(numbers: Floats, places: Ints, at: int, observe: int, q: Floats,
     """Return the probability that states q (C, B) lie inside a region, (B,).
 
     Args:
-        numbers, places: the tables.
-        at: index of the region's matrix.
-        observe: index of the terms of the observation.
+        numbers, places: tables of the model, see ``compiled.tables``.
+        at: index of the region's matrix in the tables.
+        observe: index, in the tables, of the terms that compute the observation.
         q: coordinates, one state a column.
         actions: number of action entries, F.
     """
@@ -143,8 +144,9 @@ def probability(numbers: Floats, places: Ints, at: int, observe: int, q: Floats,
 def add_jumped(
     numbers: Floats, places: Ints, at: int, observe: int, q: Floats, actions: int, reward: Floats, variance: Floats
 ) -> None:
-    """Add the jumps at index ``at`` to the rewards of states q (C, B), and the variance from their uncertain edges to
-    ``variance``, (B,) each."""
+    """Add the jumps of the reward with index ``at`` in the tables: their sizes to the rewards ``reward`` (B,) of those
+    states q (C, B) that lie inside, and to ``variance`` (B,) the variance that results from the uncertain edges of
+    their regions."""
     jumps = matrix(numbers, places, at)
     free = np.ones(q.shape[1], dtype=np.bool_)
     for j in range(len(jumps)):
@@ -180,16 +182,18 @@ def judge(
     std: Floats,
     terminated: Bools,
 ) -> None:
-    """Apply learned regions to N steps, and change the results of these steps in place.
+    """Add the learned jumps of the reward to the results of N steps, and apply the learned termination. The results
+    change in place.
 
     Args:
-        numbers, places: the tables.
+        numbers, places: tables of the model, see ``compiled.tables``.
         q, q_next: coordinates before and after the steps, (N, C).
         actions: number of action entries, F.
         reward_std: whether the standard deviation of the reward is needed.
         reward: (N,) rewards, to which jumps are added.
-        std: (N, O) standard deviations, of which the last column grows by uncertain edges.
-        terminated: (N,) overwritten if termination is learned.
+        std: (N, O) standard deviations. The last column, that of the reward, increases where the edges of jumps are
+            uncertain.
+        terminated: (N,) whether each step ends the episode; overwritten if termination is learned.
     """
     head = matrix(numbers, places, HEAD)
     observe = int(head[0, OBSERVE])

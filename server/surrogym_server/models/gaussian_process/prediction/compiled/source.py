@@ -20,15 +20,16 @@ from surrogym_server.tensors import EDGE
 Floats = NDArray[np.float64]
 FIXED = ("step.c", "step.h")
 PER_LINE = 8  # numbers in a line of the source
-PROCESS = 3  # column, in the table of processes, with the index of a process's first matrix
+PROCESS = 3  # column of the matrix of processes that contains the index of a process's first matrix
 
 
 def step_source(definition: EnvironmentDefinition, tables: Tables) -> StepSource:
-    """Return the C source of the step of a model with these tables (see ``tables_of`` in ``compiled.step``)."""
+    """Return C source of the functions that compute a step of a model. ``tables`` are its tables from ``tables_of`` in
+    ``compiled.step``."""
     matrices = _matrices(tables)
     processes = {int(place) for place in _processes(matrices)}
     for process in processes:
-        for drawn in (KEPT, TURNED):  # only sampled functions read these matrices
+        for drawn in (KEPT, TURNED):  # these matrices are left out, because only sampled functions read them
             matrices[process + drawn] = np.zeros((1, 0))
     inner = {process + place for process in processes for place in range(HEAD, TURNED + 1)}
     sizes = {
@@ -55,7 +56,8 @@ def _matrices(tables: Tables) -> list[Floats]:
 
 
 def _processes(matrices: Sequence[Floats]) -> Iterator[float]:
-    """Yield the index of each process: of outputs, and of classifiers in regions."""
+    """Yield the index, among the matrices, of each process: those of the outputs, then those of the classifiers in
+    learned regions."""
     head = matrices[layout.HEAD][0].astype(int)
     yield from matrices[head[layout.PROCESSES]][:, PROCESS]
     regions = [] if head[layout.JUMPS] == layout.NONE else [int(jump[1]) for jump in matrices[head[layout.JUMPS]]]

@@ -56,7 +56,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
-# Columns of the matrix of outputs: constant, standard deviation of the noise, and stage.
+# Columns of the matrix of outputs: value of an output that never varied, standard deviation of the noise, and stage.
 CENTRE, NOISE, STAGE = range(3)
 # Stages of a prediction: outputs that read (q, u), those that also read next values of leading coordinates, and a
 # reward that reads the next state.
@@ -105,7 +105,8 @@ def tables_of(predictor: Predictor, ending: Region | None) -> Tables:
 
 
 def _add_outputs(tables: TablesBuilder, predictor: Predictor) -> tuple[int, int]:
-    """Add a matrix of outputs, and one of processes with their stages, to the tables. Return their indices."""
+    """Add a matrix of outputs and a matrix of processes to the tables, and return their two indices. The processes are
+    those of outputs that vary."""
     rows, processes = np.zeros((predictor._reward_column + 1, 3)), []
     begins = {one.column: one.span.start for group in predictor._groups if group for one in group.drawn}
     places = (*predictor._columns, predictor._reward_column)
@@ -130,11 +131,11 @@ def _add_outputs(tables: TablesBuilder, predictor: Predictor) -> tuple[int, int]
 def _encode_stage(
     numbers: Floats, places: Ints, head: Floats, stage: int, raw: Floats, arrived: Floats, mean: Floats, x: Floats
 ) -> None:
-    """Write the features that a stage reads, and that no earlier stage has written, to x (d, B).
+    """Write those features to x (d, B) that outputs of a stage read and that no earlier stage has written.
 
-    The first stage reads coordinates and actions from ``raw`` (C + F + L, B). The second also reads the next values of
-    the leading coordinates, which are written behind them. The third reads the next coordinates ``arrived`` (C, B),
-    which replace the coordinates in ``raw``.
+    Features are computed from ``raw`` (C + F + L, B). Its first rows are coordinates and actions, which the first stage
+    reads. The second stage writes the next values of the L leading coordinates to the last rows, and reads them too.
+    The third stage replaces the coordinates by the next coordinates ``arrived`` (C, B).
     """
     size, lanes, observe = len(arrived), raw.shape[1], int(head[0, OBSERVE])
     width, begin, end = int(head[0, WIDTH]), 0, int(head[0, WIDTH])
@@ -156,8 +157,9 @@ def _encode_stage(
 
 @inlined
 def _grow(numbers: Floats, places: Ints, at: int, x: Floats, mean: Floats, spread: Floats) -> None:
-    """Multiply an output's distance from its centre, and its standard deviation, (B,) each, by its amplitude at x (d,
-    B). ``at`` is the index of its rates."""
+    """Multiply the distance of an output's ``mean`` (B,) from its centre, and its standard deviation ``spread`` (B,),
+    by the output's amplitude at inputs x (d, B). ``at`` is the index of the output's rates, from which the amplitude is
+    computed."""
     rates, centre = matrix(numbers, places, at), matrix(numbers, places, at + 1)[0, 0]
     for b in range(len(mean)):
         amplitude = 1.0
@@ -183,17 +185,19 @@ def _predict_stage(
     mean: Floats,
     spread: Floats,
 ) -> None:
-    """Predict the outputs of one stage for B lanes, and write them to ``mean`` and ``spread``.
+    """Predict the outputs of one stage for B lanes (parallel environments), and write the results to ``mean`` and
+    ``spread``.
 
     Args:
-        numbers, places: the tables.
+        numbers, places: tables of the model, see ``tables_of``.
         head: first matrix of the tables.
-        stage: FIRST, LED or AFTER.
+        stage: FIRST, LED or AFTER, for outputs that read coordinates and action, also the next values of leading
+            coordinates, or the next state.
         x: features (d, B).
         noise, process, paths, known: as in ``step``, for these lanes.
         stds, reward_std: whether standard deviations of transition outputs and of the reward are needed.
-        mean: (columns, B), of which the stage's rows are written.
-        spread: (O, B) standard deviations, of which the stage's rows are written.
+        mean: (columns, B) predicted values. The rows of this stage's outputs are written.
+        spread: (O, B) standard deviations. The rows of this stage's outputs are written.
     """
     columns = matrix(numbers, places, int(head[0, OUTPUTS]))
     for column in range(len(columns)):
@@ -225,8 +229,8 @@ def _predict_stage(
 
 @inlined
 def _arrive(numbers: Floats, places: Ints, head: Floats, raw: Floats, mean: Floats, arrived: Floats) -> None:
-    """Write to ``arrived`` (C, B) the next coordinates of those in ``raw`` (C + F + L, B) after changes ``mean``
-    (columns, B)."""
+    """Write the next coordinates to ``arrived`` (C, B): the coordinates in the first rows of ``raw`` (C + F + L, B),
+    changed by ``mean`` (columns, B), with the environment's rules applied."""
     size, lanes = arrived.shape
     for c in range(size):
         for b in range(lanes):
@@ -248,8 +252,8 @@ def _arrive(numbers: Floats, places: Ints, head: Floats, raw: Floats, mean: Floa
 
 @inlined
 def _unwarp(warp: Floats, mean: Floats, spread: Floats) -> None:
-    """Convert mean and standard deviation (B,) of a reward's logarithm to those of the reward, in place, as ``Warp``
-    does."""
+    """Convert mean and standard deviation, (B,) each, of the logarithm of a reward to those of the reward, in place.
+    ``Warp`` does the same in torch."""
     for b in range(len(mean)):
         y, s = mean[b], spread[b]
         spread[b] = 0.5 * (math.exp(min(y + s, LARGEST)) - math.exp(min(y - s, LARGEST)))
@@ -305,19 +309,20 @@ def step(
     """Compute N steps, and write the results to the last five arrays.
 
     Args:
-        numbers, places: the tables.
+        numbers, places: tables of the model, see ``tables_of``.
         q: coordinates (N, C).
         u: actions (N, F).
-        noise: (N, M) latent standard deviations to add to the outputs, or (0, 0).
-        process: (N, M) standard deviations of the learned noise to add to the outputs, or (0, 0).
-        paths: (N, W) functions that the outputs follow, or (0, 0) for the mean.
-        known: (N, columns) mean of a prior to add to the outputs, or (0, 0).
+        noise: (N, M) numbers of standard deviations to add to the mean of each transition output, or (0, 0).
+        process: (N, M) standard normal numbers, by which the learned noise moves each transition output, or (0, 0) for
+            no noise.
+        paths: (N, W) weights of the sampled function that each row follows, or (0, 0) for the mean.
+        known: (N, columns) predictions of a prior model to add to the outputs, or (0, 0).
         stds, reward_std: whether standard deviations of transition outputs and of the reward are needed.
         q_next: next coordinates (N, C).
-        reward: (N,).
+        reward: (N,) rewards, without the terminal reward.
         std: (N, O) standard deviations, where needed.
-        terminated: (N,).
-        change: (N, columns) changes before any limit, or (0, 0) if they are not needed.
+        terminated: (N,) whether the declared termination holds.
+        change: (N, columns) predicted changes before limits are applied, or (0, 0) if they are not needed.
     """
     head, size, actions = matrix(numbers, places, HEAD), q.shape[1], u.shape[1]
     columns, leads = len(matrix(numbers, places, int(head[0, OUTPUTS]))), int(head[0, LEADS])
@@ -372,7 +377,8 @@ def step(
 
 
 NO_ROWS = np.zeros((0, 0))
-SPLIT = 4_000_000  # with more covariances in a call, which take some ms, the call uses several threads
+# A call that computes more covariances than this, which takes some milliseconds, uses several threads.
+SPLIT = 4_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -384,7 +390,7 @@ class StepsOfModel(ArraySteps):
     outputs: int
     has_regions: bool  # whether the model has a learned termination or learned jumps of the reward
     points: int  # number of points of all processes, mirror images included
-    prior: StepsOfModel | None  # steps of the prior, whose mean is added to the columns of ``uses``
+    prior: StepsOfModel | None  # steps of the prior model, whose mean is added to the columns that ``uses`` marks
     uses: Floats  # (columns,) 1 for a column to which the prior is added, 0 for the others
 
     @classmethod
@@ -392,9 +398,9 @@ class StepsOfModel(ArraySteps):
         """Compile a model.
 
         Args:
-            predictor: its outputs.
+            predictor: predictor of the model's outputs.
             ending: region in which episodes end, or None if termination is declared.
-            prior: compiled steps of its prior, or None.
+            prior: compiled steps of the model's prior, or None.
         """
         regions = ending is not None or bool(predictor.jumps)
         points = sum(group.serving.exponents.shape[1] for group in predictor._groups if group)
@@ -415,12 +421,13 @@ class StepsOfModel(ArraySteps):
         return self._steps(q, u, noise, process, paths, stds, reward_std, NO_ROWS)
 
     def _by_prior(self, prior: StepsOfModel, q: Floats, u: Floats) -> Floats:
-        """Return the prior's mean for those columns that use it, 0 in the others, at q (N, C) and u (N, F)."""
+        """Return the prior model's predictions at q (N, C) and u (N, F) for the columns to which they are added, 0 in
+        the others."""
         added = np.empty((len(q), len(self.uses)))
         added[:, -1] = prior._steps(q, u, None, None, None, False, False, added).reward
         return added * self.uses
 
-    def _steps(  # eight parameters, because numba takes them one by one
+    def _steps(  # many parameters, because the compiled function takes arrays one by one
         self,
         q: Floats,
         u: Floats,
@@ -431,8 +438,8 @@ class StepsOfModel(ArraySteps):
         reward_std: bool,
         change: Floats,
     ) -> ArrayTransition:
-        """Predict as ``__call__`` does, and write the changes before any limit to ``change`` (N, columns) if it has
-        rows."""
+        """Predict as ``__call__`` does. If ``change`` has rows, write the predicted changes before limits are applied
+        to it, (N, columns)."""
         count = len(q)
         moved = ArrayTransition(
             np.empty_like(q), np.empty(count), np.empty((count, self.outputs)), np.empty(count, dtype=np.bool_)
