@@ -35,36 +35,39 @@ GROUP = "surrogym.acquisitions"
 
 @dataclass(frozen=True)
 class CandidateView:
-    """Properties of m candidates that an acquisition may use, with respect to one output."""
+    """Properties of m candidates for queries from which an acquisition rates them, with respect to one output."""
 
     model: DynamicsModel
     points: Points  # m states and actions
     output: int  # index of the output, in the order of the definition
     tolerance: float  # tolerance of the output, in the output's unit
-    std: Tensor  # (m,) latent standard deviation, in the output's unit, as if all pending queries had been answered
+    # (m,) standard deviation without noise, in the output's unit, as if all pending queries had been answered.
+    std: Tensor
     distance: Tensor  # (m,) distance to the nearest query so far, in standard deviations of the sampling range
-    log_probability: Tensor  # (m,) logarithm of the input probability P_i (eq. 11); 0 without ``reads_probability``
+    # (m,) logarithm of the input probability P_i (eq. 11); 0 unless the acquisition sets ``reads_probability``.
+    log_probability: Tensor
     _reduction: Callable[[], Tensor]
 
     @cached_property
     def variance_reduction(self) -> Tensor:
         """How much an answer at each candidate would reduce the weighted variance over the reference points, (m,). Only
-        available if the acquisition has ``reads_reference``."""
+        acquisitions that set ``reads_reference`` may use it."""
         return self._reduction()
 
 
 @dataclass(frozen=True)
 class PathView:
-    """Properties of b predicted paths of T steps that an acquisition may use, with respect to one output."""
+    """Properties of b predicted paths of T steps from which an acquisition rates them, with respect to one output."""
 
     tolerance: float  # tolerance of the output, in the output's unit
-    weight: Tensor  # (b, T) at least 0; smaller where a step lies outside the ranges or is hard to predict
+    # (b, T) at least 0; weight of each step: 0 outside the sampling range, smaller where the path is uncertain.
+    weight: Tensor
     _std: Callable[[], Tensor]
     _information: Callable[[], Tensor]
 
     @cached_property
     def std(self) -> Tensor:
-        """Latent standard deviation at each step, in the output's unit, (b, T)."""
+        """Standard deviation without noise at each step, in the output's unit, (b, T)."""
         return self._std()
 
     @cached_property
@@ -74,15 +77,16 @@ class PathView:
 
 
 class Acquisition(ABC):
-    """Criterion that rates queries. Its laws are in this module's docstring."""
+    """Criterion that rates queries by their expected use. The docstring of this module says what every criterion has to
+    obey."""
 
     adaptive: ClassVar[bool] = True  # if False, the whole budget is queried before the first fit
     reads_reference: ClassVar[bool] = False  # whether the acquisition uses ``variance_reduction``
     reads_probability: ClassVar[bool] = False  # whether the acquisition uses ``log_probability``
 
     def check(self, definition: EnvironmentDefinition) -> None:  # noqa: B027  most take every environment
-        """Check that the settings fit the environment. Called once, when a surrogate is registered, before any real
-        step.
+        """Check that the criterion's settings fit the environment. It is called once, when a surrogate is registered,
+        before any real step.
 
         Raises:
             ValueError: the settings don't fit; the message says what was expected and what came.
@@ -90,19 +94,23 @@ class Acquisition(ABC):
 
     @abstractmethod
     def value(self, candidates: CandidateView) -> Tensor:
-        """Return the value of a query at each of m candidates, (m,)."""
+        """Return the value of a query at each of m candidates, (m,). The candidate with the largest value is
+        queried."""
 
     def path_value(self, paths: PathView) -> Tensor:
-        """Return the value of following each path up to each step, (b, T). It does not decrease along a path.
+        """Return the value of each path if it is followed up to each of its steps, (b, T). The value does not decrease
+        along a path.
 
-        By default it is the information of the steps, each given the earlier ones, for any criterion for candidates.
+        By default it is the information about the output that the steps give, where each step counts with what it adds
+        to the earlier ones.
         """
         return paths.information
 
 
 @dataclass(frozen=True)
 class IntegratedVariance(Acquisition):
-    """Criterion: how much an answer would reduce the variance over the sampling range and the visited states.
+    """Criterion: by how much an answer to the query would reduce the variance at reference points, which are spread
+    over the sampling range and the states that policies visited.
 
     Reference: D. Cohn (1993), NIPS 6.
     """
@@ -115,7 +123,7 @@ class IntegratedVariance(Acquisition):
 
 @dataclass(frozen=True)
 class Variance(Acquisition):
-    """Criterion: the latent standard deviation at the candidate."""
+    """Criterion: the standard deviation (without noise) of the output at the candidate."""
 
     def value(self, candidates: CandidateView) -> Tensor:
         return candidates.std
@@ -140,8 +148,8 @@ class UncertaintyIndex(Acquisition):
 
 @dataclass(frozen=True)
 class LatinHypercube(Acquisition):
-    """Criterion of a design that is not adaptive: one Latin hypercube of the whole budget. Later queries fill the
-    largest gaps."""
+    """Criterion of a design that is not adaptive: the whole budget is one Latin hypercube. Queries after that are as
+    far as possible from all earlier ones."""
 
     adaptive: ClassVar[bool] = False
 
@@ -163,7 +171,8 @@ ACQUISITIONS: Registry[Acquisition] = Registry(
 
 
 def acquisition_of(choice: Choice) -> Acquisition:
-    """Return the acquisition with a name and settings. Raises ``InvalidSpec`` if there is none."""
+    """Return the acquisition that has the name and the settings of ``choice``. Raises ``InvalidSpec`` for an unknown
+    name or setting."""
     return ACQUISITIONS.make(choice)
 
 
@@ -183,8 +192,8 @@ def value_of(choice: Choice, candidates: CandidateView) -> Tensor:
 
 
 def path_value_of(choice: Choice, paths: PathView) -> Tensor:
-    """Return the acquisition's value of the first t steps of each path, for each t, (b, T). Raises ``ChoiceFailed`` if
-    the acquisition fails or the values are not finite numbers of this shape."""
+    """Return the acquisition's value of each of b paths if it is followed up to each of its T steps, (b, T). Raises
+    ``ChoiceFailed`` if the acquisition fails or the values are not finite numbers of this shape."""
     return _criterion_values(choice, acquisition_of(choice).path_value, paths, paths.weight.shape)
 
 

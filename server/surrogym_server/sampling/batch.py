@@ -16,7 +16,7 @@ from surrogym_server.sampling.acquisition import CandidateView, acquisition_of, 
 from surrogym_server.sampling.candidates import Candidates
 from surrogym_server.sampling.outlook import outlook_of
 
-NEAR = 0.02  # queries closer than this, in standard deviations of the sampling range, are near-duplicates
+NEAR = 0.02  # queries closer than this, in standard deviations of the sampling range, count as duplicates
 
 
 def choose(
@@ -27,18 +27,20 @@ def choose(
     outputs: Sequence[int],
     tolerances: Sequence[float],
 ) -> list[int]:
-    """Choose queries greedily: for each of the ``outputs`` the best candidate, as if the earlier choices were answered.
+    """Choose queries one after the other: for each of the ``outputs`` the candidate with the largest value of the
+    acquisition, as if the queries chosen before were answered.
 
     Args:
         model: the model whose standard deviations the batch should lower.
         candidates: points to choose from. If some are reserved, the first query is one of them.
         earlier: all queries so far, answered or not; no query close to one of them is chosen.
-        unanswered: queries without an answer yet, which are treated as answered.
+        unanswered: queries without an answer yet; standard deviations are computed as if they were answered.
         outputs: for each query to choose, the index of the output that it should improve.
         tolerances: (O,) tolerance of each output, in its unit.
 
     Returns:
-        Indices of candidates; fewer than ``outputs`` if no distinct candidate is left.
+        Indices of the chosen candidates. There are fewer of them than ``outputs`` if every other candidate is close to
+        a query.
     """
     definition, points = model.definition, candidates.points
     acquisition = definition.design.acquisition
@@ -80,7 +82,7 @@ def candidate_view(
 
     Args:
         model: the model of the round.
-        candidates: m points.
+        candidates: the m candidates.
         column: index of the output, which must vary in the samples.
         outlook: predicted effect of answers on the variance of this output.
         tolerance: tolerance of this output, in its unit.

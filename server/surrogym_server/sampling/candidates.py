@@ -17,12 +17,14 @@ from surrogym_server.sampling.occupancy import log_occupancy
 
 MAX_CANDIDATES = 4_096  # greatest number of candidates of each kind, which bounds the memory for covariances
 REFERENCE = 256  # number of reference points of each kind: from the Monte Carlo set, and from visited states
-OCCUPIED = 0.75  # weight of the visited states among the reference points; points of the whole range have the rest
+# Share of the reference points' total weight that visited states have; points of the whole range have the rest.
+OCCUPIED = 0.75
 
 
 @dataclass(frozen=True)
 class Candidates:
-    """Candidate points, their input probabilities, and the reference points whose variance should become small."""
+    """Candidate points (states and actions) for queries, their input probabilities, and the reference points at which
+    queries should reduce the variance."""
 
     points: Points  # m candidates
     log_p: Tensor  # (m,) logarithm of the input probability P_i (eq. 11); 0 if the acquisition does not use it
@@ -32,12 +34,12 @@ class Candidates:
 
 
 def candidates_of(model: DynamicsModel, points: Points, states: Tensor | None, rng: np.random.Generator) -> Candidates:
-    """Build candidates from the Monte Carlo set, m ``points``, and from visited states (v, C) under random actions.
+    """Build candidates from the Monte Carlo set, m ``points`` spread over the sampling range, and from states (v, C)
+    that policies visited, with random actions.
 
-    Few points of a set over the whole range lie where a policy goes, so visited states are added. The reference points
-    are those of the Monte Carlo set, mixed with visited states if there are any. Visited states outside the sampling
-    range, or within the margin of a limit, are left out: with a wrong model a policy can reach states to which the real
-    system must not be set.
+    Visited states are added because few points of the Monte Carlo set lie where a policy goes. The reference points are
+    chosen from both in the same way. Visited states outside the sampling range or within the margin of a limit are left
+    out: if the model is wrong, a policy can reach states to which the real system must not be set.
     """
     definition = model.definition
     states = None if states is None else states[definition.in_range(states) & ~definition.falls_back(states, states)]
@@ -56,7 +58,8 @@ def candidates_of(model: DynamicsModel, points: Points, states: Tensor | None, r
 
 
 def with_reserved(candidates: Candidates, points: Points) -> Candidates:
-    """Add k points to the candidates, each with the largest probability of all, and reserve only these."""
+    """Add k points to the candidates and reserve only these for the next query. Their input probability is the largest
+    of all candidates."""
     log_p = torch.cat([candidates.log_p, candidates.log_p.max().expand(len(points))])
     points_of_all = Points.joined([candidates.points, points])
     reserved = torch.arange(len(points_of_all)) >= len(candidates.points)
@@ -66,8 +69,8 @@ def with_reserved(candidates: Candidates, points: Points) -> Candidates:
 def input_probability(model: DynamicsModel, points: Points, states: Tensor | None) -> Tensor:
     """Return the logarithm of the input probability P_i (eq. 11) at m points, (m,), given visited states (v, C).
 
-    Without visited states it is 0, or the density of the model's predicted next states if the definition's
-    ``input_probability`` is "predicted".
+    It follows from the density of the visited states. Without visited states it is 0, or, if the definition's
+    ``input_probability`` is "predicted", it follows from the density of the model's predicted next states.
     """
     definition = model.definition
     if states is not None and len(states):

@@ -24,23 +24,28 @@ SUREST = 1e9  # upper limit of the ratio of tolerance to standard deviation
 
 @dataclass(frozen=True)
 class OutputConfidence:
-    """How well a model knows one output, and what limits its knowledge."""
+    """Measures of how well a model knows one output, and of what limits its knowledge, such as noise."""
 
     confidence_index: float  # mean certainty over the Monte Carlo set (eq. 8)
     confidence_index_paper: float  # the paper's index, with a tolerance of 1 in the output's unit
     coverage: float  # share of the Monte Carlo set where the standard deviation is below the tolerance
-    leave_one_out_error: float | None  # root mean square error, in the output's unit; None if the model has none
+    # Root mean square error, in the output's unit; None if the model family does not compute leave-one-out errors.
+    leave_one_out_error: float | None
     leave_one_out_within_one: float | None  # share of the samples within one predictive standard deviation
     leave_one_out_within_two: float | None  # share of the samples within two predictive standard deviations
-    noise: float = 0.0  # standard deviation of a single step's noise that real steps confirm, in the output's unit
-    sensor_noise: float = 0.0  # standard deviation of one measurement, if most of the noise is the sensor's
-    past: float = 0.0  # share of the squared errors that earlier steps explain, as with a dead time or hidden state
-    region: Region | None = None  # part of the sampling range with most of the model uncertainty
+    # Standard deviation of a single step's noise, confirmed by repeated or consecutive steps, in the output's unit.
+    noise: float = 0.0
+    # Standard deviation of one measurement by the sensor; 0 unless most of the noise comes from the sensor.
+    sensor_noise: float = 0.0
+    # Share of the squared errors that earlier steps explain, for example because of a dead time or a hidden state.
+    past: float = 0.0
+    region: Region | None = None  # part of the sampling range in which most of the model uncertainty lies
     prequential: PrequentialScores | None = None  # scores of predictions of samples before the model learned from them
 
 
 def stds(model: DynamicsModel, q: Tensor, u: Tensor) -> Tensor:
-    """Return the latent standard deviation of every output, the reward last, at q (m, C) and u (m, F): (m, O)."""
+    """Return the standard deviation, without noise, of every output at q (m, C) and u (m, F), the reward last:
+    (m, O)."""
     transition = model.transition(q, u, stds=True, reward_std=True)
     require_shapes(model, transition, q, stds=True)
     assert transition.std is not None
@@ -49,14 +54,15 @@ def stds(model: DynamicsModel, q: Tensor, u: Tensor) -> Tensor:
 
 
 def certainty(std: Tensor, tolerance: Tensor | float) -> Tensor:
-    """Return the certainty C_m = Phi(tau / sigma) (eq. 9) for standard deviations sigma; 1 if sigma is 0."""
+    """Return the certainty C_m = Phi(tau / sigma) (eq. 9) for standard deviations sigma = ``std`` and tolerances tau; 1
+    if sigma is 0."""
     index: Tensor = torch.special.ndtr(tolerance / std)
     return index
 
 
 def log_model_uncertainty(std: Tensor, tolerance: Tensor | float) -> Tensor:
-    """Return log U_m = log Phi(-tau / sigma), the logarithm of the model uncertainty (eq. 10); finite also if sigma is
-    0."""
+    """Return the logarithm of the model uncertainty (eq. 10), log U_m = log Phi(-tau / sigma), for standard deviations
+    sigma = ``std`` and tolerances tau. It is finite also if sigma is 0."""
     log_uncertainty: Tensor = torch.special.log_ndtr(-(tolerance / std).clamp_max(SUREST))
     return log_uncertainty
 

@@ -13,12 +13,14 @@ Bools = NDArray[np.bool_]
 
 
 def covered(definition: EnvironmentDefinition, q: Array, u: Array, logged_q: Array, logged_u: Array) -> Bools:
-    """Return which of m queries a log makes unnecessary, (m,) bool.
+    """Return which of m planned queries are unnecessary because recorded steps of a log lie close enough, (m,) bool.
 
-    These are the queries to which a logged step is nearer than half the distance to the nearest other query.
+    A query is unnecessary if the distance to the nearest logged step is less than half the distance to the nearest
+    other query.
 
-    Distances are measured over states and actions, in widths of the sampling range, angles around the circle. Two
-    discrete actions are 1 apart. A single query counts as covered by any log.
+    Distances combine the differences of all coordinates and actions, in widths of the sampling range; those of angles
+    are measured around the circle. Two different discrete actions have the distance 1. If there is only one query, any
+    log makes it unnecessary.
 
     Args:
         definition: the environment.
@@ -36,7 +38,8 @@ def covered(definition: EnvironmentDefinition, q: Array, u: Array, logged_q: Arr
 
 
 def _places(definition: EnvironmentDefinition, q: Array, u: Array) -> Array:
-    """Map n states and actions to points (n, D) whose Euclidean distances are those that ``covered`` describes."""
+    """Map n states and actions to points (n, D) whose Euclidean distances are the distances that the docstring of
+    ``covered`` describes."""
     columns: list[Array] = []
     for index, coordinate in enumerate(definition.coordinates):
         if coordinate.kind == "angle":

@@ -42,17 +42,19 @@ from surrogym_server.sampling.tolerances import frozen_tolerances
 from surrogym_shared.nouns import Query
 from surrogym_shared.states import Verdict
 
-FEW_POINTS = 500  # with more points only one Latin hypercube is drawn, because comparing pairs takes much memory
+# With more points only one Latin hypercube is drawn, because comparing the distances of all pairs takes much memory.
+FEW_POINTS = 500
 
 
 @dataclass(frozen=True)
 class Decision:
-    """Result of a round: a model, its judgement, and the next queries. O outputs."""
+    """Result of one round of the design: the model that was learned, how well it knows its O outputs, the verdict, and
+    the next queries."""
 
     model: DynamicsModel
     confidences: tuple[OutputConfidence, ...]  # (O,) confidence of each output
     tolerances: tuple[float, ...]  # (O,) tolerances of the confidences: declared or default, widened by confirmed noise
-    state: DesignState  # what the next round needs
+    state: DesignState  # state to pass to the next round
     verdict: Verdict
     queries: tuple[Query, ...]  # queries of the next round
 
@@ -74,16 +76,17 @@ def initial_queries(definition: EnvironmentDefinition, budget: int) -> tuple[Que
 
 
 def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignState, request: Request) -> Decision:
-    """Do one round of Algorithm 1, lines 3 to 6, 8 to 10 and 12 to 14; the module's docstring has the other lines.
+    """Do one round of Algorithm 1 of the paper: lines 3 to 6, 8 to 10 and 12 to 14. The module's docstring says where
+    the other lines are.
 
-    The paper fits again after every real step (line 12). Here the queries of a round are chosen together, each as if
-    those before it were answered, and the next round fits once they all are.
+    The paper fits models again after every real step (line 12). Here a round chooses several queries, each as if those
+    chosen before it were answered. The next round fits when all of them have answers.
 
     Args:
         definition: the environment, with the settings of its design.
         samples: results of all real steps so far.
-        state: result of the round before; ``DesignState()`` before the first round.
-        request: budget and target of the design, and its queries without an answer.
+        state: state that the previous round returned; ``DesignState()`` before the first round.
+        request: budget and target of the design, and those of its queries that have no answer.
 
     Raises:
         InvalidInput: too few samples to learn from.
@@ -135,8 +138,9 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
     if continues:
         verdict = _verdict_with(queries, round)
 
-    # Store what the next round needs; the caller of ``advance`` adds the predictions of the new samples. A design with
-    # extra queries has not ended, whatever its verdict. A design that has ended continues if the conditions change.
+    # Store the state that the next round needs; the caller of ``advance`` adds the predictions of the new samples. A
+    # design with extra queries has not ended, whatever its verdict. A design that has ended continues if the conditions
+    # change.
     ended = verdict != "continue" and not queries
     following = DesignState(
         round=state.round + 1,
@@ -151,9 +155,11 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
 
 
 def _verdict_with(queries: tuple[Query, ...], round: Round) -> Verdict:
-    """Return the verdict on a design that would continue: it ends if no query was chosen and none is open.
+    """Return the verdict on a design that may continue: "continue" if a query was chosen or an earlier one may still be
+    answered. Otherwise the design ends.
 
-    Then no distinct query is left, or the budget has no real steps left for one.
+    Without a query, either every candidate is close to an earlier query, or the rest of the budget is too small for
+    one.
     """
     if queries or round.request.open:
         return "continue"
@@ -161,7 +167,9 @@ def _verdict_with(queries: tuple[Query, ...], round: Round) -> Verdict:
 
 
 def _lacks_excursion(definition: EnvironmentDefinition, samples: Samples, state: DesignState) -> bool:
-    """Return whether a ready design has snapshots, and no sample has come since its last excursion was planned."""
+    """Return whether a ready design still has to be tested by an excursion. It has to if the stopping rule is
+    ``tested_confidence``, if the environment has snapshots, and if no excursion was planned yet or no sample has come
+    since the last one was planned."""
     if not definition.snapshots or definition.design.stopping != "tested_confidence":
         return False
     return not state.tested_at or len(samples) <= state.tested_at

@@ -13,17 +13,22 @@ from surrogym_server.environment.samples import Samples
 from surrogym_server.models.abilities import RewardEdges, offers
 from surrogym_server.models.port import DynamicsModel
 
-FRONTIER = 0.1  # states closer than this to the range of earlier states, in widths of it, are not worth a query
-DOUBT = 0.005  # acceptable mean probability, over the candidates, that the model is wrong about a termination
+# States whose distance from the range of earlier states, in widths of this range, is below this need no query.
+FRONTIER = 0.1
+# Acceptable probability, as a mean over the candidates, that the model is wrong about a termination or a jump of the
+# reward.
+DOUBT = 0.005
 
 
 def ending(model: DynamicsModel, samples: Samples, points: Points) -> Tensor | None:
-    """Return which of m candidates are reserved for a query about the end of episodes, (m,) bool; None if none is.
+    """Return which of m candidates are reserved for the next query, because it should clarify where episodes end or
+    where the reward jumps, (m,) bool; None if this is clear.
 
-    With a declared termination: the points predicted to end an episode, until a sample has ended one; then those at
-    which the side of a jump of the reward is doubtful. With a learned termination: the points at which it is most
-    doubtful, until little doubt is left; then those with a doubtful jump; then those farthest beyond the states known
-    to be non-terminal, where another termination may lie.
+    The first of these groups that is not empty is reserved. With a declared termination: the points at which the model
+    predicts an end, as long as no sample has ended an episode; then the points at which a jump of the reward is
+    doubtful. With a learned termination: the points at which it is most doubtful whether the episode ends; then the
+    points at which a jump of the reward is doubtful; then those that lie farthest outside the range of known
+    non-terminal states, where an unknown termination may lie.
     """
     q_next = model.transition(points.q, points.u).q_next
     if not model.definition.learns_termination:
@@ -39,15 +44,16 @@ def ending(model: DynamicsModel, samples: Samples, points: Points) -> Tensor | N
 
 
 def in_doubt(model: DynamicsModel, q_next: Tensor) -> Tensor:
-    """Return the probability that the model is wrong about a termination at q_next (m, C), (m,); 0 if it is
-    declared."""
+    """Return the probability that the model is wrong about whether an episode ends at q_next (m, C), (m,); 0 if
+    termination is declared."""
     probability = model.termination_probability(q_next)
     return probability.minimum(1 - probability)
 
 
 def edge_in_doubt(model: DynamicsModel, q: Tensor, q_next: Tensor) -> Tensor:
-    """Return the probability that the model is wrong about the side of an edge of the reward, (m,), for steps from
-    q (m, C) to q_next (m, C). Of several edges, the largest probability counts."""
+    """Return the probability, for steps from q (m, C) to q_next (m, C), that the model is wrong about whether the step
+    lies inside a region at whose edge the reward jumps, (m,). If there are several regions, it is the largest
+    probability."""
     doubt = q.new_zeros(len(q))
     for of_one in _edge_doubts(model, q, q_next):
         doubt = doubt.maximum(of_one)
@@ -55,8 +61,8 @@ def edge_in_doubt(model: DynamicsModel, q: Tensor, q_next: Tensor) -> Tensor:
 
 
 def _edges(model: DynamicsModel, points: Points, q_next: Tensor) -> Tensor | None:
-    """Return at which candidates it is most doubtful on which side of a reward edge a step ends, (m,) bool; None if no
-    edge is in doubt."""
+    """Return the candidates at which it is most doubtful whether the step lies inside a region at whose edge the reward
+    jumps, (m,) bool. The first region with doubt counts; None if there is none."""
     for doubt in _edge_doubts(model, points.q, q_next):
         if float(doubt.mean()) > DOUBT:
             return doubt >= 0.5 * doubt.max()
@@ -64,7 +70,8 @@ def _edges(model: DynamicsModel, points: Points, q_next: Tensor) -> Tensor | Non
 
 
 def _edge_doubts(model: DynamicsModel, q: Tensor, q_next: Tensor) -> Iterator[Tensor]:
-    """Return an iterator over the edges of the reward: the probability (m,) that the model is wrong about the side."""
+    """Return an iterator that yields, for each region at whose edge the reward jumps, the probability (m,) that the
+    model is wrong about whether the step from q (m, C) to q_next (m, C) lies inside."""
     edged = offers(model, RewardEdges)
     return iter(()) if edged is None else edged.reward_edge_doubts(q, q_next)
 
@@ -75,11 +82,11 @@ def _predicted(model: DynamicsModel, points: Points, q_next: Tensor) -> Tensor |
 
 
 def unexplored(definition: EnvironmentDefinition, states: Tensor, q: Tensor) -> Tensor:
-    """Return how far states q (m, C) lie outside of the range of earlier states (n, C), where an unknown termination
-    may lie: (m,).
+    """Return how far states q (m, C) lie outside the range of earlier ``states`` (n, C), (m,). An unknown termination
+    may lie there.
 
-    The result is the sum over both ends of every moving coordinate, in widths of that range; 1 if there are no earlier
-    states.
+    Each moving coordinate contributes its distance from its range over the earlier states, in widths of this range and
+    at most 1. The result is the sum; it is 1 if there are no earlier states.
     """
     columns = list(definition.moving)
     if not len(states):

@@ -21,16 +21,18 @@ from surrogym_server.models.port import DynamicsModel
 from surrogym_server.sampling.rollouts import Sequences, best_rollout, predict_paths
 from surrogym_shared.nouns import Query, Vector
 
-FAR = 0.5  # least distance from an excursion's end to all samples, in standard deviations of the sampling range
+# Distance that the end of an excursion should have from all samples, in standard deviations of the sampling range.
+FAR = 0.5
 LONGEST = 16  # greatest number of actions of an excursion
 
 
 def excursion(
     model: DynamicsModel, samples: Tensor, snapshots: Mapping[str, Vector], longest: int, rng: np.random.Generator
 ) -> Query:
-    """Plan the shortest sequence whose predicted state gets at least the distance ``FAR`` away from all samples.
+    """Plan an excursion: the shortest sequence of actions after which the predicted state is at least the distance
+    ``FAR`` away from the states of all samples.
 
-    If no sequence gets so far, plan the one that leads farthest.
+    If no sequence leads so far, plan the one that leads farthest.
 
     Args:
         model: the model.
@@ -46,16 +48,17 @@ def excursion(
 def _reach(model: DynamicsModel, samples: Tensor, starts: Tensor, sequences: Sequences) -> tuple[Tensor, Tensor]:
     """Rate sequences of actions by how far they lead away from the samples.
 
-    A sequence that gets ``FAR`` away is rated above all that don't, and above longer ones.
+    A sequence that reaches the distance ``FAR`` has a higher value than any that does not, and a higher value than one
+    that takes more actions to reach it.
 
     Args:
         model: the model.
         samples: states (n, C) of all samples.
-        starts: equally likely first states of each of k sequences, (k, s, C).
+        starts: s equally likely first states for each of k sequences, (k, s, C).
         sequences: actions (k, T, F).
 
     Returns:
-        Value (k,) and best length (k,) of each sequence.
+        Value of each sequence (k,), and the number of its first actions that give this value (k,).
     """
     count, lanes = starts.shape[:2]
     paths = predict_paths(model, starts.flatten(0, 1), torch.from_numpy(sequences).repeat_interleave(lanes, 0))

@@ -30,11 +30,13 @@ from surrogym_shared.states import Verdict
 
 @dataclass(frozen=True)
 class Judgement:
-    """Judgement of a model: confidences, tolerances, verdict, and candidates for the next queries."""
+    """Judgement of a model: how well it knows each output, the verdict that follows, and the candidates for the next
+    queries."""
 
     confidences: tuple[OutputConfidence, ...]  # (O,) confidence of each output
-    widened_tolerances: tuple[float, ...]  # (O,) tolerances of the confidences, widened by confirmed noise
-    verdict: Verdict  # verdict on this model alone, whatever the verdicts of earlier rounds
+    # (O,) tolerances with which the confidences were computed, which include confirmed noise.
+    widened_tolerances: tuple[float, ...]
+    verdict: Verdict  # verdict that follows from this model alone, without regard to earlier rounds
     candidates: Candidates  # points from which the next queries are chosen
 
 
@@ -49,7 +51,7 @@ def judge_model(
 
     Args:
         model: the model of this round.
-        samples: the samples that it has learned from.
+        samples: the samples that the model has learned from.
         tolerances: tolerance of each output (O,), in its unit.
         request: budget and target of the design.
         state: result of the previous round.
@@ -63,7 +65,8 @@ def judge_model(
         sensors = tuple(None if any(past) else one for one in sensor_noise(model, samples, tolerances))
         of_sensors = noise_of_sensors(model, samples, sensors, tolerances)
         noise = established_noise(model, samples, tolerances).maximum(of_sensors)
-        if any(past):  # a hidden state may influence every output, so no noise is confirmed
+        # A hidden state may influence every output, so differences between repeated steps are no evidence of noise.
+        if any(past):
             noise = torch.zeros_like(noise)
     widened = widened_by(noise, tolerances)
     points = Points(*monte_carlo(definition))
@@ -92,14 +95,15 @@ def judge_model(
         settled = False
         if (
             candidates.reserved is None or state.round % 2
-        ):  # if there are both, endings and peaks are queried in alternate rounds
+        ):  # if both endings and peaks need queries, they get them in alternate rounds
             candidates = with_reserved(candidates, peak)
     verdict = judge(definition, confidences, widened, len(samples), request, settled)
     return Judgement(confidences, widened, verdict, candidates)
 
 
 def monte_carlo(definition: EnvironmentDefinition) -> tuple[Tensor, Tensor]:
-    """Draw the Monte Carlo set of eq. 8, the same in every round: coordinates (m, C) and actions (m, F)."""
+    """Draw the Monte Carlo set of eq. 8: random points over which the confidence index is averaged. It is the same in
+    every round. Return coordinates (m, C) and actions (m, F)."""
     rng = generator_for(definition, "monte carlo")
     return going_on(definition, *random_points(definition, definition.design.monte_carlo, rng), rng)
 
@@ -114,9 +118,10 @@ def judge(
 ) -> Verdict:
     """Decide whether the design continues, is ready, or has spent its budget.
 
-    Under ``tested_confidence`` a design is ready only if its confidence index has reached the target, its leave-one-out
-    errors are known and within the tolerances, the end of episodes is known, and enough adaptive queries were answered:
-    half as many as initial ones. Logged samples count as initial ones, because nobody chose them to disprove the model.
+    A design is ready if the confidence index of every output has reached the target. With the stopping rule
+    ``tested_confidence`` three more conditions hold: leave-one-out errors are known and within the tolerances; ends of
+    episodes and peaks of the reward are known; and at least half as many adaptive queries as initial ones were
+    answered. Logged samples count as initial ones, because they were not chosen to disprove the model.
 
     Args:
         definition: the environment, with the settings of its design.
@@ -140,31 +145,34 @@ def judge(
 
 
 def agrees(confidence: OutputConfidence, tolerance: float) -> bool:
-    """Return whether the leave-one-out error of an output is known and within the tolerance."""
+    """Return whether the leave-one-out error of an output is known and within the tolerance. If the output has
+    confirmed noise, the error may be slightly larger."""
     limit = SLACK * tolerance if confidence.noise else tolerance
     return confidence.leave_one_out_error is not None and confidence.leave_one_out_error <= limit
 
 
 def below_target(confidences: Sequence[OutputConfidence], target: float) -> list[int]:
-    """Return the indices of the outputs below the target, the least confident first; if there is none, the index of the
-    least confident output."""
+    """Return the indices of the outputs whose confidence index is below the target, the lowest first. If there is none,
+    return only the index of the output with the lowest confidence index."""
     index = [confidence.confidence_index for confidence in confidences]
     order = sorted(range(len(index)), key=index.__getitem__)
     return [i for i in order if index[i] < target] or order[:1]
 
 
 def verdict_with_history(judgement: Judgement, state: DesignState, request: Request, conditions: Conditions) -> Verdict:
-    """Correct the verdict on a model by how the design ended before, if it did.
+    """Return the verdict on a design, given the verdict on its present model and how the design ended in an earlier
+    round, if it did.
 
-    A design that was ready stays ready, unless a person has asked for more or later steps contradict the model: a fit
-    to more steps may lower the confidence index a little although the model had predicted all of them. Audits and
-    logs are no reason for an ended design to take further real steps.
+    A design that was ready stays ready, unless a person has asked for more or later steps contradict the model. Without
+    this rule, a fit to more steps could lower the confidence index a little, although the model had predicted these
+    steps well. A design that has ended does not continue only because audits or logs have added samples.
 
     Args:
         judgement: judgement of the present model.
         state: result of the previous round.
         request: budget and target of the design.
-        conditions: conditions of the present round; compared with those under which the design ended.
+        conditions: conditions of the present round (such as budget and target). The design may continue if they differ
+            from those under which it ended.
     """
     if judgement.verdict in ("ready", "from_log"):
         return judgement.verdict
@@ -187,7 +195,8 @@ def _asks_more(now: Conditions, before: Conditions | None) -> bool:
 def _contradicted(judgement: Judgement, request: Request) -> bool:
     """Return whether the recent prediction errors of an output exceed its tolerance.
 
-    They are the errors of predictions of the latest steps, or the leave-one-out errors if there are no such steps.
+    These are the errors with which the previous model predicted the newest samples. If there are no new samples,
+    leave-one-out errors are used.
     """
     surprises = request.surprises
     for i, (confidence, tolerance) in enumerate(zip(judgement.confidences, judgement.widened_tolerances, strict=True)):

@@ -11,7 +11,7 @@ from torch import Tensor
 from surrogym_server.environment.definition import EnvironmentDefinition
 
 Array = NDArray[np.float64]
-REDRAWS = 100  # greatest number of times that points in terminated states are drawn again
+REDRAWS = 100  # greatest number of times that unsuitable points are drawn again
 
 
 def latin_hypercube(
@@ -19,9 +19,9 @@ def latin_hypercube(
 ) -> tuple[Tensor, Tensor]:
     """Draw a Latin hypercube of ``count`` points: coordinates (count, C) and actions (count, F).
 
-    Each coordinate is stratified in probability, so truncated distributions keep their shape. Discrete actions are
-    balanced: the counts of two of them differ by at most one. Of ``tries`` random hypercubes, the one whose closest
-    pair of points is farthest apart is returned.
+    Each coordinate has one point in each of ``count`` intervals of equal probability, so the points follow the sampling
+    distributions. Discrete actions are balanced: the numbers of points with two different actions differ by at most
+    one. Of ``tries`` random hypercubes, the one whose closest two points are farthest apart is returned.
     """
     dimensions = len(definition.coordinates) + definition.action.size
     designs = [_unit_hypercube(count, dimensions, rng, definition.action.nvec) for _ in range(tries)]
@@ -38,11 +38,11 @@ def random_points(definition: EnvironmentDefinition, count: int, rng: np.random.
 def going_on(
     definition: EnvironmentDefinition, q: Tensor, u: Tensor, rng: np.random.Generator
 ) -> tuple[Tensor, Tensor]:
-    """Replace those of the points q (n, C), u (n, F) at which the declared termination holds, or that lie within the
-    margin of a limit, by random other points.
+    """Replace some of the points q (n, C), u (n, F) by other random points: those at which the declared termination
+    holds, and those within the margin of a limit.
 
-    No episode passes through a terminated state, so a query there would teach nothing, and the sampler refuses one
-    within a margin. If there is no other point in the whole range, the points stay.
+    A query in a terminated state would teach nothing, because no episode continues there. The sampler refuses queries
+    within the margin of a limit. If no other points are found, the points stay.
     """
     q, u = q.clone(), u.clone()
     for _ in range(REDRAWS):
@@ -66,8 +66,8 @@ def from_unit(definition: EnvironmentDefinition, p: Tensor) -> tuple[Tensor, Ten
 
 
 def _unit_hypercube(count: int, dimensions: int, rng: np.random.Generator, nvec: tuple[int, ...]) -> Array:
-    """Draw points (count, dimensions) in [0, 1), stratified in each column. The last columns are discrete actions with
-    ``nvec`` values each, in the middle of the share of their value."""
+    """Draw a Latin hypercube of points (count, dimensions) in [0, 1). The last columns are discrete actions: an action
+    with k values in ``nvec`` is represented by the middle of one of k equal parts of [0, 1)."""
     cells = np.stack([rng.permutation(count) for _ in range(dimensions)], 1)
     points = (cells + rng.random((count, dimensions))) / count
     for column, n in enumerate(nvec, start=dimensions - len(nvec)):

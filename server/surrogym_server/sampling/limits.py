@@ -11,12 +11,12 @@ from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.samples import Samples, limit_sides
 from surrogym_shared.kinds import Side
 
-MANY = 0.2  # least share of the samples for which a limit is reported
+MANY = 0.2  # a limit is reported if at least this share of the samples end at it
 
 
 @dataclass(frozen=True)
 class Limit:
-    """A declared limit of a coordinate at which samples end."""
+    """Declared limit of a coordinate at which many samples end."""
 
     coordinate: str
     side: Side

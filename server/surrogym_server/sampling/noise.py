@@ -22,27 +22,29 @@ from surrogym_server.environment.samples import Samples, increments, preceding, 
 from surrogym_server.models.abilities import LearnedNoise, LeaveOneOut, offers
 from surrogym_server.models.port import DynamicsModel
 
-ENOUGH = 3  # least degrees of freedom of the repeats with which noise can be confirmed
-STAGES = (1, ENOUGH, 6, 9)  # degrees of freedom at which repeats are tested, one after the other
+ENOUGH = 3  # least number of degrees of freedom of the repeats with which noise can be confirmed
+STAGES = (1, ENOUGH, 6, 9)  # numbers of degrees of freedom up to which steps are repeated before the next test
 LEVEL = 0.01  # significance level of each test
 NEGLIGIBLE = 0.5  # true noise below this share of the tolerance is confirmed with probability ``LEVEL`` at most
-AT_MOST = 3.0  # learned noise above this multiple of the repeats' noise is misfit of the model
-SLACK = 1.25  # a leave-one-out error up to this multiple of the noise may be chance, because samples are few
+# If learned noise is larger than the noise of repeats by more than this factor, it is misfit of the model.
+AT_MOST = 3.0
+SLACK = 1.25  # a leave-one-out error may exceed noise or tolerance by this factor by chance, because samples are few
 
 
 @dataclass(frozen=True)
 class Repeats:
-    """Pooled differences between results of the same step."""
+    """Differences between the results of steps that were taken several times (repeats), pooled over all such steps."""
 
-    degrees: int  # degrees of freedom: number of samples less number of distinct steps
-    std: Tensor  # (O,) standard deviation of one result, in each output's unit
+    degrees: int  # degrees of freedom: number of samples less the number of different steps
+    std: Tensor  # (O,) standard deviation of the result of one step, in each output's unit
 
 
 def repeats(model: DynamicsModel, samples: Samples) -> Repeats:
-    """Pool the differences between results of the same step.
+    """Compute the differences between the results of steps that were taken several times, pooled over all such steps.
 
-    Samples are of the same step if their states and actions are equal, and, in an environment that is reset, those of
-    the steps before too. Otherwise what the environment remembers of the step before would count as noise.
+    Samples are results of the same step if their states and actions are equal. In an environment that can't be set to
+    any state, the states and actions of the steps before must be equal too; otherwise the influence of hidden state
+    would count as noise.
     """
     targets = torch.cat([increments(model.definition, samples), samples.reward[:, None]], -1)
     groups, member = torch.unique(_conditions(model.definition, samples), dim=0, return_inverse=True)
@@ -54,11 +56,11 @@ def repeats(model: DynamicsModel, samples: Samples) -> Repeats:
 
 
 def _conditions(definition: EnvironmentDefinition, samples: Samples) -> Tensor:
-    """Return what may determine the result of each of n steps, (n, d): its state and action, and those of the step
-    before.
+    """Return the quantities that may determine the result of each of n steps, (n, d): its state and action, and those
+    of the step before.
 
-    The first step of an episode has zeros for the step before. An environment that can be set to any state does not
-    remember an earlier step, so there the state and action suffice.
+    The first step of an episode has zeros for the step before. If the environment can be set to any state, the step
+    before is left out, because such an environment does not remember it.
     """
     now = torch.cat([samples.q, samples.u], -1)
     if definition.max_rollout is None:
@@ -71,7 +73,7 @@ def _conditions(definition: EnvironmentDefinition, samples: Samples) -> Tensor:
 def established_noise(model: DynamicsModel, samples: Samples, tolerances: Sequence[float]) -> Tensor:
     """Return the standard deviation of each output's noise that repeated steps confirm, in the output's unit, (O,).
 
-    It is 0 if repeats confirm no noise, or if the noise is below the output's tolerance.
+    It is 0 if repeated steps confirm no noise, or if the noise is below the output's tolerance.
     """
     model_noise, limits = _model_noise(model, tolerances)
     differences = repeats(model, samples)
@@ -82,12 +84,14 @@ def established_noise(model: DynamicsModel, samples: Samples, tolerances: Sequen
 
 
 def to_repeat(model: DynamicsModel, samples: Samples, tolerances: Sequence[float]) -> Points | None:
-    """Return the steps to take again; None if none are needed.
+    """Return earlier steps (states and actions) that should be taken again to tell noise from misfit of the model; None
+    if none are needed.
 
-    Repeats are needed if noise above a tolerance would explain the samples and no repeat has confirmed or refuted it
-    yet. One repeat comes first, because it refutes the noise of a deterministic environment. Then follow as many as the
-    next of ``STAGES`` needs. An output whose confirmed noise does not explain its leave-one-out error is tested again,
-    because few repeats may show too little noise. Steps that ended at a bound are not repeated: the bound hides noise.
+    Repeats are needed if noise above a tolerance could explain the samples, and repeats have neither confirmed nor
+    refuted it yet. First one step is repeated, which suffices to refute noise if the environment is deterministic.
+    Further repeats follow in the ``STAGES``. An output is also tested again if its confirmed noise does not explain its
+    leave-one-out error, because few repeats may show too little noise. Steps that ended at a bound are not repeated,
+    because the bound hides noise.
     """
     model_noise, limits = _model_noise(model, tolerances)
     differences = repeats(model, samples)
@@ -109,14 +113,15 @@ def to_repeat(model: DynamicsModel, samples: Samples, tolerances: Sequence[float
 
 
 def _confirmed(differences: Repeats, limits: Tensor) -> Tensor:
-    """Return whether repeats show that each output's noise exceeds ``NEGLIGIBLE`` times its limit (O,): (O,) bool."""
+    """Return for each output whether repeats show that its noise exceeds ``NEGLIGIBLE`` times its tolerance in
+    ``limits`` (O,), (O,) bool."""
     bound = (NEGLIGIBLE * limits).square() * float(scipy.special.chdtri(differences.degrees, LEVEL))
     return differences.degrees * differences.std.square() > bound
 
 
 def _unexplained(model: DynamicsModel, limits: Tensor, noise: Tensor) -> Tensor:
-    """Return whether each leave-one-out error exceeds what tolerance (O,) and noise (O,) explain together, (O,)
-    bool."""
+    """Return for each output whether its leave-one-out error is larger than its tolerance in ``limits`` (O,) and its
+    ``noise`` (O,) explain together, (O,) bool."""
     able = offers(model, LeaveOneOut)
     if able is None:
         return torch.zeros_like(noise, dtype=torch.bool)
@@ -125,19 +130,21 @@ def _unexplained(model: DynamicsModel, limits: Tensor, noise: Tensor) -> Tensor:
 
 
 def _refuted(differences: Repeats, model_noise: Tensor) -> Tensor:
-    """Return whether repeats show that most of each output's learned noise (O,) is misfit of the model, (O,) bool."""
+    """Return for each output whether repeats show that most of the noise that the model learned, ``model_noise`` (O,),
+    is misfit of the model, (O,) bool."""
     bound = (model_noise / AT_MOST).square() * float(scipy.special.chdtri(differences.degrees, 1 - LEVEL))
     return differences.degrees * differences.std.square() <= bound
 
 
 def widened_by(noise: Tensor, tolerances: Sequence[float]) -> tuple[float, ...]:
-    """Widen the tolerances (O,) by the confirmed noise (O,), because a noisy output can't be known better than its
-    noise."""
+    """Return the tolerances (O,), increased by the confirmed noise (O,): sqrt(tolerance^2 + noise^2). The error of a
+    prediction of a noisy output can't be smaller than the noise."""
     return tuple(math.hypot(tolerance, float(one)) for tolerance, one in zip(tolerances, noise, strict=True))
 
 
 def _possible(model: DynamicsModel, limits: Tensor) -> Tensor:
-    """Return the largest noise (O,) that explains the samples as well as the noise that the model has learned."""
+    """Return the largest noise of each output, (O,), with which the samples are at least as likely as with the noise
+    that the model has learned."""
     able = offers(model, LearnedNoise)
     return torch.zeros_like(limits) if able is None else torch.tensor(able.possible_noise, dtype=limits.dtype)
 

@@ -19,9 +19,10 @@ BLOCK = 2**17  # number of kernel values computed at once, so that they stay in 
 
 
 def log_occupancy(definition: EnvironmentDefinition, states: Tensor, q: Tensor, floor: float = FLOOR) -> Tensor:
-    """Return log P_i at q (m, C): the logarithm of the density of visited states (v, C) over a uniform density, (m,).
+    """Return the logarithm of the input probability P_i at q (m, C), (m,): the density of the visited ``states`` (v,
+    C), relative to a uniform density over the sampling range.
 
-    ``floor`` is the share of the uniform density that is mixed in.
+    The density is a mixture of kernels around the visited states and a uniform density, whose share is ``floor``.
     """
     count, moving = len(states), len(definition.moving)
     bandwidth = count ** (-1 / (moving + 4))
@@ -36,8 +37,8 @@ def log_occupancy(definition: EnvironmentDefinition, states: Tensor, q: Tensor, 
 
 
 def _log_kernel(coordinate: CoordinateDefinition, at: Tensor, states: Tensor, bandwidth: float) -> Tensor:
-    """Return the log density of one coordinate at m points under a kernel at each of v states, less that of a uniform
-    density, (m, v)."""
+    """Return the log density, relative to a uniform density, of one coordinate at m points ``at`` under a kernel around
+    each of v ``states``, (m, v)."""
     difference = at[:, None] - states[None]
     if coordinate.kind == "angle":
         spread = _circular_std(states)

@@ -19,9 +19,10 @@ from surrogym_server.sampling.confidence import stds
 def outlook_of(
     model: DynamicsModel, candidates: Points, reference: Points, unanswered: Points
 ) -> tuple[OutputOutlook | None, ...]:
-    """Return the predicted effect of answers at m candidates on the variance at r reference points, for every output.
+    """Return, for every output, a forecast of how answers to queries at m candidates would change the variance at r
+    reference points.
 
-    Queries in ``unanswered`` are treated as answered.
+    The forecast is made as if the queries ``unanswered`` had been answered.
     """
     if (able := offers(model, Lookahead)) is not None:
         return able.outlook(candidates, reference, unanswered)
@@ -29,7 +30,8 @@ def outlook_of(
 
 
 def path_outlook(model: DynamicsModel, steps: PredictedSteps, column: int) -> PathOutlook | None:
-    """Return the predicted information of steps along b paths of T steps, for the output with index ``column``."""
+    """Return a forecast of the information that real steps along b predicted paths of T steps would give about the
+    output with index ``column``."""
     if (able := offers(model, Lookahead)) is not None:
         return able.along(steps, column)
     spread = stds(model, steps.flat.q, steps.flat.u)[:, column].reshape(steps.q.shape[:-1])
@@ -37,17 +39,19 @@ def path_outlook(model: DynamicsModel, steps: PredictedSteps, column: int) -> Pa
 
 
 def as_if_answered(model: DynamicsModel, steps: PredictedSteps) -> DynamicsModel:
-    """Condition the model on T predicted real steps. A model that can't be conditioned is returned unchanged."""
+    """Return the model as if T real steps had been taken with the predicted results. A model without the ability
+    ``Lookahead`` is returned unchanged."""
     able = offers(model, Lookahead)
     return model if able is None else able.as_if_answered(steps)
 
 
 @dataclass(frozen=True)
 class NearbyAnswers(OutputOutlook):
-    """Effect of further answers predicted from distances alone, for models that can't predict it themselves.
+    """Forecast of the effect of further answers on an output's standard deviations, computed from distances alone. It
+    is used for models that can't compute it themselves.
 
-    Two points at distance d, in standard deviations of the sampling range, have the correlation exp(-d^2 / 2). An
-    answer removes all variance at its point.
+    The outputs at two points at distance d, in standard deviations of the sampling range, are assumed to have the
+    correlation exp(-d^2 / 2). An answer removes all variance at the point of its query.
     """
 
     definition: EnvironmentDefinition
@@ -55,13 +59,14 @@ class NearbyAnswers(OutputOutlook):
     reference: Points  # r reference points
     own: Tensor  # (m,) variance at each candidate, as if all queries so far were answered
     there: Tensor  # (r,) variance at each reference point, as if all queries so far were answered
-    learns: Tensor  # (m,) bool: whether a model learns from a step at the candidate, because its lags are known
+    # (m,) bool: whether a model would learn from a step at the candidate; it does not if a lag (past value) is unknown.
+    learns: Tensor
 
     @classmethod
     def of(
         cls, model: DynamicsModel, candidates: Points, reference: Points, unanswered: Points
     ) -> tuple[NearbyAnswers, ...]:
-        """Build the outlook of every output (O,), with the ``unanswered`` queries treated as answered."""
+        """Build the forecast for every output (O,), as if the queries ``unanswered`` had been answered."""
         own, there = (stds(model, points.q, points.u).square() for points in (candidates, reference))
         definition, learns = model.definition, torch.ones(len(candidates), dtype=torch.bool)
         outputs = (
@@ -82,7 +87,7 @@ class NearbyAnswers(OutputOutlook):
         return self.answered(self.candidates[index : index + 1])
 
     def answered(self, query: Points) -> NearbyAnswers:
-        """Return the outlook after an answer to one more query."""
+        """Return the forecast as if one more query had been answered."""
         own, there = (
             _removed_share(self.definition, points, query)[:, 0] for points in (self.candidates, self.reference)
         )
@@ -91,13 +96,15 @@ class NearbyAnswers(OutputOutlook):
 
 @dataclass(frozen=True)
 class IndependentSteps(PathOutlook):
-    """Information along paths as if steps were independent: I(t) = 1/2 sum log(1 + (w sigma / tau)^2).
+    """Forecast of the information that steps along paths give, as if steps were independent: 1/2 sum log(1 + (w sigma /
+    tau)^2), with weights w, standard deviations sigma and tolerance tau.
 
-    For models that can't predict the effect of further steps themselves.
+    It is used for models that can't compute the effect of further steps themselves.
     """
 
-    spread: Tensor  # (b, T) latent standard deviation at each step, in the output's unit
-    learns: Tensor  # (b, T) bool: whether a model learns from the step, because its lags are known
+    spread: Tensor  # (b, T) standard deviation without noise at each step, in the output's unit
+    # (b, T) bool: whether a model would learn from the step; it does not if a lag (past value) is unknown.
+    learns: Tensor
 
     @property
     def std(self) -> Tensor:
@@ -108,5 +115,6 @@ class IndependentSteps(PathOutlook):
 
 
 def _removed_share(definition: EnvironmentDefinition, points: Points, queries: Points) -> Tensor:
-    """Return the share of the variance at m points that the answer to each of k queries removes, (m, k)."""
+    """Return the share of the variance at each of m points that the answer to each of k queries would remove, (m,
+    k)."""
     return (-distances(definition, points, queries).square()).exp()

@@ -26,18 +26,19 @@ from surrogym_server.environment.samples import Samples, increments, preceding
 from surrogym_server.models.abilities import AtSamples, LeaveOneOut, SampledFunctions, offers
 from surrogym_server.models.port import DynamicsModel
 
-EXPLAINED = 0.5  # least explained share of the squared error that counts as the influence of the past
+EXPLAINED = 0.5  # least share of the squared error that must be explained by earlier steps to count as their influence
 PAIRS = 3  # least number of pairs of consecutive steps for each coefficient of a regression
-DEPTHS = (1, 3)  # numbers of earlier actions to try; a longer dead time is not found
+DEPTHS = (1, 3)  # numbers of earlier actions that the test tries; a dead time of more steps is not found
 MOST = 400  # greatest number of samples in a test, because its time grows with their third power
 RIDGE = 1e-6  # ridge of the regressions, relative to the variance of the inputs
 
 
 def owed_to_past(model: DynamicsModel, samples: Samples, limits: Sequence[float]) -> tuple[float, ...]:
-    """Return the share of each output's squared error that earlier steps of the episode explain, (O,).
+    """Return the share of the model's squared error in each output that earlier steps of the episode explain, (O,), as
+    with a dead time or a hidden state.
 
-    The share is 0 if it would be below ``EXPLAINED``, if the error is within the output's limit, or if there are too
-    few consecutive steps.
+    The share counts as 0 if it is below ``EXPLAINED``, if the error is within the output's tolerance in ``limits``
+    (O,), or if there are too few consecutive steps. It is 0 for the reward.
     """
     definition, able, errors = model.definition, offers(model, SampledFunctions), offers(model, LeaveOneOut)
     nothing = (0.0,) * len(definition.outputs)
@@ -70,30 +71,33 @@ def _state(definition: EnvironmentDefinition, q: Tensor) -> Tensor:
 
 
 def _past(u: Tensor, change: Tensor, follows: Tensor, depth: int) -> tuple[Tensor, Tensor]:
-    """Return what came before each of n samples, (n, d), and whether all of it is known, (n,) bool.
+    """Return the past of each of n samples, (n, d): the change of the state in the step before, then the actions of the
+    ``depth`` steps before. Return also whether all of it is known, (n,) bool.
 
     Args:
         u: actions (n, F).
         change: change of the state in each sample, (n, M).
-        follows: (n,) index of the sample of the step before, -1 if there is none.
-        depth: number of earlier actions, which follow the change of the step before in the result.
+        follows: (n,) index of the sample that is the step before, -1 if there is none.
+        depth: number of earlier actions.
     """
     place, complete, columns = torch.arange(len(follows)), torch.ones(len(follows), dtype=torch.bool), [change[follows]]
     for _ in range(depth):
-        place = follows[place]  # -1 for a row that has no step before it
+        # -1 if there is no step before; as an index it selects any row, which ``complete`` excludes.
+        place = follows[place]
         complete &= place >= 0
         columns.append(u[place])
     return torch.cat(columns, -1), complete
 
 
 def _explained_share(at: AtSamples, now: Tensor, past: Tensor, complete: Tensor) -> float:
-    """Return the share of an output's squared error at n samples that their past explains beyond state and action.
+    """Return the share of an output's squared error at n samples that their past explains, in addition to state and
+    action.
 
     Args:
-        at: the output's process at the samples.
+        at: values of the output at the samples, and covariance of its process.
         now: (n, e) state and action.
-        past: (n, d) earlier change and actions.
-        complete: (n,) whether the past of a sample is known; samples without it are not used.
+        past: (n, d) past of each sample, see ``_past``.
+        complete: (n,) bool, whether the past of each sample is known. Other samples are not used.
     """
     some = complete[at.rows]
     x, y, r = now[at.rows][some], at.targets[some], _residuals(at)[some]
@@ -114,7 +118,8 @@ def _left_out(x: Tensor, y: Tensor) -> float:
 
 
 def _residuals(at: AtSamples) -> Tensor:
-    """Return the leave-one-out errors (k,) of an output's process: each target less its prediction from the others."""
+    """Return the leave-one-out errors of an output's process at its k samples, (k,): each target less the prediction
+    from the other samples."""
     noisy = at.covariance + at.noise_variance * torch.eye(len(at.targets), dtype=at.covariance.dtype)
     inverse = torch.linalg.inv(noisy)
     residuals: Tensor = (inverse @ at.targets) / inverse.diagonal()

@@ -18,22 +18,26 @@ from surrogym_server.environment.samples import Samples
 from surrogym_server.models.abilities import RewardPeaks, offers
 from surrogym_server.models.port import DynamicsModel
 
-CLIMBERS, TRIES, CLIMBS = 16, 16, 24  # numbers of climbing points, of random steps of each per iteration, of iterations
+# Number of points that climb, of random steps that each tries in an iteration, and of iterations.
+CLIMBERS, TRIES, CLIMBS = 16, 16, 24
 WIDEST = 0.25  # standard deviation of the first iteration's random steps, as a share of the sampling range
-SHRINK = 0.75  # factor of the random steps' length from one iteration to the next
+SHRINK = 0.75  # factor by which the random steps become shorter from one iteration to the next
 NOTHING = torch.finfo(torch.float32).tiny  # trainers compute in float32, in which a smaller reward counts as 0
-UNMET = 0.1  # a predicted reward is clearly above all samples if it exceeds them by this share of the range of rewards
-NEW = 0.01  # a point nearer to a sample than this share of the sampling range counts as queried
+# A predicted reward is clearly above those of all samples if it exceeds them by this share of its distance from the
+# lowest.
+UNMET = 0.1
+NEW = 0.01  # a point whose distance from a sample is below this share of the sampling range needs no query
 
 
 def highest(
     model: DynamicsModel, samples: Samples, points: Points, tolerance: float, rng: np.random.Generator
 ) -> Points | None:
-    """Return the step at which the reward may be highest, found by climbing from m points.
+    """Return the point (state and action) at which the reward may be highest, found by climbing from m ``points``; None
+    if no query is needed.
 
-    None if the highest reward is known to the tolerance, or if the environment pays in more than a small part of the
-    range (see the module's docstring). While all samples have the reward 0, there is nothing to climb: the step is then
-    the point farthest from all samples.
+    No query is needed if the highest reward is known within the tolerance, or if rewards are not nearly zero almost
+    everywhere (see the module's docstring). As long as all samples have the reward 0, climbing is impossible; then the
+    point is the one of ``points`` that is farthest from all samples.
     """
     definition = model.definition
     points = points[~_over(definition, points.q)]
@@ -52,15 +56,16 @@ def highest(
 
 
 def _least(samples: Samples) -> float:
-    """Return the smallest difference of rewards that counts; a trainer's float32 can't distinguish smaller ones."""
+    """Return the smallest difference of rewards that matters. Trainers compute in float32 and can't distinguish smaller
+    ones."""
     return max(NOTHING, torch.finfo(torch.float32).eps * float(samples.reward.abs().max()))
 
 
 def _unknown(model: DynamicsModel, samples: Samples, points: Points, tolerance: float) -> Tensor:
-    """Return whether the reward at each of m points deserves a query, (m,) bool.
+    """Return at which of m points the reward is unknown enough to query it, (m,) bool.
 
-    It does if it is not known to the tolerance, or if it is predicted to be clearly above the reward of every sample.
-    While no sample has a reward that a trainer can distinguish from 0, every point does.
+    It is if its standard deviation is above the tolerance, or if its prediction is clearly above the rewards of all
+    samples. As long as a trainer can't distinguish the rewards of the samples, it is at every point.
     """
     prediction = model.transition(points.q, points.u, reward_std=True)
     assert prediction.reward_std is not None
@@ -70,9 +75,11 @@ def _unknown(model: DynamicsModel, samples: Samples, points: Points, tolerance: 
 
 
 def _climbed(definition: EnvironmentDefinition, able: RewardPeaks, points: Points, rng: np.random.Generator) -> Points:
-    """Climb from the best of m points to points of a higher optimistic reward, and return these, the highest first.
+    """Climb from the best of m points to points with a higher optimistic score of the reward (``RewardPeaks.promise``).
+    Return the points that are reached, those with the highest score first.
 
-    Each climber tries random steps, whose length decreases, and takes the best one.
+    From each point, several random steps are tried, and the best is taken if it increases the score. Their length
+    decreases from one iteration to the next.
     """
     low, high = _limits(definition)
     value = able.promise(points.q, points.u)
@@ -98,7 +105,8 @@ def _over(definition: EnvironmentDefinition, q: Tensor) -> Tensor:
 
 
 def _in_space(definition: EnvironmentDefinition, points: Tensor) -> Tensor:
-    """Round discrete actions in points (m, C + F) to whole numbers; other points are returned unchanged."""
+    """Return points (m, C + F) with discrete actions rounded to whole numbers. Points with continuous actions are
+    returned unchanged."""
     return (
         torch.cat([points[:, : len(definition.coordinates)], points[:, len(definition.coordinates) :].round()], 1)
         if definition.action.nvec

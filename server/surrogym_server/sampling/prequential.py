@@ -28,8 +28,8 @@ LATEST = 20  # greatest number of predictions that are kept for each output
 class Prediction:
     """Prediction of one output of a sample, by a model that had not learned from the sample."""
 
-    error: float  # sample less predicted mean, in the output's unit
-    std: float  # predictive standard deviation, with the noise of a single step
+    error: float  # value in the sample less predicted mean, in the output's unit
+    std: float  # standard deviation of the prediction, including the noise of a single step
 
 
 Predictions = tuple[tuple[Prediction, ...], ...]  # the predictions of each output (O,), the oldest first
@@ -37,16 +37,18 @@ Predictions = tuple[tuple[Prediction, ...], ...]  # the predictions of each outp
 
 @dataclass(frozen=True)
 class PrequentialScores:
-    """Scores of one output's predictions, each made before the model learned from the sample.
+    """Scores of predictions of one output. Each sample was predicted before the model learned from it.
 
-    An error within the tolerance counts as inside every interval.
+    A prediction whose error is within the tolerance counts as inside every prediction interval.
     """
 
     predictions: int
     within_50: float  # share of the samples in the central 50 % interval, or within the tolerance
     within_80: float  # share of the samples in the central 80 % interval, or within the tolerance
     within_90: float  # share of the samples in the central 90 % interval, or within the tolerance
-    interval_score: float  # mean over 90 % intervals, each at least as wide as the tolerance; in units of the tolerance
+    # Mean interval score of the 90 % intervals, in units of the tolerance; half of an interval is at least the
+    # tolerance.
+    interval_score: float
 
 
 def scores_of(predictions: Sequence[Prediction], tolerance: float) -> PrequentialScores | None:
@@ -62,7 +64,8 @@ def scores_of(predictions: Sequence[Prediction], tolerance: float) -> Prequentia
 
 
 def half_width(level: float) -> float:
-    """Return half the width of the central interval that holds a standard normal number with probability ``level``."""
+    """Return half the width of the central interval in which a standard normal number lies with probability
+    ``level``."""
     return NormalDist().inv_cdf((1 + level) / 2)
 
 
@@ -96,7 +99,7 @@ def predicted(model: DynamicsModel, samples: Samples) -> Predictions:
 
 
 def latest(before: Predictions, new: Predictions) -> Predictions:
-    """Append new predictions to earlier ones, and keep the last ``LATEST`` of each output."""
+    """Return the last ``LATEST`` predictions of each output, from the earlier ones followed by the new ones."""
     return tuple((*old, *more)[-LATEST:] for old, more in zip(before or [()] * len(new), new, strict=True))
 
 
@@ -106,7 +109,7 @@ def pairs_of(predictions: Predictions) -> list[list[list[float]]]:
 
 
 def from_pairs(pairs: Sequence[Sequence[Sequence[float]]]) -> Predictions:
-    """Convert JSON of ``pairs_of`` back to predictions."""
+    """Convert the JSON that ``pairs_of`` returns back to predictions."""
     return tuple(tuple(Prediction(*pair) for pair in output) for output in pairs)
 
 
@@ -117,10 +120,11 @@ def _noise(model: DynamicsModel, like: Tensor) -> Tensor:
 
 
 def _reward_std_by_state(model: DynamicsModel, samples: Samples) -> Tensor:
-    """Return the standard deviation (m,) of the reward due to the uncertain next state; 0 if the reward does not depend
-    on it.
+    """Return the standard deviation (m,) of the reward that is due to the uncertain next state; 0 if the reward does
+    not depend on the next state.
 
-    First order: the root sum of squares of the reward's changes when each output moves by one standard deviation.
+    It is computed to first order: the square root of the sum of the squared changes of the reward when one transition
+    output after the other changes by one standard deviation.
     """
     count, outputs = len(samples), len(model.definition.outputs) - 1
     one = torch.eye(outputs, dtype=samples.q.dtype).repeat_interleave(count, 0)

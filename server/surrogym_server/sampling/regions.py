@@ -16,25 +16,25 @@ from torch import Tensor
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.points import Points
 
-LEAST_GAIN = 0.5  # least difference between the share of the doubt and the share of the points in a region
+LEAST_GAIN = 0.5  # least difference between a region's share of the model uncertainty and its share of the points
 LEAST_DOUBT = 1e-12  # mean model uncertainty below which no region is searched
 
 
 @dataclass(frozen=True)
 class Region:
-    """Range of one input. An end that is None is open."""
+    """Part of the sampling range, given by a range of one input. An end that is None has no limit."""
 
     input: str  # name of the coordinate, or of the action entry
     low: float | None
     high: float | None
-    outside: bool  # whether the region is what lies outside of low to high; then both are numbers
+    outside: bool  # whether the region is everything outside [low, high]; then both ends are numbers
     share: float  # share of the total model uncertainty that lies in the region
 
 
 def regions_of(
     definition: EnvironmentDefinition, points: Points, doubt: Tensor, names: Sequence[str] = ()
 ) -> tuple[Region | None, ...]:
-    """Find the region with most of each output's uncertainty.
+    """Find, for each output, a range of one input in which most of the model uncertainty of this output lies.
 
     Args:
         definition: gives the names of the coordinates.
@@ -43,7 +43,8 @@ def regions_of(
         names: names of the action's entries; if empty, they are called ``action`` or ``action 1``, ``action 2``...
 
     Returns:
-        One region for each output; None if there is no doubt, or if no single input separates it.
+        One region for each output. It is None if there is hardly any uncertainty, or if no range of a single input
+        contains most of it.
     """
     entries = points.u.shape[1]
     actions = names or (["action"] if entries == 1 else [f"action {i + 1}" for i in range(entries)])
@@ -62,10 +63,11 @@ def _region(inputs: Tensor, doubt: Tensor, names: Sequence[str]) -> Region | Non
 
 
 def _ranges(values: Tensor, share: Tensor, name: str) -> list[tuple[float, Region]]:
-    """Return the range of an input with the most doubt for its size, and the complement of the one with the least, each
-    with its gain."""
+    """Return two candidate regions of one input, each with its gain (share of the uncertainty less share of the points
+    in it): the range with the greatest gain, and the complement of the range with the smallest."""
     ordered, order = values.sort(stable=True)
-    last = torch.cat([ordered[1:] != ordered[:-1], torch.tensor([True])])  # a range may not separate equal values
+    # The end of a range may not separate equal values.
+    last = torch.cat([ordered[1:] != ordered[:-1], torch.tensor([True])])
     doubt = torch.cat([torch.zeros(1, dtype=share.dtype), share[order].cumsum(0)[last]])
     gain = doubt - torch.cat([torch.zeros(1, dtype=share.dtype), (torch.arange(len(values)) + 1.0)[last] / len(values)])
     distinct = ordered[last]
@@ -73,17 +75,18 @@ def _ranges(values: Tensor, share: Tensor, name: str) -> list[tuple[float, Regio
 
 
 def _range(gain: Tensor, doubt: Tensor, values: Tensor, name: str, *, outside: bool) -> tuple[float, Region]:
-    """Find the interval of an input over which the cumulative ``gain`` (d + 1,) rises most, or its complement.
+    """Find the interval of an input over which the cumulative ``gain`` (d + 1,) increases most. Return the increase,
+    and as a region the interval, or its complement if ``outside``.
 
     Args:
-        gain: share of the doubt less share of the points, cumulated over the values.
-        doubt: (d + 1,) cumulative share of the doubt.
+        gain: share of the uncertainty less share of the points, cumulated over the values.
+        doubt: (d + 1,) cumulative share of the uncertainty.
         values: (d,) distinct values of the input, sorted.
         name: name of the input.
-        outside: whether the region is what lies outside the interval.
+        outside: whether the region is everything outside the interval.
 
     Returns:
-        The rise, and the region.
+        The increase of the gain, and the region.
     """
     lowest, at = gain.cummin(0)
     end = int((gain - lowest).argmax())
@@ -92,6 +95,7 @@ def _range(gain: Tensor, doubt: Tensor, values: Tensor, name: str, *, outside: b
     high = None if end == len(values) else float((values[end - 1] + values[end]) / 2)
     inside = float(doubt[end] - doubt[begin])
     share = 1 - inside if outside else inside
-    if outside and (low is None or high is None):  # the complement of a half-line is the other half-line
+    # The complement of a range without a lower or upper limit is again such a range.
+    if outside and (low is None or high is None):
         return float(gain[end] - gain[begin]), Region(name, high, low, False, share)
     return float(gain[end] - gain[begin]), Region(name, low, high, outside, share)

@@ -29,48 +29,52 @@ from surrogym_server.sampling.occupancy import log_occupancy
 from surrogym_server.sampling.outlook import as_if_answered, path_outlook
 from surrogym_shared.nouns import Query, Vector
 
-STARTS = 6  # number of start states, drawn at random, from which each sequence is predicted
+STARTS = 6  # number of random states after a reset from which each action sequence is predicted
 POPULATION = 48  # number of action sequences that are compared at once
 ELITE = 12  # number of the best sequences, whose variations form the next population
 GENERATIONS = 3  # number of populations in a search, the random first one included
-DOUBTFUL = 0.25  # least chance of finding an unknown termination for which a rollout is planned
+# Least probability of finding an unknown termination or jump of the reward with which a rollout is planned for this.
+DOUBTFUL = 0.25
 
 Sequences = NDArray[np.float64]  # k sequences of T actions, (k, T, F)
-# Function that rates k sequences, each from s equally likely start states (k, s, C): it returns their values and best
-# lengths, (k,) each.
+# Function that rates k action sequences, each from s equally likely start states (k, s, C). It returns the value of
+# each sequence, and the number of its first actions that give this value, (k,) each.
 Worth = Callable[[Tensor, Sequences], tuple[Tensor, Tensor]]
 
 
 @dataclass(frozen=True)
 class Aim:
-    """Objective and limits of a planned action sequence: which outputs to learn about, and where it may lead."""
+    """Objective of a planned action sequence (which outputs it should give information about), and restrictions
+    on it."""
 
     columns: Sequence[int]  # indices of the outputs about which the sequence should give information
     tolerances: Sequence[float]  # (O,) tolerance of every output, in its unit
     longest: int  # greatest number of actions in the sequence
     snapshots: Mapping[str, Vector] = field(default_factory=dict)  # states at which a sequence may begin, by name
-    states: Tensor | None = None  # (v, C) states that policies visited; their density weights the information
-    ending: bool = False  # whether a sequence that meets an unknown termination or reward edge has priority
+    states: Tensor | None = None  # (v, C) states that policies visited; steps count more where these are dense
+    ending: bool = False  # whether sequences that lead to an unknown termination or jump of the reward have priority
     ended: bool = False  # whether a sample has ended an episode, so that a declared termination counts as known
 
 
 @dataclass(frozen=True)
 class Paths:
-    """Predicted paths of the mean state: b paths of T steps."""
+    """b predicted paths of T steps each, in which every step has the mean result."""
 
     q: Tensor  # (b, T, C) states before each step
     u: Tensor  # (b, T, F) actions
     q_next: Tensor  # (b, T, C) states after each step
-    running: Tensor  # (b, T) 1 for steps of a running episode, 0 after its end or after a limit was approached
+    running: Tensor  # (b, T) 1 for steps of a running episode; 0 after the episode ended or came too close to a limit
     ended: Tensor  # (b, T) 1 from the step that ends the episode, 0 before
-    drift: Tensor  # (b, T) predictive variance summed over the steps before, in variances of the sampling range
+    # (b, T) sum over the earlier steps of the predictive variances of all coordinates, in variances of the sampling
+    # range.
+    drift: Tensor
 
 
 def first_rollouts(definition: EnvironmentDefinition, steps: int, rng: np.random.Generator) -> tuple[Query, ...]:
-    """Draw random sequences of 1, 2, 3, ... actions, with ``steps`` actions in total.
+    """Draw random action sequences (rollouts) of 1, 2, 3, ... actions, until they have ``steps`` actions in total.
 
-    Each sequence holds its actions for a different number of steps, so that the states spread. First steps from which a
-    model does not learn, because lags are not known yet, come in addition.
+    A sequence repeats each action for a random number of steps, so that the states spread. If the environment has lags
+    (past values), each sequence is longer by the number of first steps at which they are not known yet.
     """
     rollouts: list[Query] = []
     while steps > definition.unknown_steps:
@@ -83,9 +87,9 @@ def first_rollouts(definition: EnvironmentDefinition, steps: int, rng: np.random
 def plan_round(
     model: DynamicsModel, aim: Aim, steps: int, unanswered: Sequence[Query], rng: np.random.Generator
 ) -> list[Query]:
-    """Plan action sequences with ``steps`` real steps in total.
+    """Plan action sequences (rollouts) with ``steps`` real steps in total.
 
-    Each sequence is planned as if the earlier ones and the unanswered queries had been answered.
+    Each sequence is planned as if the sequences planned before and the unanswered queries had been answered.
     """
     rollouts: list[Query] = []
     latest = list(unanswered)
@@ -100,9 +104,9 @@ def plan_round(
 
 
 def plan_rollout(model: DynamicsModel, aim: Aim, rng: np.random.Generator) -> Query:
-    """Plan the action sequence, from a reset or from the best snapshot, with the highest value per expected real step.
+    """Plan the action sequence with the highest value per expected real step. It begins at a reset or at a snapshot.
 
-    The search compares random sequences of at most ``aim.longest`` actions, then variations of the best ones.
+    The search first compares random sequences of at most ``aim.longest`` actions, then variations of the best ones.
     """
     return best_rollout(model.definition, partial(_worth, model, aim), aim.longest, aim.snapshots, rng)
 
@@ -114,8 +118,8 @@ def best_rollout(
     snapshots: Mapping[str, Vector],
     rng: np.random.Generator,
 ) -> Query:
-    """Search for the sequence of at most ``longest`` actions, from a reset or a snapshot, that the function ``worth``
-    rates best."""
+    """Search for the sequence of at most ``longest`` actions that has the highest value by the function ``worth``. It
+    begins at a reset or at one of the ``snapshots``."""
     starts = start_points(definition, STARTS, rng)[None]
     actions, _, value = _search(definition, worth, longest, starts, POPULATION, rng)
     if snapshots:
@@ -134,7 +138,8 @@ def _search(
     population: int,
     rng: np.random.Generator,
 ) -> tuple[NDArray[np.float64], int, float]:
-    """Search for the best sequence (T, F) from any of k origins, each with s equally likely states (k, s, C).
+    """Search for the sequence of actions (T, F) with the highest value by ``worth``, from any of k origins. Each origin
+    is s equally likely states; ``origins`` is (k, s, C).
 
     Return the sequence, the index of its origin, and its value.
     """
@@ -155,7 +160,8 @@ def _search(
 def as_if_done(
     model: DynamicsModel, query: Query, snapshots: Mapping[str, Vector], rng: np.random.Generator
 ) -> DynamicsModel:
-    """Condition the model on a rollout along its predicted path: variances shrink, means stay.
+    """Return the model as if a rollout (query) had been answered along its predicted path: variances decrease, means
+    stay.
 
     If the query's snapshot is not among ``snapshots``, the path begins at a reset.
     """
@@ -168,7 +174,8 @@ def as_if_done(
 
 
 def start_points(definition: EnvironmentDefinition, count: int, rng: np.random.Generator) -> Tensor:
-    """Draw states after a reset, (count, C), stratified over the declared start distribution."""
+    """Draw states after a reset, (count, C), from the declared start distribution. Each coordinate is stratified: it
+    has one value in each of ``count`` intervals of equal probability."""
     columns = [
         c.start.quantile(torch.from_numpy((rng.permutation(count) + rng.random(count)) / count))
         for c in definition.coordinates
@@ -179,7 +186,8 @@ def start_points(definition: EnvironmentDefinition, count: int, rng: np.random.G
 
 
 def random_sequences(definition: EnvironmentDefinition, count: int, length: int, rng: np.random.Generator) -> Sequences:
-    """Draw piecewise constant sequences (count, length, F); the constant stretches last 1, 2, 4, ... steps."""
+    """Draw random action sequences (count, length, F). Each sequence repeats every action for 1, 2, 4, ... steps; this
+    number is drawn once for a sequence."""
     times = 2 ** np.arange(int(np.log2(length)) + 1)
     sequences = np.empty((count, length, definition.action.size))
     for sequence in sequences:
@@ -190,7 +198,7 @@ def random_sequences(definition: EnvironmentDefinition, count: int, length: int,
 
 
 def predict_paths(model: DynamicsModel, starts: Tensor, actions: Tensor) -> Paths:
-    """Predict the path of the mean state from each start (b, C) under action sequences (b, T, F)."""
+    """Predict a path from each start (b, C) under its action sequence (b, T, F), with the mean result of every step."""
     definition = model.definition
     spread = starts.new_tensor([scaling(definition.coordinates[i].sampling)[1] for i in definition.moving])
     q, running, going = starts, starts.new_ones(len(starts)), starts.new_ones(len(starts))
@@ -208,8 +216,9 @@ def predict_paths(model: DynamicsModel, starts: Tensor, actions: Tensor) -> Path
 
 
 def _may_leave_limits(definition: EnvironmentDefinition, q: Tensor, q_next: Tensor, variance: Tensor) -> Tensor:
-    """Return which of b paths, with a step from q (b, C) to q_next (b, C), come too close to a limit, (b,) bool: the
-    fallback action would take over, or they leave the limit with more than the allowed probability.
+    """Return which of b paths come too close to a declared limit in a step from q (b, C) to q_next (b, C), (b,) bool. A
+    path does if the fallback action would take over, or if the probability of being outside the limit is above the
+    allowed one.
 
     ``variance`` (b, M) is the predictive variance of the moving coordinates, summed along each path.
     """
@@ -227,8 +236,8 @@ def _may_leave_limits(definition: EnvironmentDefinition, q: Tensor, q_next: Tens
 
 
 def path_values(model: DynamicsModel, aim: Aim, paths: Paths) -> Tensor:
-    """Return the acquisition's value of each path up to each step, (b, T), summed over the outputs in
-    ``aim.columns``."""
+    """Return the acquisition's value of each path if it is followed up to each of its steps, (b, T), summed over the
+    outputs in ``aim.columns``."""
     acquisition = model.definition.design.acquisition
     weight = _weights(model.definition, aim, paths)
     total = torch.zeros_like(weight)
@@ -240,15 +249,17 @@ def path_values(model: DynamicsModel, aim: Aim, paths: Paths) -> Tensor:
 
 
 def _view(output: PathOutlook, weight: Tensor, tolerance: float) -> PathView:
-    """Return the properties of paths that an acquisition uses, for one output; ``weight`` (b, T) is that of each
+    """Return the properties of paths that an acquisition uses, for one output; ``weight`` (b, T) is the weight of each
     step."""
     return PathView(tolerance, weight, lambda: output.std, lambda: output.information(weight, tolerance))
 
 
 def _worth(model: DynamicsModel, aim: Aim, starts: Tensor, sequences: Sequences) -> tuple[Tensor, Tensor]:
-    """Rate the sequences (k, T, F), each from s equally likely states (k, s, C), by their best first part.
+    """Rate the action sequences (k, T, F). A sequence may be cut off: the number of its first actions is chosen that
+    gives the highest value per expected real step. ``starts`` (k, s, C) are s equally likely first states of each
+    sequence.
 
-    Return the value per expected real step of that part, (k,), and its length, (k,).
+    Return this value (k,) and this number (k,).
     """
     count, lanes = starts.shape[:2]
     actions = torch.from_numpy(sequences).repeat_interleave(lanes, 0)
@@ -262,9 +273,10 @@ def _worth(model: DynamicsModel, aim: Aim, starts: Tensor, sequences: Sequences)
 
 
 def _endings(model: DynamicsModel, aim: Aim, paths: Paths) -> Tensor:
-    """Return the probability that, up to a step, the model is wrong about a termination or a reward edge, (b, T).
+    """Return for each step of each path the largest probability, up to this step, that the model is wrong about a
+    termination or about a jump of the reward, (b, T).
 
-    If termination is declared and no sample has ended, it is 1 from the step at which a path ends.
+    If termination is declared and no sample has ended an episode, it is 1 from the step at which the path ends.
     """
     q, q_next = paths.q.flatten(0, 1), paths.q_next.flatten(0, 1)
     doubt = in_doubt(model, q_next).maximum(edge_in_doubt(model, q, q_next)).reshape(paths.running.shape)
@@ -273,10 +285,10 @@ def _endings(model: DynamicsModel, aim: Aim, paths: Paths) -> Tensor:
 
 
 def _weights(definition: EnvironmentDefinition, aim: Aim, paths: Paths) -> Tensor:
-    """Return the weight of each step of each path in the value of a plan, (b, T).
+    """Return the weight with which each step of each path counts in the value of a planned sequence, (b, T).
 
-    With snapshots the weight also contains the sampling density at the state. Otherwise plans could lead ever farther
-    away, to states that hardly matter for the verdict.
+    If sequences may begin at snapshots, the weight also contains the sampling density at the state. Otherwise sequences
+    could lead farther and farther away, to states that hardly matter for the confidence.
     """
     weight = paths.running * definition.in_range(paths.q) * definition.known(paths.q) * (-0.5 * paths.drift).exp()
     if aim.snapshots:
@@ -289,15 +301,15 @@ def _weights(definition: EnvironmentDefinition, aim: Aim, paths: Paths) -> Tenso
 
 
 def vary(definition: EnvironmentDefinition, sequences: Sequences, rng: np.random.Generator) -> None:
-    """Change each sequence (k, T, F) in place: a random stretch of it gets a new constant action."""
+    """Vary each of k action sequences (k, T, F) in place: a random interval of its steps gets a new constant action."""
     for sequence in sequences:
         first, last = sorted(rng.integers(sequence.shape[0] + 1, size=2))
         sequence[first : last + 1] = _random_actions(definition, 1, rng)
 
 
 def _random_actions(definition: EnvironmentDefinition, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Draw random actions (count, F). Half of the continuous entries are at a limit, because such actions reach
-    farthest."""
+    """Draw random actions (count, F). Half of the continuous entries are at the lower or upper limit, because such
+    actions lead farthest."""
     action = definition.action
     if action.nvec:
         return rng.integers(action.nvec, size=(count, action.size)).astype(np.float64)

@@ -16,7 +16,8 @@ from surrogym_server.sampling.state import Request
 
 @dataclass(frozen=True)
 class Round:
-    """The model of a round, its judgement, and the request that the round answers. O outputs."""
+    """Everything from which rules choose the queries of one round of the design: the model with O outputs, its
+    judgement, the samples and the request."""
 
     number: int
     model: DynamicsModel
@@ -24,9 +25,11 @@ class Round:
     request: Request
     judgement: Judgement
     tolerances: tuple[float, ...]  # (O,) declared or default tolerances, not widened by noise
-    outputs: list[int]  # indices of the outputs to query for, the least confident first; at least one
-    continues: bool  # whether the round may spend the rest of the budget; if not, it may take ``request.extra`` steps
-    testing: bool  # whether the design is ready but for an excursion that tests its model
+    outputs: list[int]  # indices of the outputs that queries should improve, the least confident first; at least one
+    # Whether the design continues, so that the round may spend the rest of the budget; otherwise only ``request.extra``
+    # steps.
+    continues: bool
+    testing: bool  # whether the design is ready, except that an excursion has to test its model first
 
     @property
     def definition(self) -> EnvironmentDefinition:
@@ -34,25 +37,26 @@ class Round:
 
     @property
     def cost(self) -> int:
-        """Number of real steps that count towards the budget."""
+        """Number of real steps so far that count towards the budget."""
         return self.request.cost(len(self.samples))
 
     @property
     def room(self) -> int:
-        """Number of real steps that the budget has left, less those that unanswered queries may take."""
+        """Number of real steps that are left in the budget, without those that are reserved for pending queries."""
         return max(0, self.request.budget - self.cost - self.request.pending_steps)
 
     @property
     def may_examine(self) -> bool:
-        """Whether rules may spend steps on the causes of large errors.
+        """Whether rules may spend real steps on finding the causes of large errors, such as noise or hidden state.
 
-        They may in the second half of the budget, once half as many adaptive queries as initial ones are answered. In
-        preset ``paper`` they never may.
+        They may if at least half of the budget is spent and at least half as many adaptive steps as initial ones were
+        taken. With a stopping rule other than ``tested_confidence``, as in preset ``paper``, they never may.
         """
         design = self.definition.design
         enough = self.cost >= max(self.request.budget / 2, 1.5 * design.initial)
         return self.continues and design.stopping == "tested_confidence" and enough
 
     def generator(self) -> np.random.Generator:
-        """Return a new random generator for this round's rollouts; every call returns the same stream of numbers."""
+        """Return a new random generator for this round's rollouts. All generators that it returns in one round give the
+        same numbers."""
         return generator_for(self.definition, f"rollouts {self.number}")

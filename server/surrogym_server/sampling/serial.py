@@ -30,10 +30,11 @@ from surrogym_server.models.port import DynamicsModel
 FEWEST = 12  # least number of pairs of consecutive steps for a test
 MOST = 256  # greatest number of samples in a test, because its time grows with their third power
 CRITICAL = 5.41  # upper 2 % point of chi-squared with one degree of freedom: the one-sided test has level 1 %
-MAINLY = 0.5  # least share of the noise from the sensor for which the noise counts as the sensor's
+MAINLY = 0.5  # if at least this share of the noise comes from the sensor, it counts as sensor noise
 SHARES = torch.linspace(0, 1, 21, dtype=torch.float64)  # values of the share to try; see the module's formula
 FACTORS = torch.logspace(-0.6, 0.6, 9, dtype=torch.float64)  # values of c to try; see the module's formula
-CARRIED = 1.25  # safety factor on an estimated standard deviation, because the slopes are those of a model
+# Safety factor for an estimated standard deviation, because it is computed with slopes of the model, which has errors.
+CARRIED = 1.25
 DIFFERENCE = 1e-4  # step of the numerical derivatives, as a share of a coordinate's sampling range
 
 
@@ -47,10 +48,10 @@ class SensorNoise:
 
 
 def sensor_noise(model: DynamicsModel, samples: Samples, limits: Sequence[float]) -> tuple[SensorNoise | None, ...]:
-    """Estimate the noise of the sensor of each output (O,).
+    """Estimate the noise of the sensor that measures each output (O,).
 
-    The entry is None for an output whose learned noise is below its limit (O,), or whose consecutive steps don't show
-    that most of that noise comes from the sensor.
+    The entry is None for an output whose learned noise is below its tolerance in ``limits`` (O,), or if consecutive
+    steps don't show that most of this noise comes from the sensor.
     """
     definition, able = model.definition, offers(model, SampledFunctions)
     follows = preceding(definition, samples)
@@ -73,10 +74,10 @@ def sensor_noise(model: DynamicsModel, samples: Samples, limits: Sequence[float]
 def noise_of_sensors(
     model: DynamicsModel, samples: Samples, sensors: Sequence[SensorNoise | None], limits: Sequence[float]
 ) -> Tensor:
-    """Return the standard deviation of the part of each output's noise that comes from sensors, (O,), in its unit.
+    """Return the standard deviation of the noise in each output that comes from sensors, (O,), in the output's unit.
 
-    It is the noise of the output's own sensor. An output without a noisy sensor has the noise that errors in the
-    measured start of a step cause. A value below the limit (O,) is returned as 0.
+    If the output's own sensor is noisy, it is the noise of a single step of this output. Otherwise it is the noise that
+    results from measurement errors in the start of a step. A value below the tolerance in ``limits`` (O,) counts as 0.
     """
     if not any(sensors):
         return torch.zeros(len(sensors), dtype=torch.float64)
@@ -87,7 +88,8 @@ def noise_of_sensors(
 
 
 def _carried(model: DynamicsModel, samples: Samples, sensors: Sequence[SensorNoise | None]) -> Tensor:
-    """Return the standard deviation of each output (O,) that errors in the measured start of a step cause."""
+    """Return the standard deviation of each output (O,) that results from measurement errors in the state at the start
+    of a step."""
     variance = torch.zeros(len(sensors), dtype=torch.float64)
     for index, sensor in zip(model.definition.moving, sensors, strict=False):
         if sensor is not None:
@@ -103,12 +105,13 @@ def _model_noise(model: DynamicsModel) -> Tensor:
 
 
 def _sensor_noise(at: AtSamples, follows: Tensor, slope: Tensor) -> SensorNoise | None:
-    """Test for noise of the sensor of one output; return None if the test does not show it.
+    """Test whether most of the noise of one output comes from its sensor. Return the estimated noise, or None if the
+    test does not show it.
 
     Args:
-        at: the output's process at its samples.
-        follows: sample i begins where sample ``follows[i]`` ended; -1 if no sample did.
-        slope: (n,) derivative of the next value of the output's coordinate over its present value.
+        at: values of the output at its samples, and covariance of its process.
+        follows: index of the sample that is the step before each sample; -1 if there is none.
+        slope: (n,) derivative of the next value of the output's coordinate with respect to its present value.
     """
     slope = slope[at.rows]
     pattern = sensor_pattern(slope, _among(follows, at.rows))
@@ -120,16 +123,20 @@ def _sensor_noise(at: AtSamples, follows: Tensor, slope: Tensor) -> SensorNoise 
 
 
 def _among(follows: Tensor, rows: Tensor) -> Tensor:
-    """Restrict ``follows``, the index of the sample before each sample, to the samples ``rows``, and renumber it."""
-    places = torch.full((len(follows) + 1,), -1)  # the last entry is the result for -1, which means no step before
+    """Return ``follows`` (the index of the sample before each sample, or -1) for the samples ``rows`` only, with
+    indices counted among ``rows``."""
+    # The last entry is selected by the index -1 (no step before) and is -1 too.
+    places = torch.full((len(follows) + 1,), -1)
     places[rows] = torch.arange(len(rows))
     return places[follows[rows]]
 
 
 def sensor_pattern(slope: Tensor, follows: Tensor) -> Tensor:
-    """Return the correlation pattern S (n, n) that sensor noise causes between consecutive steps; see the module.
+    """Return the matrix S (n, n) of the module's docstring: the covariance between the results of n steps that sensor
+    noise causes, divided by its mean diagonal.
 
-    Step i begins where step ``follows[i]`` ended, -1 for none, and has the slope ``slope[i]``.
+    Step ``follows[i]`` is the one before step i, -1 if there is none. ``slope[i]`` is the derivative of the next value
+    with respect to the present value in step i.
     """
     pattern = torch.diag(1 + slope.square())
     later = (follows >= 0).nonzero()[:, 0]
@@ -142,12 +149,12 @@ def best_share(y: Tensor, function: Tensor, noise: float, pattern: Tensor) -> tu
 
     Args:
         y: (n,) targets with mean 0.
-        function: (n, n) covariance of the targets without noise.
+        function: (n, n) prior covariance of the targets without noise.
         noise: variance of the noise of one step.
-        pattern: S (n, n), from ``sensor_pattern``.
+        pattern: matrix S (n, n) from ``sensor_pattern``.
 
     Returns:
-        The share, the factor c, and twice the gain in log likelihood over a share of 0.
+        The share, the factor c that scales ``noise``, and twice the difference in log likelihood from a share of 0.
     """
     likelihoods = torch.stack(
         [
@@ -174,12 +181,14 @@ def _log_likelihood(y: Tensor, covariance: Tensor) -> Tensor:
 
 
 def _slopes(model: DynamicsModel, samples: Samples, column: int, index: int) -> Tensor:
-    """Return the derivative of a coordinate's next value over its present value, at the samples, (n,)."""
+    """Return the derivative of a coordinate's next value with respect to its present value at the samples, (n,).
+    ``column`` is the index of its output, ``index`` that of the coordinate."""
     return 1 + _differences(model, samples, index)[:, column]
 
 
 def _differences(model: DynamicsModel, samples: Samples, index: int) -> Tensor:
-    """Return the derivatives of all outputs over one coordinate, at the samples, (n, O)."""
+    """Return the derivatives of all outputs with respect to the coordinate with index ``index``, at the samples, (n,
+    O)."""
     sampling = model.definition.coordinates[index].sampling
     step = torch.zeros_like(samples.q)
     step[:, index] = DIFFERENCE * max(sampling.high - sampling.low, 1e-12)

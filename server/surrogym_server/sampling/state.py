@@ -18,10 +18,10 @@ from surrogym_shared.nouns import Query, Vector
 
 @dataclass(frozen=True)
 class Conditions:
-    """Conditions under which a design has ended. If they change, the design may continue. O outputs."""
+    """Conditions under which a design with O outputs has ended. If they change later, the design may continue."""
 
     cost: float  # number of real steps that count towards the budget
-    budget: float  # greatest number of these real steps
+    budget: float  # greatest number of real steps that count
     target: float  # confidence index to reach
     tolerances: tuple[float, ...]  # (O,) declared or default tolerances
 
@@ -40,12 +40,14 @@ class DesignState:
     """State that one round passes to the next. It can be stored as JSON."""
 
     round: int = 0
-    defaults: DefaultTolerances = field(default_factory=DefaultTolerances)  # for outputs without a declared tolerance
+    # Default tolerances, for outputs without a declared one.
+    defaults: DefaultTolerances = field(default_factory=DefaultTolerances)
     warm: dict[str, NDArray[np.float64]] = field(default_factory=dict)  # warm start for the next fit
     ended_under: Conditions | None = None  # conditions when the design ended; None while it continues
     ended_as: str = ""  # the verdict with which the design ended; "" while it continues
     predictions: Predictions = ()  # predictions of the latest samples by models that had not learned from them
-    tested_at: int = 0  # number of samples when an excursion was planned to test a ready model; 0 without an excursion
+    # Number of samples when the last excursion was planned to test a ready model; 0 if none was planned.
+    tested_at: int = 0
 
     def to_json(self) -> dict[str, Any]:
         warm = {key: array.tolist() for key, array in self.warm.items()}
@@ -73,39 +75,40 @@ class DesignState:
 
 @dataclass(frozen=True)
 class Request:
-    """What a round of the design is asked to do.
+    """Input of one round of the design: its budget and target, and what has happened to its queries.
 
-    Pending queries are treated as answered. Their steps are reserved: ``Round.room`` subtracts them although ``cost``
-    does not count them, so that a design whose queries all fail comes to an end. The acquisition counts them too, so
-    that the next queries go elsewhere. Queries that the environment refused only count in the acquisition, because no
-    real step was taken.
+    Steps of pending queries are reserved: ``cost`` does not count them, but ``Round.room`` subtracts them from the
+    budget, so that a design whose queries all fail comes to an end. Refused queries need no budget, because no real
+    step was taken. The acquisition computes standard deviations as if both had been answered, so that the next queries
+    are chosen elsewhere.
     """
 
     budget: int  # greatest number of real steps of the design
     target: float  # confidence index to reach
-    pending: tuple[Query, ...] = ()  # queries whose answers may still come, or that were set aside
+    pending: tuple[Query, ...] = ()  # queries that may still be answered, or that were set aside
     refused: tuple[Query, ...] = ()  # queries that the environment refused
-    extra: int = 0  # real steps to choose even if the design has ended
+    extra: int = 0  # number of real steps for which queries are chosen even if the design has ended
     states: Tensor | None = None  # (v, C) states that policies visited
     snapshots: Mapping[str, Vector] = field(default_factory=dict)  # coordinates (C,) of each snapshot, by its name
     logged: int = 0  # number of the samples that come from a log
-    audited: int = 0  # number of the samples that are steps of audits
-    unlearned: int = 0  # real steps that are not among the samples, because their lags were not known
-    open: int = 0  # real steps of the pending queries that may still be answered
+    audited: int = 0  # number of the samples that come from audits
+    unlearned: int = 0  # number of real steps that are not among the samples, because lags (past values) were not known
+    open: int = 0  # number of real steps of those pending queries that may still be answered
     prior: DynamicsModel | None = None  # model of earlier knowledge, such as one of a simulator
     surprises: Predictions = ()  # predictions of this round's new samples by the previous model
 
     def cost(self, samples: int) -> int:
         """Return the number of real steps that count towards the budget of a design that has this many samples.
 
-        Samples of logs and audits don't count. Steps whose lags were not known do count, although they are not among
-        the samples.
+        Samples from logs and audits don't count. Steps at which lags (past values) were not known do count, although
+        they are not among the samples.
         """
         return samples - self.logged - self.audited + self.unlearned
 
     @property
     def unanswered(self) -> tuple[Query, ...]:
-        """All queries without an answer, pending or refused. The acquisition treats them as answered."""
+        """All queries without an answer, pending or refused. The acquisition computes standard deviations as if they
+        had been answered."""
         return (*self.pending, *self.refused)
 
     @property
@@ -114,9 +117,10 @@ class Request:
         return sum(query.steps for query in self.pending)
 
     def is_mostly_refused(self, cost: float) -> bool:
-        """Return whether the design should end because as many steps were refused as ``cost`` and budget together.
+        """Return whether the design should end because too many steps were refused: at least as many as ``cost`` and
+        the budget together.
 
-        ``cost`` is the number of real steps that count. Without this limit, a design whose queries are all refused
-        would never end.
+        ``cost`` is the number of real steps that count towards the budget. Without this limit, a design whose queries
+        are all refused would never end.
         """
         return sum(query.steps for query in self.refused) >= self.budget + cost

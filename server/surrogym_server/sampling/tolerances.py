@@ -20,7 +20,8 @@ from surrogym_server.environment.samples import Samples, increments
 
 TOLERANCE = 0.05  # default tolerance, as a share of the output's standard deviation over the initial design
 FLOOR = 1e-9  # increments below this share of a coordinate's standard deviation over its range are rounding errors
-NOTHING = 1e-3  # a first range of targets below this share of the later range was too small to define a tolerance
+# If the first range of targets is below this share of the later range, it was too small to define a tolerance.
+NOTHING = 1e-3
 
 
 def sizes_of(definition: EnvironmentDefinition, samples: Samples) -> list[float]:
@@ -32,7 +33,8 @@ def sizes_of(definition: EnvironmentDefinition, samples: Samples) -> list[float]
 
 
 def default_tolerances(definition: EnvironmentDefinition, sizes: Sequence[float]) -> tuple[float, ...]:
-    """Return the default tolerances (O,) of outputs of these sizes (O,): 5 % of the size, or 1 for `raw` tolerances."""
+    """Return the default tolerances (O,) of outputs with these ``sizes`` (O,) (standard deviations): 5 % of the size,
+    or 1 if the design's ``tolerance`` is `raw`."""
     if definition.design.tolerance == "raw":
         return (1.0,) * len(sizes)
     floors = _floors(definition)
@@ -41,7 +43,7 @@ def default_tolerances(definition: EnvironmentDefinition, sizes: Sequence[float]
 
 @dataclass(frozen=True)
 class DefaultTolerances:
-    """Default tolerances of all O outputs of a design; for an output with a declared tolerance they are not used."""
+    """Default tolerances of all O outputs of a design. They are used for outputs without a declared tolerance."""
 
     values: tuple[float, ...] = ()  # (O,) in each output's unit; empty before the first round
     ranges: tuple[float, ...] = ()  # (O,) ranges of the targets from which the values were computed
@@ -52,10 +54,10 @@ def frozen_tolerances(
 ) -> DefaultTolerances:
     """Return the default tolerances of a round: those of the previous round, ``before``, unless they have to change.
 
-    They are computed from the samples in the first round, and again for an output whose range of targets has grown by
-    a factor of more than 1 / ``NOTHING``. With snapshots they are computed in each round, and never become smaller.
-    Tolerances that were stored without ranges don't change. Rewards of terminating steps are left out, because the
-    reward's process does not model them.
+    They are computed from the samples of the first round. For an output whose range of targets has grown by a factor of
+    more than 1 / ``NOTHING`` since then, they are computed again. With snapshots they increase whenever the samples of
+    a round give a larger tolerance. Tolerances that were stored without ranges don't change. Ranges don't include
+    rewards of terminating steps, because the reward's process does not model these.
     """
     sizes, ranges = sizes_of(definition, samples), _ranges(definition, samples)
     current = default_tolerances(definition, sizes)
@@ -69,9 +71,10 @@ def frozen_tolerances(
 
 
 def _later(last: tuple[float, float], new: tuple[float, float], *, grows: bool) -> tuple[float, float]:
-    """Return the ``last`` tolerance and range of an output, or the ``new`` ones if the range has grown far.
+    """Return the ``last`` pair of tolerance and range of an output, or the ``new`` pair if the range has grown by a
+    factor of more than 1 / ``NOTHING``.
 
-    With ``grows`` the larger tolerance is returned.
+    With ``grows`` the pair with the larger tolerance is returned otherwise.
     """
     if new[1] * NOTHING > last[1]:
         return new
@@ -92,8 +95,8 @@ def _targets(definition: EnvironmentDefinition, samples: Samples) -> Tensor:
 
 
 def _floors(definition: EnvironmentDefinition) -> list[float]:
-    """Return the smallest size of each output (O,) that is not a rounding error; 0 for the reward, whose range is
-    unknown."""
+    """Return the smallest size (standard deviation) of each output (O,) that is not a rounding error. It is 0 for the
+    reward, and for outputs that are observation entries."""
     if definition.moves_observation:
         return [0.0] * len(definition.outputs)
     return [FLOOR * scaling(definition.coordinates[i].sampling)[1] for i in definition.moving] + [0.0]

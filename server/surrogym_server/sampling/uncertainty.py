@@ -19,10 +19,11 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class UncertaintyResult:
-    """Prediction and uncertainty at n points: arrays (n, O) with the outputs in the order of ``definition.outputs``."""
+    """Predictions and uncertainties at n points. Arrays are (n, O), with the outputs in the order of
+    ``definition.outputs``."""
 
-    mean: Array  # predicted change of each coordinate, or of each observation entry that the model moves; then reward
-    std: Array  # latent standard deviation, in the output's unit
+    mean: Array  # predicted change of each moving coordinate or observation entry; in the last column the reward
+    std: Array  # standard deviation without noise, in the output's unit
     model_uncertainty: Array  # model uncertainty U_m (eq. 10)
     input_probability: Array  # input probability P_i (eq. 11)
     log_uncertainty_index: Array  # logarithm of the uncertainty index U (eq. 12)
@@ -51,10 +52,11 @@ def query_uncertainty(
 def visited_confidence(model: DynamicsModel, states: Array, tolerances: Sequence[float]) -> float:
     """Return the smallest confidence index (eq. 8, 9) of the outputs over visited states (v, C), for tolerances (O,).
 
-    It shows how well the model is known where a policy goes, instead of over the Monte Carlo set.
+    It shows how well the model knows the outputs where a policy goes, whereas the Monte Carlo set covers the whole
+    range.
 
-    States outside the sampling range count as well, although the design never queries there. Each state is taken under
-    one random action, as in the acquisition's reference, because a policy that learns tries actions other than its own.
+    States outside the sampling range count too, although the design never queries there. Each state has one random
+    action, as have the reference points of the acquisition, because a policy tries many actions while it learns.
     """
     definition = model.definition
     rng = np.random.default_rng(definition.design.seed)

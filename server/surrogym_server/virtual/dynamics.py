@@ -16,17 +16,18 @@ from surrogym_server.models.guard import require_shapes
 from surrogym_server.models.port import DynamicsModel, Transition
 from surrogym_shared.kinds import Weighting
 
-WEIGHT_FLOOR = 1e-12  # added to a particle's reward variance, as a share of the samples', so that weights stay finite
+# Share of the reward's variance over the samples that is added to a particle's, so that weights stay finite.
+WEIGHT_FLOOR = 1e-12
 LEAST_VARIANCE = 1e-290  # lower limit of a particle's reward variance, which may otherwise be 0
 
 
 @dataclass(frozen=True)
 class Moved:
-    """Prediction of the model for one step of N lanes."""
+    """Prediction of one step of N lanes (parallel environments)."""
 
     q: Tensor  # (N, C) state after the step
     particles: Tensor  # (N, P, C) particles after the step; P is 0 except in variant probabilistic
-    reward_mean: Tensor  # (N,) reward without penalty
+    reward_mean: Tensor  # (N,) reward without the penalty for uncertainty
     reward: Tensor  # (N,) penalised reward, eq. 14
     terminated: Tensor  # (N,) bool: whether the step ends the episode
     std: Tensor | None  # (N, O) standard deviation of each output, if needed
@@ -43,7 +44,8 @@ def move_mean(
     paths: Tensor | None = None,
     functions: int | None = None,
 ) -> Moved:
-    """AUR-D: move q (N, C) under u (N, F) to the mean of the next state, or along each lane's sampled function.
+    """Predict one step of N lanes from q (N, C) under u (N, F): to the mean next state (variant AUR-D of the paper), or
+    with ``paths`` along a sampled function of each lane.
 
     Args:
         model: the model.
@@ -51,8 +53,8 @@ def move_mean(
         u: actions.
         penalty: number of standard deviations to subtract from the reward (eq. 14).
         stds: whether the standard deviations of the outputs are needed.
-        process: (N, M) standard normal numbers that add the learned noise, or None.
-        paths: (N, W) the function that each lane follows, or None for the mean.
+        process: (N, M) standard normal numbers, by which the learned noise moves the next state, or None for no noise.
+        paths: (N, W) weights of the sampled function that each lane follows, or None for the mean.
         functions: number of functions that the lanes share, or None if each lane has its own.
     """
     step = model.transition if paths is None else partial(function_draws(model, functions).transition_along, paths)
@@ -78,10 +80,11 @@ def move_particles(
     process: Tensor | None = None,
     steps: ArraySteps | None = None,
 ) -> Moved:
-    """AUR-P: move particles (N, P, C) under one action for each lane, u (N, F).
+    """Predict one step of N lanes that are represented by particles (N, P, C), under u (N, F), one action for each lane
+    (variant AUR-P of the paper).
 
-    The output state is the particles' mean. The reward is the mean of their penalised rewards, weighted by 1/U with U
-    the variance of eq. 7.
+    The next state is the mean of the particles. The reward is a weighted mean of the particles' penalised rewards, with
+    weights 1/U, where U is the variance of a particle's reward (eq. 7).
 
     Args:
         model: the model.
@@ -90,8 +93,9 @@ def move_particles(
         penalty: number of standard deviations to subtract from each particle's reward (eq. 14).
         noise: (N, P, M) standard normal numbers by which each particle samples its next state; None for the mean.
         weighting: weights of the particles' rewards; `uniform` replaces 1/U by equal weights.
-        process: (N, P, M) standard normal numbers that add the learned noise, or None.
-        steps: compiled steps to use, or None.
+        process: (N, P, M) standard normal numbers, by which the learned noise moves each particle, or None for no
+            noise.
+        steps: compiled steps of the model, or None to use ``DynamicsModel.transition``.
     """
     lanes, count, size = particles.shape
     q, action = particles.flatten(0, 1), u.repeat_interleave(count, 0)
@@ -160,7 +164,8 @@ def mean_state(definition: EnvironmentDefinition, particles: Tensor) -> Tensor:
 
 
 def _weights(spread: Tensor, scale: Tensor, weighting: Weighting) -> Tensor:
-    """Return normalised weights (N, P) of particles with reward standard deviations ``spread`` (N, P).
+    """Return weights (N, P) of particles whose rewards have the standard deviations ``spread`` (N, P). The weights of a
+    lane add up to 1.
 
     ``scale`` is the standard deviation of the reward over the samples.
     """

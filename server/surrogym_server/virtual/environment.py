@@ -31,62 +31,71 @@ Ints = NDArray[np.integer[Any]]
 
 @dataclass(frozen=True)
 class VirtualSettings:
-    """Options of a session, fixed when it is opened."""
+    """Options of a session of virtual environments (lanes). They are fixed when the session is opened."""
 
     num_envs: int
     variant: Variant = "deterministic"
     autoreset_mode: AutoresetMode = "next_step"
     time_limit: int | None = None
-    penalty: float = 0.0  # standard deviations to subtract from each reward, k of eq. 14
+    # Number of standard deviations of the reward that are subtracted from each reward, k of eq. 14.
+    penalty: float = 0.0
     start_box: float = 0.0  # share of episodes that start anywhere in the sampling range
     start_visited: float = 0.0  # share of episodes that start at one of the states ``visited``
     particles: int = 1_000
     propagation: Propagation = "sample"
     weighting: Weighting = "inverse_variance"
     spread: float = 0.01  # initial standard deviation of particles, as a share of each coordinate's range
-    functions: int | None = None  # number of functions that lanes of variant pathwise share; None: one for each lane
-    residual: Residual | None = None  # systematic errors that are added to each prediction
-    process_noise: bool = False  # whether the learned noise moves the state, w of eq. 2
-    sensor_noise: SensorNoise = ()  # noise of observed coordinates, which does not move the state
+    # Number of sampled functions that the lanes of variant pathwise share; None: one for each episode of a lane.
+    functions: int | None = None
+    residual: Residual | None = None  # systematic errors of the model that are added to each prediction; None for none
+    process_noise: bool = False  # whether the learned noise (w of eq. 2) changes the state
+    sensor_noise: SensorNoise = ()  # measurement noise of observed coordinates, which does not change the state
     reward_limits: tuple[float, float] | None = None  # limits of mean rewards, or None for none
-    trust: float | None = None  # truncate if a predicted std exceeds this multiple of the output's std over the samples
-    caution: float = 0.0  # multiple of the doubt that is subtracted from each reward, see ``_doubted``
+    # An episode is truncated if an output's predicted standard deviation exceeds this multiple of that over the
+    # samples.
+    trust: float | None = None
+    caution: float = 0.0  # factor of the doubt about a step that is subtracted from its reward, see ``_doubted``
     compiled: bool = False  # whether steps use the model's compiled code; decided when the session opens
-    visited: Tensor | None = field(default=None, compare=False, repr=False)  # (k, C) states of real steps
+    # (k, C) states of real steps, at which episodes can start.
+    visited: Tensor | None = field(default=None, compare=False, repr=False)
 
     @property
     def doubts(self) -> bool:
-        """Whether a step needs the standard deviation of each output."""
+        """Whether steps need the standard deviations of all outputs, because ``trust`` or ``caution`` is used."""
         return self.trust is not None or self.caution > 0
 
 
 @dataclass(frozen=True)
 class LaneTransition:
-    """Results of one step of N lanes, as NumPy arrays. Lanes that the mask excludes have reward 0 and no flags."""
+    """Results of one step of N lanes (parallel environments), as NumPy arrays. Lanes that are not stepped have reward
+    0, and all their flags are false."""
 
-    observation: Floats  # (N, D) float32, of the new episode in lanes that were reset
-    reward: Floats  # (N,) reward less penalties
+    observation: Floats  # (N, D) float32; in lanes that were reset, the first observation of the new episode
+    reward: Floats  # (N,) reward less the penalties for uncertainty
     terminated: Bools  # (N,) lanes whose episode ended in a terminal state
-    truncated: Bools  # (N,) lanes whose episode was cut off
-    final_lanes: Ints  # (K,) indices of lanes that ended and were reset in this step (same_step only)
+    truncated: Bools  # (N,) lanes whose episode ended by the time limit or by leaving the trusted range
+    # (K,) indices of the lanes whose episode ended and that were reset in the same step (autoreset mode same_step
+    # only).
+    final_lanes: Ints
     final_observation: Floats  # (K, D) float32, last observations of these lanes' episodes
     reset_lanes: Bools  # (N,) lanes in which a new episode began
-    reward_mean: Floats  # (N,) reward without penalty
+    reward_mean: Floats  # (N,) reward without the penalties for uncertainty
     std: Floats | None  # (N, O) standard deviation of each output, if requested
-    untrusted: Bools | None  # (N,) lanes truncated because they left the trusted range; None if there is no such range
-    left: Bools | None = None  # (N,) lanes that ended with the outside reward; None if leaving does not end an episode
+    # (N,) lanes that were truncated because they left the trusted range; None if ``trust`` is None.
+    untrusted: Bools | None
+    left: Bools | None = None  # (N,) lanes whose episode ended with the outside reward; None if no episode can end so
 
 
 def expected_bytes(definition: EnvironmentDefinition, settings: VirtualSettings, path_size: int) -> int:
-    """Return the approximate memory of a session's lanes, in bytes: coordinates, particles, and the ``path_size``
-    weights of each lane's function."""
+    """Return the approximate memory that a session's lanes need, in bytes: for coordinates, for particles, and for the
+    ``path_size`` weights of the sampled function that each lane follows."""
     particles = settings.particles if settings.variant == "probabilistic" else 0
     path = path_size if settings.variant == "pathwise" else 0
     return 8 * settings.num_envs * (len(definition.coordinates) * (1 + particles) + path)
 
 
 def create(definition: EnvironmentDefinition, settings: VirtualSettings, seed: int) -> LaneState:
-    """Create the state of N lanes that have not been reset yet; ``seed`` is the key of their noise."""
+    """Create the state of N lanes that have not been reset yet. ``seed`` determines all their random numbers."""
     count, size = settings.num_envs, len(definition.coordinates)
     particles = settings.particles if settings.variant == "probabilistic" else 0
     zeros = torch.zeros(count, dtype=torch.int64, device=definition.device)
@@ -112,8 +121,9 @@ def reset(
 ) -> tuple[LaneState, Floats]:
     """Begin new episodes in all lanes, or in those of the mask (N,). Return the lanes and their observations (N, D).
 
-    An int seed s gives lane i the key (s, i), and a list gives lane i the key (s_i, 0), both from episode 0 on. Without
-    a seed each lane begins its next episode. Lanes outside the mask keep their state.
+    The random numbers of a lane depend on a key. With an integer seed s, lane i gets the key (s, i); with a list of
+    seeds it gets (s_i, 0). In both cases it begins episode 0. Without a seed each lane keeps its key and begins its
+    next episode. Lanes outside the mask keep their state.
 
     Raises:
         InvalidInput: the mask or the list of seeds has a wrong length, or a seed is negative or too large.
@@ -125,7 +135,7 @@ def reset(
     return lanes, _observe(definition, settings, lanes)
 
 
-@torch.inference_mode()  # no records for gradients, which saves a sixth of the time
+@torch.inference_mode()  # without records for gradients a step takes a sixth less time
 def step(
     model: DynamicsModel,
     settings: VirtualSettings,
@@ -138,7 +148,7 @@ def step(
     """Step lanes in torch. This is the reference implementation of ``virtual.step``, with the same arguments and
     errors.
 
-    With ``particle_steps`` particles move in compiled code.
+    If ``particle_steps`` are given, they predict the steps of particles in compiled code.
     """
     definition = model.definition
     moving, beginning = divided(settings, lanes, chosen_lanes(mask, lanes))
@@ -185,10 +195,11 @@ def step(
 
 
 def divided(settings: VirtualSettings, lanes: LaneState, chosen: Chosen) -> tuple[Chosen, Tensor | None]:
-    """Divide the chosen lanes by what this step does with them.
+    """Divide the chosen lanes (parallel environments) into those that this step moves and those that it resets.
 
     Returns:
-        The lanes to move, and the lanes (N,) to reset because their episode has ended; None if there are none.
+        The lanes to move, and a mask (N,) of the lanes to reset because their episode has ended, or None if there are
+        none.
 
     Raises:
         NotReset: a chosen lane has no running episode, and autoreset does not start one in this step.
@@ -249,9 +260,9 @@ def _move(
 
 
 def _doubted(model: DynamicsModel, settings: VirtualSettings, moved: Moved) -> Moved:
-    """Subtract ``caution`` times a doubt from the rewards of a move.
+    """Subtract ``caution`` times the doubt about each lane's step from its reward.
 
-    The doubt is the largest standard deviation of an output, relative to that output's standard deviation over the
+    The doubt is the largest ratio of an output's predicted standard deviation to its standard deviation over the
     samples, times the standard deviation of the reward over the samples.
     """
     if settings.caution == 0:
@@ -262,8 +273,8 @@ def _doubted(model: DynamicsModel, settings: VirtualSettings, moved: Moved) -> M
 
 
 def _untrusted(model: DynamicsModel, settings: VirtualSettings, moved: Moved) -> Tensor | None:
-    """Return which lanes (N,) left the trusted range: an output's standard deviation exceeds ``trust`` times its
-    standard deviation over the samples. None if there is no such range."""
+    """Return which lanes left the trusted range, (N,) bool. A lane has if the predicted standard deviation of any
+    output is above ``trust`` times its standard deviation over the samples. None if ``trust`` is None."""
     if settings.trust is None:
         return None
     assert moved.std is not None
@@ -271,8 +282,9 @@ def _untrusted(model: DynamicsModel, settings: VirtualSettings, moved: Moved) ->
 
 
 def _left(definition: EnvironmentDefinition, q: Tensor, moved: Moved, untrusted: Tensor | None) -> Tensor | None:
-    """Return which lanes (N,), moved from q (N, C), end because they left the sampling range or the trusted range, or
-    because the fallback of the limits would act; None if none of these ends an episode."""
+    """Return the lanes that end early after a step from q (N, C), (N,) bool. With a declared outside reward, a lane
+    ends if it left the sampling range or the trusted range; with limits, also if their fallback action would take over.
+    None without either."""
     if definition.outside_reward is None and definition.limits is None:
         return None
     left = definition.falls_back(q, moved.q)
@@ -283,8 +295,9 @@ def _left(definition: EnvironmentDefinition, q: Tensor, moved: Moved, untrusted:
 
 
 def paid_outside(definition: EnvironmentDefinition, settings: VirtualSettings) -> float:
-    """Return the reward of each step that an episode misses after it left: the declared outside reward, or else the
-    least that a virtual step can pay."""
+    """Return the reward for each step that an episode misses because it ended early, outside the sampling range or at a
+    limit. It is the declared outside reward. Without one it is the lower limit of virtual rewards, or 0 without such a
+    limit."""
     if definition.outside_reward is not None:
         return definition.outside_reward
     return 0.0 if settings.reward_limits is None else settings.reward_limits[0]
@@ -293,9 +306,10 @@ def paid_outside(definition: EnvironmentDefinition, settings: VirtualSettings) -
 def _paid_outside(
     definition: EnvironmentDefinition, settings: VirtualSettings, before: LaneState, moved: Moved, left: Tensor
 ) -> Moved:
-    """Terminate the lanes ``left`` (N,) and give them the outside reward.
+    """Terminate the lanes that the mask ``left`` (N,) selects, and replace their rewards by the outside reward.
 
-    They get it for this step and for each missing step up to the time limit; without a time limit for this step only.
+    A lane gets it for this step and for each further step up to the time limit. Without a time limit it gets it for
+    this step only.
     """
     lacking = torch.ones_like(moved.reward)
     if settings.time_limit is not None:
@@ -309,8 +323,8 @@ def _paid_outside(
 def _advanced(
     settings: VirtualSettings, before: LaneState, moved: Moved, untrusted: Tensor | None
 ) -> tuple[LaneState, Tensor]:
-    """Return the lanes after their move, and which of them were truncated. As in Gymnasium, a step may both terminate
-    and truncate."""
+    """Return the state of the lanes after their step, and which lanes were truncated, by the time limit or because they
+    left the trusted range. As in Gymnasium, a step may both terminate and truncate."""
     elapsed = before.elapsed + 1
     cut = torch.zeros_like(moved.terminated) if settings.time_limit is None else elapsed >= settings.time_limit
     cut = cut if untrusted is None else cut | untrusted
@@ -357,14 +371,14 @@ def _observe(definition: EnvironmentDefinition, settings: VirtualSettings, lanes
 
 
 def _array(values: Tensor) -> NDArray[Any]:
-    """Return a tensor of any device as a NumPy array."""
+    """Return a tensor, which may be on any device, as a NumPy array."""
     array: NDArray[Any] = values.cpu().numpy()
     return array
 
 
 def chosen_lanes(mask: Bools | None, lanes: LaneState) -> Chosen:
-    """Return the lanes of a mask (N,), or all lanes if it is None. Raises ``InvalidInput`` for a mask of another
-    length."""
+    """Return a selection of the lanes that ``mask`` (N,) selects, or of all lanes if ``mask`` is None. Raises
+    ``InvalidInput`` for a mask of another length."""
     if mask is None:
         return EVERY
     if len(mask) != len(lanes):
@@ -373,7 +387,8 @@ def chosen_lanes(mask: Bools | None, lanes: LaneState) -> Chosen:
 
 
 def _scatter(chosen: Chosen, values: Tensor) -> Tensor:
-    """Spread values of the chosen lanes over all N lanes, with 0 in the others."""
+    """Return a tensor with a row for each of N lanes: the rows of ``values`` for the chosen lanes, and 0 for the
+    others."""
     if isinstance(chosen, slice):
         return values
     full = values.new_zeros(len(chosen), *values.shape[1:])

@@ -33,13 +33,14 @@ class Imagined:
 
 
 def imagine(model: DynamicsModel, q: Array, u: Array, *, draws: int, seed: int) -> Imagined:
-    """Imagine episodes from the state q (C,) under the model's actions u (T, F).
+    """Predict episodes from the state q (C,) under the actions u (T, F): one with mean predictions, and others along
+    sampled functions.
 
     Args:
         model: the model.
-        q, u: first state and actions.
+        q, u: first state, and actions in the form in which the model takes them.
         draws: number of episodes along sampled functions.
-        seed: seed of the functions.
+        seed: seed with which the functions are sampled.
     """
     mean = _episodes(model, VirtualSettings(1, autoreset_mode="disabled"), q, u, seed)[0]
     if not draws:

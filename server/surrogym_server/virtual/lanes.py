@@ -18,33 +18,35 @@ Chosen = Tensor | slice  # selection of lanes: a mask (N,), or EVERY
 
 @dataclass(frozen=True)
 class LaneState:
-    """State of N lanes, with P particles and W weights of a function each.
+    """State of N lanes (parallel virtual environments). Each has P particles, and W weights of the sampled function
+    that it follows.
 
-    P is 0 except in variant probabilistic, W is 0 except in variant pathwise. Functions of models of different sizes
-    are rows of one tensor: shorter rows are padded with zeros, and a model reads as many weights as it has.
+    P is 0 except in variant probabilistic, W is 0 except in variant pathwise. If functions of the lanes have different
+    numbers of weights, because they come from different models, the shorter ones are padded with zeros. A model ignores
+    the padding.
     """
 
-    seed: Tensor  # (N,) int64, part of the noise's key
-    lane: Tensor  # (N,) int64, part of the noise's key
+    seed: Tensor  # (N,) int64, part of the key that determines the lane's random numbers
+    lane: Tensor  # (N,) int64, part of the key that determines the lane's random numbers
     episode: Tensor  # (N,) int64, number of the episode; -1 before the first
     elapsed: Tensor  # (N,) int64, number of steps in this episode
     phase: Tensor  # (N,) int8: NEW, RUNNING, or ENDED and waiting for a reset
     q: Tensor  # (N, C) state, which determines observation and termination
-    particles: Tensor  # (N, P, C) states of the particles
+    particles: Tensor  # (N, P, C) state of each particle
     path: Tensor  # (N, W) weights of the function that the episode follows; sampled in its first step
 
     def __len__(self) -> int:
         return len(self.seed)
 
     def take(self, index: NDArray[Any] | Chosen) -> LaneState:
-        """Return the lanes of an index array or mask, in its order."""
+        """Return the state of the lanes that an index array or a mask selects, in its order."""
         if isinstance(index, slice):
             return self
         at = torch.as_tensor(index, device=self.seed.device)
         return LaneState(*(getattr(self, f.name)[at] for f in fields(self)))
 
     def put(self, index: NDArray[Any] | Chosen, other: LaneState) -> LaneState:
-        """Return the state with the lanes of an index array or mask replaced by ``other``."""
+        """Return the state with those lanes replaced by ``other`` that an index array or a mask selects."""
         if isinstance(index, slice):
             return other
         at = torch.as_tensor(index, device=self.seed.device)

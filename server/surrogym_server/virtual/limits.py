@@ -16,17 +16,18 @@ Limits = tuple[float, float]
 def reward_limits(low: float, high: float) -> Limits:
     """Return the limits of virtual rewards, given the smallest and the largest reward of all samples.
 
-    They lie beyond these rewards by their difference or by their largest absolute value, whichever is larger, so they
-    always include 0.
+    The limits lie beyond the smallest and the largest reward, by the difference of these two or by the larger of their
+    absolute values, whichever is greater. So the range between the limits always includes 0.
     """
     room = max(high - low, abs(low), abs(high))
     return low - room, high + room
 
 
 def within(limits: Limits | None, transition: LaneTransition) -> LaneTransition:
-    """Clip the mean rewards of a transition to the limits; a penalty is subtracted after that.
+    """Return the transition with its mean rewards clipped to the limits. Penalties are subtracted from the clipped
+    rewards.
 
-    The outside reward is not predicted by the model, so it is not clipped.
+    The outside reward, which an episode gets that ended early, is not clipped, because the model does not predict it.
     """
     if limits is None:
         return transition

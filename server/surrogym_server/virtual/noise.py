@@ -13,11 +13,12 @@ from surrogym_server.virtual.lanes import LaneState
 from surrogym_server.virtual.philox import MASK, normals, philox, uniforms
 from surrogym_shared import compiled
 
-STEP_BITS = 24  # bits of the step in the counter's third word; the purpose has the other eight
+STEP_BITS = 24  # number of bits of the counter's third word that contain the step; the other eight contain the purpose
 
 
 class Purpose(IntEnum):
-    """Purpose of a random number, part of its key, so that no two purposes share a number."""
+    """Purpose for which a random number is drawn. It is part of the number's key, so that no random number serves two
+    purposes."""
 
     START = 0
     BOX_START = 1
@@ -29,17 +30,20 @@ class Purpose(IntEnum):
 
 
 def uniform_noise(lanes: LaneState, purpose: Purpose, size: int) -> Tensor:
-    """Return uniform numbers in (0, 1) for each lane, (N, size)."""
+    """Return ``size`` uniform random numbers in (0, 1) for each of N lanes, (N, size). They depend on the lane's state
+    and the purpose alone."""
     return uniforms(_words(lanes, purpose, 1, size)).flatten(-2)[:, 0, :size]
 
 
 def normal_noise(lanes: LaneState, purpose: Purpose, particles: int, size: int) -> Tensor:
-    """Return standard normal numbers for each particle of each lane, (N, particles, size)."""
+    """Return ``size`` standard normal random numbers for each particle of each of N lanes, (N, particles, size). They
+    depend on the lane's state and the purpose alone."""
     return normals(_words(lanes, purpose, particles, size)).flatten(-2)[..., :size]
 
 
 def _words(lanes: LaneState, purpose: Purpose, particles: int, size: int) -> Tensor:
-    """Return random words, (N, particles, ceil(size / 4), 4): each counter value gives four words."""
+    """Return random 32-bit words, at least ``size`` for each particle of each of N lanes, (N, particles, ceil(size /
+    4), 4). Each value of the generator's counter gives four words."""
     blocks = -(-size // 4)
     third = lanes.elapsed | (int(purpose) << STEP_BITS)
     if lanes.seed.device == CPU and compiled.available():

@@ -12,11 +12,11 @@ from surrogym_server.virtual.noise import Purpose, normal_noise
 
 
 def with_paths(model: DynamicsModel, lanes: LaneState, functions: int | None = None) -> LaneState:
-    """Sample the functions of those lanes that are in the first step of their episode.
+    """Return the lanes, with a newly sampled function for each lane that is in the first step of its episode.
 
-    A function depends on model, seed, lane and episode alone. With a number of ``functions`` the lane counts modulo
-    that number, so that lanes share functions. Its weights are still kept in the state, because computing them with
-    other lanes in the same batch could change their last bits.
+    A function is determined by the model and by the seed, number and episode of the lane. If ``functions`` is given,
+    the number of the lane counts modulo ``functions``, so that lanes share functions. The weights of a function are
+    stored in the lane's state: computed again in a batch with other lanes, they could differ in the last bits.
     """
     fresh = lanes.elapsed == 0
     if not bool(fresh.any()):

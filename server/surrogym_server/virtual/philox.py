@@ -13,13 +13,13 @@ from torch import Tensor
 
 MASK = 0xFFFFFFFF  # lower 32 bits
 MULTIPLIERS = (0xD2511F53, 0xCD9E8D57)  # constants M_0 and M_1 of the reference
-WEYL = (0x9E3779B9, 0xBB67AE85)  # increments of the key in each round
+WEYL = (0x9E3779B9, 0xBB67AE85)  # numbers that are added to the key in each round
 ROUNDS = 10
 
 
 def philox(counter: tuple[Tensor, Tensor, Tensor, Tensor], key: tuple[Tensor, Tensor]) -> Tensor:
-    """Return four random words for each counter and key. Tensors broadcast; the result (..., 4) is int64 in
-    [0, 2^32)."""
+    """Return four random 32-bit words for each pair of counter and key. Tensors broadcast; the result (..., 4) is
+    int64, in [0, 2^32)."""
     c0, c1, c2, c3 = counter
     k0, k1 = key
     for _ in range(ROUNDS):

@@ -19,14 +19,14 @@ from surrogym_server.models.port import DynamicsModel
 from surrogym_server.virtual.dynamics import Moved
 from surrogym_server.virtual.lanes import LaneState
 
-FARTHEST = 3.0  # limit of a standardised input, in standard deviations
+FARTHEST = 3.0  # standardised inputs are clipped to this absolute value
 
 
 @dataclass(frozen=True)
 class Residual:
-    """Errors as affine functions of standardised inputs, one for each output.
+    """Systematic errors of a model: an affine function of standardised inputs for each output.
 
-    There are K sets of functions; lane i uses set i modulo K.
+    There are K such sets of functions. Lane i (of N parallel environments) uses set i modulo K.
     """
 
     centre: tuple[float, ...]  # (P,) mean of each input
@@ -40,7 +40,8 @@ class Residual:
         return cls(tuple(saved["centre"]), tuple(saved["scale"]), weights)
 
     def check(self, definition: EnvironmentDefinition) -> None:
-        """Raise ``InvalidInput`` unless the residual fits the environment."""
+        """Raise ``InvalidInput`` unless the residual has the numbers of inputs and outputs of the environment and its
+        scales are above 0."""
         if definition.moves_observation:
             raise InvalidInput(
                 "residual: expected a surrogate that models coordinates, got one of preset 'paper', which models "
@@ -59,7 +60,7 @@ class Residual:
             raise InvalidInput(f"residual: expected each entry of scale above 0, got {min(self.scale)}")
 
     def of(self, definition: EnvironmentDefinition, lanes: LaneState, u: Tensor) -> Tensor:
-        """Return the errors (N, O) of the step of lanes under u (N, F)."""
+        """Return the errors of all outputs, (N, O), in the step of N lanes under actions u (N, F)."""
         x = inputs(definition, lanes.q, u)
         x = ((x - x.new_tensor(self.centre)) / x.new_tensor(self.scale)).clamp(-FARTHEST, FARTHEST)
         x = torch.cat([torch.ones_like(x[:, :1]), x], 1)
@@ -78,7 +79,8 @@ def inputs(definition: EnvironmentDefinition, q: Tensor, u: Tensor) -> Tensor:
 
 
 def with_residual(model: DynamicsModel, residual: Residual, lanes: LaneState, u: Tensor, moved: Moved) -> Moved:
-    """Add the errors of ``residual`` to a move of lanes under u (N, F), and apply the environment's rules."""
+    """Return the predicted step ``moved`` of N lanes under u (N, F) with the errors of ``residual`` added. The
+    environment's rules, such as limits, are applied again."""
     definition = model.definition
     errors = residual.of(definition, lanes, u)
     q = settle(definition, moved.q + placed(definition, errors[:, :-1]))

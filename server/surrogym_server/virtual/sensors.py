@@ -13,11 +13,13 @@ from surrogym_server.virtual.lanes import LaneState
 from surrogym_server.virtual.noise import Purpose, normal_noise
 
 SensorNoise = tuple[tuple[str, float], ...]  # pairs: name of a coordinate, standard deviation of one measurement
-MEASURED = 2.0  # how many measurement errors a step's noise contains: one at its start, one at its end
+# Number of measurement errors that the learned noise of a step contains: one at its start, one at its end.
+MEASURED = 2.0
 
 
 def sensed(definition: EnvironmentDefinition, noise: SensorNoise, lanes: LaneState) -> Tensor:
-    """Return the states of the lanes as the sensors measure them, (N, C). Each step of a lane has its own error."""
+    """Return the states of N lanes with the sensors' measurement errors, (N, C). The errors are drawn anew in each
+    step."""
     if not noise:
         return lanes.q
     drawn = normal_noise(lanes, Purpose.SENSOR, 1, len(definition.coordinates))[:, 0]
@@ -25,7 +27,8 @@ def sensed(definition: EnvironmentDefinition, noise: SensorNoise, lanes: LaneSta
 
 
 def driving(model: DynamicsModel, noise: SensorNoise, process: Tensor) -> Tensor:
-    """Scale standard normal process noise (N, ..., M) down by the share of the learned noise that sensors cause."""
+    """Return standard normal numbers ``process`` (N, ..., M), scaled down so that the learned noise that they scale no
+    longer contains the part caused by sensors."""
     able = offers(model, LearnedNoise)
     if not noise or able is None or model.definition.moves_observation:
         return process

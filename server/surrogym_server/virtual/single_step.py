@@ -26,7 +26,7 @@ class PointPrediction:
 
 
 def predict_points(model: DynamicsModel, q: Array, u: Array) -> PointPrediction:
-    """Predict one mean step from each of n states q (n, C) under u (n, F)."""
+    """Predict one step, with mean results, from each of n states q (n, C) under actions u (n, F)."""
     at, action = torch.from_numpy(q), torch.from_numpy(u)
     predicted = model.transition(at, action, reward_std=True)
     require_shapes(model, predicted, at)

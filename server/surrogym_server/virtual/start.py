@@ -20,14 +20,15 @@ def start_coordinates(
     visited_share: float = 0.0,
     visited: Tensor | None = None,
 ) -> Tensor:
-    """Draw the start of each lane's current episode, (N, C).
+    """Draw the first state of the current episode of each of N lanes, (N, C).
 
     Args:
         definition: the environment.
-        lanes: the lanes, whose keys determine the draw.
-        box_share: share of the episodes that start anywhere in the sampling range.
+        lanes: state of the lanes, whose keys and episode numbers determine the draw.
+        box_share: share of the episodes whose start is drawn from the sampling distributions, anywhere in the sampling
+            range.
         visited_share: share of the episodes that start at one of the states ``visited``.
-        visited: (k, C), or None if ``visited_share`` is 0.
+        visited: (k, C) states at which episodes can start, or None if ``visited_share`` is 0.
     """
     coordinates = definition.coordinates
     p = uniform_noise(lanes, Purpose.START, len(coordinates))
@@ -45,15 +46,16 @@ def start_coordinates(
 
 
 def _one_of(states: Tensor, p: Tensor) -> Tensor:
-    """Return the state (N, C) of ``states`` (k, C) that each number p (N,) in [0, 1) selects."""
+    """Return one of the k ``states`` (k, C) for each of N numbers p (N,), (N, C). A number in [0, 1) selects one of k
+    equal intervals."""
     return states[(p * len(states)).long().clamp_(max=len(states) - 1)]
 
 
 def start_particles(
     definition: EnvironmentDefinition, lanes: LaneState, q: Tensor, count: int, spread: float
 ) -> Tensor:
-    """Draw initial particles (N, P, C) around starts q (N, C): normal, with standard deviation ``spread`` times the
-    range of each coordinate (section 4)."""
+    """Draw initial particles (N, P, C) around the first states q (N, C), with P = ``count``. They are normally
+    distributed; the standard deviation is ``spread`` times the range of each coordinate (section 4 of the paper)."""
     each = [_std(definition, i, spread) for i in range(len(definition.coordinates))]
     std = torch.tensor(each, dtype=q.dtype, device=q.device)
     noise = normal_noise(lanes, Purpose.SPREAD, count, len(definition.coordinates))

@@ -16,9 +16,10 @@ logger = logging.getLogger(__name__)
 
 
 def in_fastest_form(settings: VirtualSettings, model: DynamicsModel) -> VirtualSettings:
-    """Return the settings of a new session, with compiled steps if they work on this machine and are faster.
+    """Return the settings of a new session. ``compiled`` is set if compiled steps of the model work on this machine and
+    are faster.
 
-    Compiled steps don't support a residual.
+    It is not set with a residual, which compiled steps don't support.
     """
     stds = settings.variant == "probabilistic" or settings.penalty > 0 or settings.doubts
     able = None if settings.residual is not None else offers(model, CompiledSteps)
@@ -39,13 +40,13 @@ def step(
     mask: Bools | None = None,
     stds: bool = False,
 ) -> tuple[LaneState, LaneTransition]:
-    """Step all lanes, or those of the mask (N,), under the model's actions u (N, F).
+    """Step all N lanes (parallel environments), or those that ``mask`` (N,) selects, under actions u (N, F).
 
     Args:
         model: the model.
         settings: settings of the session.
         lanes: state of the lanes.
-        u: actions.
+        u: actions, in the form in which the model takes them.
         mask: lanes to step, or None for all.
         stds: whether to return the standard deviation of each output.
 
@@ -54,7 +55,7 @@ def step(
 
     Raises:
         InvalidInput: the mask has a wrong length.
-        NotReset: a lane was never reset, or its episode ended under autoreset `disabled`.
+        NotReset: a lane was never reset, or its episode has ended and autoreset does not reset it in this step.
     """
     move = _array_steps(model, settings)
     if move is None or settings.variant == "probabilistic":

@@ -24,9 +24,9 @@ LOW, HALF = np.uint64(0xFFFFFFFF), np.uint64(32)
     types.int64[:, :, ::1],
 )
 def fill(seed: Ints, lane: Ints, episode: Ints, third: Ints, words: Ints) -> None:
-    """Fill ``words`` (N, counters, 4) with random words.
+    """Fill ``words`` (N, counters, 4) with random 32-bit words for N lanes.
 
-    The counter of lane n's i-th four words is (lane[n], episode[n], third[n], i), and its key is ``seed[n]``.
+    The i-th four words of lane n have the counter (lane[n], episode[n], third[n], i) and the key ``seed[n]``.
     """
     for n in range(len(words)):
         key0, key1 = np.uint64(seed[n]) & LOW, (np.uint64(seed[n]) >> HALF) & LOW

@@ -10,8 +10,8 @@ from surrogym_shared.nouns import Query
 
 
 def take_excursion(round: Round) -> tuple[Query, ...] | None:
-    """Return an excursion as the next query if the model is to be tested and the budget has room, otherwise None or
-    ()."""
+    """Return an excursion (an action sequence that leads far away from all samples) as the next query. Return None if
+    the model need not be tested by one, and () if no budget is left for it."""
     if not round.testing:
         return None
     if not round.room:

@@ -9,9 +9,11 @@ from surrogym_shared.nouns import Query
 
 
 def complete_initial_rollouts(round: Round) -> tuple[Query, ...] | None:
-    """Return further random rollouts if the initial design lacks more steps than a planned round takes, otherwise None.
+    """Return further random rollouts if more steps of the initial design are missing than a planned round would take,
+    otherwise None.
 
-    Without them many small rounds would follow, each with a fit to few samples. Logged steps replace initial ones.
+    Steps are missing if rollouts ended early. Without this rule many small rounds would follow, each with a fit to few
+    samples. Steps from a log count as steps of the initial design.
     """
     if not round.continues or round.definition.snapshots:
         return None

@@ -12,10 +12,11 @@ LENGTH = 8  # number of steps of each rollout
 
 
 def see_the_past(round: Round) -> tuple[Query, ...] | None:
-    """Return random rollouts if an error exceeds its tolerance and ``sampling.past`` lacks consecutive steps, otherwise
-    None.
+    """Return random rollouts if a leave-one-out error exceeds its tolerance and there are too few consecutive steps to
+    test whether earlier steps explain it (``sampling.past``). Otherwise return None.
 
-    An environment with snapshots needs none, because a snapshot contains what the environment remembers.
+    It is always None for an environment with snapshots, because a snapshot contains everything that the environment
+    remembers.
     """
     definition, judgement = round.definition, round.judgement
     if not round.may_examine or definition.snapshots or round.request.pending:

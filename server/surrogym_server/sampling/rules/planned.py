@@ -6,11 +6,12 @@ from surrogym_server.sampling.rollouts import Aim, plan_round
 from surrogym_server.sampling.round import Round
 from surrogym_shared.nouns import Query
 
-SHORTEST = 4  # least number of real steps of a planned round
+SHORTEST = 4  # least number of real steps of a planned round without snapshots
 
 
 def plan_rollouts(round: Round) -> tuple[Query, ...]:
-    """Return planned rollouts for the outputs whose confidence is below the target."""
+    """Return rollouts (action sequences) that are planned in the model to give most information about the outputs whose
+    confidence is below the target."""
     request, judgement = round.request, round.judgement
     aim = Aim(
         columns=round.outputs,
@@ -28,8 +29,8 @@ def plan_rollouts(round: Round) -> tuple[Query, ...]:
 def steps_of_a_round(round: Round) -> int:
     """Return the number of real steps of a planned round: a quarter of the number of samples, at least ``SHORTEST``.
 
-    So rounds grow with the data, and fits are few. With snapshots it is an eighth, because a plan need not first lead
-    away from a reset, and at least one step for each output below its target.
+    Rounds grow with the number of samples so that few fits are needed. With snapshots it is an eighth, at least one
+    step for each output below the target, because sequences need not lead away from a reset first.
     """
     samples = len(round.samples)
     if round.definition.snapshots:

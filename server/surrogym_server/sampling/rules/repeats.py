@@ -9,8 +9,8 @@ from surrogym_shared.nouns import Query
 
 
 def repeat_steps(round: Round) -> tuple[Query, ...] | None:
-    """Return repeats of earlier steps if they are needed to tell noise from misfit and the budget has room, otherwise
-    None."""
+    """Return queries that repeat earlier steps if these are needed to tell noise from misfit of the model and if budget
+    is left, otherwise None."""
     if not round.may_examine:
         return None
     with plugin_calls(round.definition):

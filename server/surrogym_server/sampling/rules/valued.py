@@ -9,10 +9,11 @@ from surrogym_shared.nouns import Query
 
 
 def ask_best_candidates(round: Round) -> tuple[Query, ...]:
-    """Return one query for each output below the target, the least confident output first, while the budget has room.
+    """Return one query for each output whose confidence is below the target, the least confident first, as far as the
+    budget allows: the candidate with the largest value of the acquisition.
 
-    If the design has ended, return ``request.extra`` queries for the outputs in turn. If candidates are reserved (see
-    ``Candidates``), the first query is one of them.
+    If the design has ended, return ``request.extra`` queries, for these outputs in turn. If some candidates are
+    reserved (see ``Candidates``), the first query is one of them.
     """
     judgement = round.judgement
     unanswered = Points.of(round.definition, round.request.unanswered)

@@ -21,8 +21,8 @@ BLOCK = 64  # number of lanes computed at once
 
 @entry(types.float64[::1], types.int64[:, ::1], types.float64[:, ::1], types.float32[:, ::1])
 def observe(numbers: Floats, places: Ints, q: Floats, observation: Singles) -> None:
-    """Write the observations (N, D) of coordinates q (N, C) to ``observation``; ``numbers`` and ``places`` are tables
-    of its terms."""
+    """Write the observations of coordinates q (N, C) to ``observation`` (N, D). ``numbers`` and ``places`` are the
+    tables of the terms that compute the observation."""
     size = q.shape[1]
     for begin in range(0, len(q), BLOCK):
         lanes = min(BLOCK, len(q) - begin)
@@ -46,8 +46,9 @@ def _exceeds(std: Floats, trust: float, scales: Floats) -> bool:
 
 @inlined
 def _doubt(std: Floats, scales: Floats) -> float:
-    """Return the largest of the standard deviations relative to those over the samples, times the reward's standard
-    deviation over the samples."""
+    """Return the doubt about a step, in the unit of the reward. It is the largest ratio of an output's standard
+    deviation ``std`` (O,) to its standard deviation over the samples, ``scales`` (O,), times the latter of the reward.
+    """
     most = 0.0
     for o in range(len(std)):
         most = max(most, std[o] / scales[o])
@@ -56,7 +57,9 @@ def _doubt(std: Floats, scales: Floats) -> float:
 
 @inlined
 def _penalised(mean: float, std: Floats, penalty: float, caution: float, scales: Floats) -> float:
-    """Return a mean reward less its penalties for the standard deviations ``std`` (O,), the reward's last.
+    """Return a mean reward less two penalties: ``penalty`` times the reward's standard deviation, and ``caution`` times
+    the doubt about the step (see ``_doubt``). ``std`` (O,) are the standard deviations of the outputs, the reward's
+    last.
 
     ``std`` is not read where ``penalty`` and ``caution`` are 0.
     """
@@ -114,23 +117,27 @@ def conclude(
     rewards: Floats,
     ends: Bools,
 ) -> int:
-    """Complete the step of the moving lanes, given by the mask ``moving`` (N,). Change arrays in place.
+    """Complete the step of those of N lanes (parallel environments) that move, from their predictions: rewards,
+    penalties, ends of episodes. The last five array arguments are changed in place.
 
     Args:
-        moving: lanes that move; row k of q_next, pay, std, over and fallen belongs to the k-th of these.
+        moving: (N,) mask of the lanes that move. Row k of q_next, pay, std, over and fallen belongs to the k-th of
+            these.
         q_next, pay, std, over: predicted coordinates, rewards, standard deviations and terminations of these lanes.
-        fallen: which of these lanes end because the fallback of the limits would act; (0,) if there are no limits.
+        fallen: which of these lanes end because the fallback action of the limits would take over; (0,) without limits.
         scales: (O,) standard deviation of each output over the samples.
         terminal_reward: reward that terminating steps pay in addition.
         penalty, trust, caution, time_limit: as in ``VirtualSettings``; trust is infinite and time_limit -1 for None.
-        inside: ends of the sampling range, (2, C). A lane outside of it has left. (0, 0) if such a lane does not end.
-        outside_reward: what a lane that has left, is untrusted or has fallen gets for this step and each missing one.
-        q, elapsed, phase: state of all lanes, updated.
-        rewards: (2, N) penalised rewards and mean rewards, written.
-        ends: (5, N) terminated, truncated, untrusted, terminated or truncated, left; written.
+        inside: lower and upper ends of the sampling range, (2, C), if an episode ends when it leaves this range,
+            otherwise (0, 0).
+        outside_reward: reward, for this step and for each missing one, of a lane whose episode ended because it left
+            the sampling range or the trusted range or because it is in ``fallen``.
+        q, elapsed, phase: coordinates, numbers of steps and phases of all N lanes; updated.
+        rewards: (2, N) array for the penalised rewards and the mean rewards.
+        ends: (5, N) array for the flags terminated, truncated, untrusted, terminated or truncated, left.
 
     Returns:
-        The number of lanes that ended.
+        The number of lanes whose episode ended.
     """
     row = count = 0
     for n in range(len(moving)):

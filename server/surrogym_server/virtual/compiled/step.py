@@ -31,7 +31,7 @@ Singles = NDArray[np.float32]
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
 
-MODELS = 64  # number of models whose observation tables are cached
+MODELS = 64  # number of models whose tables for observations are cached
 ANYWHERE = np.zeros((0, 0))  # passed as the ends of the sampling range where these are not needed
 NO_LANES = np.zeros(0, dtype=np.int64)
 NO_FALLBACK = np.zeros(0, dtype=np.bool_)  # passed if there are no limits
@@ -39,7 +39,8 @@ NO_FALLBACK = np.zeros(0, dtype=np.bool_)  # passed if there are no limits
 
 @dataclass(frozen=True)
 class _Changed:
-    """Copies of the arrays that a step of N lanes changes in place, and the arrays of its results."""
+    """Arrays of one step of N lanes (parallel environments): copies of the parts of the lanes' state that the step
+    changes in place, and the arrays of its results."""
 
     q: Floats  # (N, C) states
     episode: Ints  # (N,) numbers of the episodes
@@ -68,7 +69,8 @@ def compiled_step(
     mask: Bools | None,
     stds: bool,
 ) -> tuple[LaneState, LaneTransition]:
-    """Step lanes as ``virtual.environment.step`` does; ``move`` is the model's compiled step."""
+    """Step lanes (parallel environments) as ``virtual.environment.step`` does, in compiled code. ``move`` is the
+    model's compiled step."""
     definition, changed = model.definition, _Changed.of(lanes)
     running, moving, beginning = _divided(settings, lanes, changed.phase, mask)
     if settings.variant == "pathwise":
@@ -102,7 +104,7 @@ def compiled_step(
 def _divided(
     settings: VirtualSettings, lanes: LaneState, phase: NDArray[np.int8], mask: Bools | None
 ) -> tuple[Bools, Chosen, Bools | None]:
-    """Divide the lanes by what this step does with them.
+    """Divide the lanes (parallel environments) into those that this step moves and those that it resets.
 
     Returns:
         A mask (N,) of the lanes to move; the same selection as a mask or EVERY; and a mask (N,) of the lanes to reset,
@@ -125,7 +127,7 @@ def _moved(
     moving: Chosen,
     stds: bool,
 ) -> ArrayTransition:
-    """Predict the step of the moving lanes, in their order."""
+    """Predict the step of the lanes that move. The result has a row for each of them, in their order."""
     wanted, process = stds or settings.doubts, None
     if settings.process_noise:
         drawn = normal_noise(lanes, Purpose.PROCESS, 1, len(model.definition.outputs) - 1)[:, 0]
@@ -146,8 +148,8 @@ def _rows(moving: Chosen, values: NDArray[Any]) -> NDArray[Any]:
 
 
 def _fallen(definition: EnvironmentDefinition, moving: Chosen, lanes: LaneState, moved: ArrayTransition) -> Bools:
-    """Return which moving lanes come to states in which the fallback action of the limits would take over, (K,); (0,)
-    if there are no limits."""
+    """Return in which of the K lanes that move the fallback action of the limits would take over after the step, (K,)
+    bool; (0,) if there are no limits."""
     if definition.limits is None:
         return NO_FALLBACK
     fallen: Bools = definition.falls_back(lanes.take(moving).q, torch.from_numpy(moved.q_next)).numpy()
@@ -162,7 +164,8 @@ def _concluded(
     changed: _Changed,
     fallen: Bools,
 ) -> int:
-    """Complete the step of the moving lanes in ``changed``, and return the number of lanes that ended."""
+    """Complete the step of the lanes that move, write the results to ``changed``, and return the number of lanes whose
+    episode ended."""
     trust, limit, outside = settings.trust, settings.time_limit, model.definition.outside_reward
     scales = model.scales.numpy() if settings.doubts else np.zeros(0)
     return conclude(
@@ -191,7 +194,7 @@ def _concluded(
 def _begin(
     definition: EnvironmentDefinition, settings: VirtualSettings, lanes: LaneState, chosen: Bools, changed: _Changed
 ) -> None:
-    """Begin new episodes in the chosen lanes (N,), in ``changed``."""
+    """Begin new episodes in the lanes that the mask ``chosen`` (N,) selects: write their states to ``changed``."""
     at = torch.from_numpy(chosen)
     fresh = lanes.take(at)
     fresh = replace(fresh, episode=fresh.episode + 1, elapsed=torch.zeros_like(fresh.elapsed))
@@ -209,7 +212,7 @@ def _shown(
     changed: _Changed,
     chosen: Ints | None = None,
 ) -> Floats:
-    """Return the states of all lanes, or of the chosen ones, as the sensors measure them, (n, C)."""
+    """Return the states of all lanes, or of the ``chosen`` ones, with the sensors' measurement errors, (n, C)."""
     if not settings.sensor_noise or (chosen is not None and not len(chosen)):
         return changed.q if chosen is None else changed.q[chosen]
     lanes = changed.lanes(before)
@@ -231,7 +234,8 @@ def _observation_tables(steps: ArraySteps) -> Tables:
 
 
 def _scattered(moving: Bools, values: Floats) -> Floats:
-    """Spread values of the moving lanes over all N lanes, with 0 in the others."""
+    """Return an array with a row for each of N lanes: the rows of ``values`` for the lanes that move, and 0 for the
+    others."""
     if len(values) == len(moving):
         return values
     full: Floats = np.zeros((len(moving), *values.shape[1:]))
