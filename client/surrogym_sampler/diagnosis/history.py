@@ -111,7 +111,8 @@ def look_back(environment: RolloutEnvironment, spec: EnvironmentSpec, steps: int
 
 
 def declared(spec: EnvironmentSpec) -> tuple[int, int]:
-    """Return the number of earlier changes and of earlier actions that the specification declares as lags."""
+    """Return the number of earlier changes and of earlier actions that the specification declares as coordinates
+    (lags)."""
     ages: dict[str, tuple[int, int]] = {}
     for c in spec.coordinates:
         if c.lag is not None and c.lag.kind != "steps":

@@ -16,7 +16,7 @@ Files = Mapping[str, Path | None]
 
 
 def rejected_file(log: Path, given: str | Path | None) -> Path:
-    """Return the file for rows that can't be used: the given one, or LOG.rejected.csv beside the log."""
+    """Return the file for rows that can't be used: ``given``, or LOG.rejected.csv beside the log if it is None."""
     if given is not None:
         return Path(given)
     log = log if log.name else log.resolve()  # the path "." has no name, but may be the folder of a data set

@@ -56,7 +56,8 @@ class Task:
 
 
 def pendulum() -> EnvironmentSpec:
-    """Return the specification of Pendulum-v1: swing up and stay. The reward depends on the state before the step."""
+    """Return the specification of Pendulum-v1: swing the pendulum up and keep it there. The reward depends on the state
+    before the step."""
     return EnvironmentSpec(
         environment="Pendulum-v1",
         coordinates=(
@@ -129,8 +130,8 @@ def _cartpole(
 
 
 def mountain_car_continuous() -> EnvironmentSpec:
-    """Return the specification of MountainCarContinuous-v0: reach the right hill; 100 on arrival, minus the squared
-    force.
+    """Return the specification of MountainCarContinuous-v0: reach the right hill. The reward is 100 on arrival, minus a
+    tenth of the squared force in each step.
 
     Positions are sampled up to 0.52, from where no step reaches the right wall at 0.6, so that only the left wall,
     which also stops the car, has to be declared.

@@ -174,8 +174,8 @@ def fits(noted: str, name: str) -> bool:
 
 
 def own_time_limit(name: str) -> int:
-    """Return the time limit in steps that a known environment was registered with; ``LONGEST_EPISODE`` if
-    it has none."""
+    """Return the time limit in steps with which Gymnasium registers a known environment; ``LONGEST_EPISODE`` if there
+    is none."""
     import gymnasium
 
     if name in gymnasium.registry:

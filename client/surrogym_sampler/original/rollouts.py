@@ -86,8 +86,8 @@ class FromReset:
         )
 
     def save(self) -> bytes:
-        """Return a snapshot of the whole state: the environment's own bytes, after the coordinates if some of them are
-        lags.
+        """Return a snapshot of the whole state: the environment's own bytes. The coordinates are put before these if
+        some of them repeat earlier values (lags).
 
         Raises:
             StepFailed: the environment's ``save`` does not return bytes, or there are lags and no episode is running.
@@ -108,7 +108,8 @@ class FromReset:
         """Return to the state of a snapshot, and return the coordinates (C,) there.
 
         Raises:
-            StepFailed: the snapshot is too short for its lags, or ``coordinates`` does not return an array (R,).
+            StepFailed: the snapshot is too short to contain the coordinates, or ``coordinates`` does not return an
+                array (R,).
         """
         self._at = None
         if len(snapshot) < self._prefix:

@@ -47,7 +47,7 @@ class Returning:
         known: names of the snapshots that the server knows.
 
     Attributes:
-        gone: names of snapshots that no longer exist, which the server has not been told yet.
+        gone: names of snapshots that no longer exist, of which the server has not been told yet.
     """
 
     def __init__(

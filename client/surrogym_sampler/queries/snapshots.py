@@ -199,7 +199,7 @@ class SnapshotFolder:
         return len(kept) > self._bounds.count or sum(one.size for one in kept) > self._bounds.size
 
     def _nearest(self, kept: Mapping[str, _Kept], newest: str) -> str:
-        """Return the name of the snapshot that is nearest to another one; never the newest."""
+        """Return the name of the snapshot that is nearest to another one. The newest snapshot is never chosen."""
         names = list(kept)
         points = self._scaled([one.coordinates for one in kept.values()])
         return names[least_useful(points, keep=names.index(newest) if newest in kept else None)]

@@ -353,8 +353,8 @@ def _measurements(spec: EnvironmentSpec, ranges: dict[str, tuple[float, float]])
 
 
 def _readable(coordinate: Coordinate) -> tuple[float, float]:
-    """Return the default range of valid readings: much wider than the sampling range, because leaving that is not a
-    fault of the sensor."""
+    """Return the default range of valid readings. It is much wider than the sampling range, because a reading outside
+    of that range need not be a fault of the sensor."""
     if coordinate.kind == "angle":
         return -2 * np.pi * TURNS, 2 * np.pi * TURNS
     low, high = coordinate.settable
@@ -388,7 +388,8 @@ def _remembered(spec: EnvironmentSpec, place: int, coordinate: Coordinate, lag: 
 
 
 def _guard(spec: EnvironmentSpec, low: Array, high: Array) -> Guard | None:
-    """Return the limits of a specification with its fallback, clipped to actions from low (F,) to high (F,)."""
+    """Return the limits of a specification with its fallback, whose actions are clipped to the range from low (F,) to
+    high (F,). None if the specification has no limits."""
     if spec.limits is None:
         return None
     limits = (

@@ -111,7 +111,8 @@ def steps_of(traces: Sequence[Trace], most: int = MOST) -> list[StepOfEpisode]:
 
 
 def steady(spec: EnvironmentSpec, steps: Sequence[StepOfEpisode]) -> list[StepOfEpisode]:
-    """Return the steps in which no constant coordinate changed, such as a setpoint, because a model keeps constants."""
+    """Return the steps in which no constant coordinate, such as a setpoint, changed. The other steps can't be
+    predicted, because the model keeps constants."""
     held = [(i, ROUNDING * span(c)) for i, c in enumerate(spec.coordinates) if c.kind == "constant"]
     return [one for one in steps if all(abs(one.next_coordinates[i] - one.coordinates[i]) <= most for i, most in held)]
 
@@ -146,7 +147,7 @@ class Disagreements:
 
     Attributes:
         compared: number of real steps that were compared.
-        found: steps whose error exceeds the model's claim, the worst first.
+        found: steps whose error exceeds the one that the model predicts, by more than chance; the worst first.
         missing: real minus predicted reward over the compared steps of each episode, by the episode's number.
         shared: further steps that contribute most to an error that all steps share, the largest first.
     """

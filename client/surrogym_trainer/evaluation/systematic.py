@@ -114,7 +114,7 @@ class _Form(NamedTuple):
 
 @dataclass(frozen=True)
 class Systematic:
-    """The result of the joint test: the part of the errors that all real steps share.
+    """The result of the test for a part of the model's errors that all real steps share.
 
     Attributes:
         names: names of the outputs, (O,).

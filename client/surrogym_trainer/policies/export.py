@@ -168,7 +168,7 @@ def _loaded(policy: Path, algorithm: str, *, trust: bool) -> tuple[MostProbable 
 
 
 def _difference(ours: Predict, theirs: Predict, size: int) -> float:
-    """Return the largest difference of actions over random observations (CHECKS, D).
+    """Return the largest difference between the actions of two policies for the same random observations (CHECKS, D).
 
     Raises:
         NotExportable: the difference exceeds the tolerance.

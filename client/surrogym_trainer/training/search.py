@@ -155,7 +155,7 @@ def search_for(settings: TrainSettings) -> PolicySearch:
 
     Raises:
         ValueError: the settings name no search, the name or a hyperparameter is unknown, or the search does not support
-            a setting: to be prolonged, tracked or started from a policy, or other starts and a horizon.
+            a setting: prolonging, tracking, a policy to start from, other starts, or a horizon.
     """
     name, kind = name_of(settings), SEARCHES.get(name_of(settings))
     if settings.prolong and not kind.prolongable:

@@ -116,7 +116,8 @@ def chunks_of_file(path: Path) -> Iterator[bytes]:
 
 
 def chunks_of_stream(stream: BinaryIO) -> Iterator[bytes]:
-    """Yield what arrives from a stream as soon as it arrives, and a final line end, which the last line may lack."""
+    """Yield what arrives from a stream as soon as it arrives. At the end, yield a line end, because the last line may
+    lack one."""
     while chunk := os.read(stream.fileno(), CHUNK):
         yield chunk
     yield b"\n"

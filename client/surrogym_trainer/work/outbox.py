@@ -119,7 +119,7 @@ class Outbox:
         return f"job {waiting.job} {status}{f': {error}' if error else ''}{_stored(name, version)}"
 
     def _send_video(self, api: Api, waiting: Waiting) -> None:
-        """Send the video of an evaluation. It replaces an older one of the same form."""
+        """Send the video of an evaluation. It replaces an older video of the same format."""
         if waiting.video is not None and waiting.version is not None:
             path = self._folder / waiting.video
             form: wire.PolicyForm = "mp4" if path.suffix == ".mp4" else "gif"
@@ -127,7 +127,8 @@ class Outbox:
 
 
 def _evaluated(api: Api, name: str, version: int | None, evaluations: tuple[wire.AddEvaluation, ...]) -> int | None:
-    """Send the evaluations of a policy, and return the id of the policy's own; None if there is none."""
+    """Send the evaluations of a policy and of the controllers that it is compared with. Return the id of the policy's
+    evaluation; None if there is none."""
     stored = [api.policies.evaluate(name, version or 0, evaluation) for evaluation in evaluations]
     return next((one.id for one in stored if one.controller == "policy"), None)
 

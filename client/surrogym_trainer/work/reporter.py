@@ -110,8 +110,8 @@ class Reporter:
         self._note(replace(self.stand, stage=stage, share=share))
 
     def storing(self) -> None:
-        """Report at once that the result is being sent, with the end of the curve. From then on the job can't be
-        stopped."""
+        """Report at once that the result is being sent, together with the end of the training curve. From then on the
+        job can't be stopped."""
         self.stand = replace(self.stand, stage="storing", share=0.0)
         self.show(self.stand)
         self._report(self.stand)

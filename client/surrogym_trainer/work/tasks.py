@@ -196,7 +196,7 @@ def _controllers(task: wire.EvaluateTask, environment: Environment, policy: Pred
 def _filmed(
     environment: Environment, result: Evaluation, settings: EvaluationSettings, path: Path
 ) -> tuple[Path | None, str | None]:
-    """Write a video, and return its file, or the reason why it could not be made, because that must not fail an
+    """Write a video. Return its file, or the reason why it could not be made: a video that fails must not fail the
     evaluation."""
     try:
         video = record(environment.spec, environment.name, result, words_of(settings))

@@ -108,8 +108,8 @@ def _wander(subject: Subject) -> None:
 
 
 def _difference(subject: Subject, one: Array, other: Array) -> float:
-    """Return the largest difference between two results of a step, each a next state and a reward (C + 1,): of states
-    as a share of the range, of rewards relative."""
+    """Return the largest difference between two results of a step, (C + 1,) each: a next state, followed by the reward.
+    Differences of coordinates are shares of the sampling range; the difference of the rewards is relative."""
     paid = abs(one[-1] - other[-1]) / max(1.0, abs(one[-1]))
     return max(apart(subject.spec, one[:-1], other[:-1]), float(paid))
 

@@ -144,7 +144,7 @@ class _Boundary:
         self._pairs = ((few[n % len(few)], others[(n + n // len(few)) % len(others)]) for n in itertools.count())
 
     def more(self) -> Paid:
-        """Add at most ``POINTS`` points, by at most twice as many bisections, and return all points."""
+        """Add at most ``POINTS`` points of the boundary, by at most twice as many bisections, and return all points."""
         enough = len(self.points) + POINTS
         for one, other in itertools.islice(self._pairs, 2 * POINTS):
             self.between(one, other)

@@ -32,13 +32,13 @@ class Distribution(Sampled, Protocol):
         ...
 
     def slopes(self, outputs: Array, further: Array, actions: Array, by: Array) -> tuple[Array, Array]:
-        """Return a loss's derivatives by the outputs and by the further parameters.
+        """Return the derivatives of a loss with respect to the outputs and to the further parameters.
 
         Args:
             outputs: outputs of the actor (B, A).
             further: the distribution's further parameters (K,).
             actions: the actions taken (B, F).
-            by: the loss's derivatives by the log probabilities (B,).
+            by: the derivatives of the loss with respect to the log probabilities (B,).
         """
         ...
 

@@ -132,7 +132,7 @@ def backward(
         relu: whether the hidden units are rectified; otherwise tanh.
         x: inputs (n, I) of the last forward pass.
         passed: the buffer that the last forward pass filled.
-        slope: the loss's derivative by the outputs of that pass (n, O).
+        slope: the derivative of the loss with respect to the outputs of that pass (n, O).
     """
     rows, end, at = len(x), len(gradient), len(x) * sizes[1:].sum()
     spare = np.empty((2, rows * sizes.max()), dtype=np.float32)

@@ -53,7 +53,8 @@ class Mlp:
         raise AssertionError("unreachable: a network has a layer")
 
     def backward(self, slope: Array) -> None:
-        """Write the gradient of a loss whose derivative by the outputs of the last forward pass is ``slope`` (B, O)."""
+        """Write the gradient of a loss to ``gradient``. ``slope`` (B, O) is the derivative of the loss with respect to
+        the outputs of the last forward pass."""
         for number in reversed(range(len(self.layers))):
             weights, _ = self.layers[number]
             by_weights, by_bias = self._gradients[number]

@@ -51,7 +51,7 @@ class Collector:
 
     @property
     def episode_penalty(self) -> float | None:
-        """The mean penalty of the last episodes, summed over each; None if the session has no penalty."""
+        """The mean penalty of an episode, over the last episodes; None if the session has no penalty."""
         return float(np.mean(self._penalties)) if self._penalties else None
 
     def collect(self, learner: Learner, steps: int, hold: int = 1) -> Rollout:
