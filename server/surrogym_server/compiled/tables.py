@@ -24,13 +24,13 @@ class TablesBuilder:
         self._matrices: list[NDArray[Any]] = []
 
     def add(self, *matrices: ArrayLike) -> int:
-        """Append matrices, and return the index of the first."""
+        """Append matrices to the tables, and return the index of the first one."""
         first = len(self._matrices)
         self._matrices += [np.atleast_2d(np.asarray(matrix, dtype=np.float64)) for matrix in matrices]
         return first
 
     def reserve(self) -> int:
-        """Append an empty matrix, to be replaced by ``fill``, and return its index."""
+        """Append an empty matrix to the tables, which ``fill`` replaces later, and return its index."""
         return self.add(np.zeros((1, 0)))
 
     def fill(self, place: int, matrix: ArrayLike) -> None:
@@ -46,6 +46,6 @@ class TablesBuilder:
 
 @compiled
 def matrix(numbers: Floats, places: Ints, place: int) -> Floats:
-    """Return the matrix with index ``place``, (rows, columns), as a view."""
+    """Return the matrix with index ``place`` in the tables ``numbers`` and ``places``, (rows, columns), as a view."""
     begin, rows, columns = places[place, 0], places[place, 1], places[place, 2]
     return numbers[begin : begin + rows * columns].reshape((rows, columns))

@@ -38,8 +38,8 @@ def _unwrapped(speeds: Tensor, change: Tensor) -> Tensor:
     the speeds (n, L). Return the increments unchanged if this does not clearly reduce the residuals.
 
     The search has many starts: each assumes a slope over one speed, up to the slope that explains ``MAX_TURNS`` turns
-    in a step. From each start it alternates between two steps: choose the turns that come closest to the linear
-    function, then fit the function by least squares. The result with the smallest residuals is used.
+    in a step. From each start it alternates: it chooses the turns that come closest to the linear function, then fits
+    the function by least squares. The result with the smallest residuals is used.
     """
     basis = torch.cat([torch.ones(len(speeds), 1, dtype=torch.float64), speeds], 1)
     solve = torch.linalg.pinv(basis)

@@ -15,7 +15,8 @@ from surrogym_shared.kinds import RewardShape
 
 @dataclass(frozen=True)
 class QuantityDefinition:
-    """Quantity of state and action in a declared reward, x = term(q) + action . u."""
+    """Quantity on which terms of a declared reward depend: x = term(q) + action . u, with coordinates q and
+    action u."""
 
     term: TermDefinition
     action: tuple[float, ...]  # (F,) weight of each action entry
@@ -23,8 +24,8 @@ class QuantityDefinition:
 
 @dataclass(frozen=True)
 class RewardTermDefinition:
-    """Term of a declared reward: weight * shape(x_1, x_2, ...) if every inequality in ``when`` holds, else 0; see
-    ``spec.RewardTerm``."""
+    """Term of a declared reward: weight * shape(x_1, x_2, ...) of quantities x_1, x_2, ... if every inequality in
+    ``when`` holds, else 0; see ``spec.RewardTerm``."""
 
     weight: float
     shape: RewardShape

@@ -49,8 +49,8 @@ class CoordinateDefinition:
 
     name: str
     kind: CoordinateKind
-    sampling: Distribution  # distribution in queries
-    start: Distribution  # distribution at the start of episodes
+    sampling: Distribution  # distribution from which queries are drawn
+    start: Distribution  # distribution of the first states of episodes
     low: float = -np.inf  # lower saturation bound
     high: float = np.inf  # upper saturation bound
     stops: int | None = None  # index of the coordinate that becomes zero at a bound, such as the speed at a wall
@@ -165,7 +165,8 @@ class EnvironmentDefinition:
     # Greatest number of actions of a query; None if the environment can be set to any state.
     max_rollout: int | None = None
     snapshots: bool = False  # whether a query may begin at a snapshot (a saved state) instead of a reset
-    starts: tuple[tuple[float, ...], ...] = ()  # states at which episodes start; if empty, by their distributions
+    # States at which episodes start; if there are none, starts are drawn from the coordinates' distributions ``start``.
+    starts: tuple[tuple[float, ...], ...] = ()
     outside_reward: float | None = None  # reward for each step that an episode misses after it left the sampling range
     limits: LimitsDefinition | None = None  # limits of the specification, or None
     device: torch.device = CPU  # device of the definition's tensors, and of states and actions that are passed to it

@@ -31,7 +31,7 @@ class FeatureMap:
         state: how angles are encoded: as cos and sin, as the wrapped angle, or both. Or ``observation``: the
             observation replaces the coordinates, standardised except in preset paper. Or ``none``: no coordinates and
             no action, only the lead.
-        action: discrete actions as evenly spaced values, or one-hot, or no action at all.
+        action: how discrete actions are encoded: as evenly spaced values or one-hot; or no action at all.
         lead: whether the lead is an input too: the predicted next value of each leading coordinate (see ``leading``),
             clipped to its limits. With it, an output that depends on a limited speed, such as an angle, has no kink
             where the speed reaches its limit.

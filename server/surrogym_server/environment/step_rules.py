@@ -51,7 +51,7 @@ def moved(
 
     Args:
         definition: the environment.
-        inverse: inverse of the observation if the outputs move the observation, otherwise None.
+        inverse: inverse of the observation if the model predicts changes of the observation, otherwise None.
         q: coordinates (m, C) before the step.
         u: actions (m, F).
         change: change of the coordinates, (m, C), or of the observation, (m, D).

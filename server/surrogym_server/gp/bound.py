@@ -45,7 +45,7 @@ SEARCHES = ((2_000, 40), (None, 15))
 # If the noise variance is above this share of the output's variance, it hides the errors of inducing points.
 NOISY = 1e-4
 PRECISE = 1e-4  # leave-one-out errors below this, in standard deviations of the output, count as exact
-HARDLY = 0.3  # an input may be left out if its effect on the mean is below this share of the noise deviation
+HARDLY = 0.3  # an input may be left out if its effect on the mean is below this share of the noise's standard deviation
 TRIES = 6  # greatest number of searches for inputs that can be left out
 JITTER = 1e-9  # added to the diagonal of K_uu, as a share of the points' mean prior variance
 
@@ -111,8 +111,8 @@ def fit_through_few(
 def loses_nothing(posterior: Posterior) -> bool:
     """Return whether a posterior is as accurate as one that uses all points without inducing points.
 
-    An exact posterior is. A posterior with inducing points is if these are fewer than ``SOME`` and if either the noise
-    hides their errors or each point is predicted precisely from the others.
+    An exact posterior always is. With inducing points, a posterior counts as such if there are fewer than ``SOME`` of
+    them, and if either the noise hides their errors or each point is predicted precisely from the others.
     """
     if posterior.sparse is None:
         return True
@@ -303,14 +303,15 @@ class Bound(Parameters):
         return part_of_kernel
 
     def _gradient(self, theta: Array, covariances: _Covariances, outer: Array, each: float) -> Array:
-        """Return the gradient over theta by the chain rule.
+        """Return the gradient of the bound (without priors) with respect to theta, by the chain rule. The entry of the
+        noise stays 0.
 
         Args:
             theta: free parameters.
             covariances: the covariances at theta.
-            outer: gradient over K_uf, (m, n). It includes the gradient over K_uu, because inducing points are some of
-                the points.
-            each: gradient over each entry of K_ff's diagonal, equal for all.
+            outer: gradient of the bound with respect to K_uf, (m, n). It includes that with respect to K_uu, because
+                inducing points are some of the points.
+            each: derivative of the bound with respect to each entry of K_ff's diagonal, which is the same for all.
         """
         lengthscale, signal, linear, quadratic, _ = self.values(theta)
         gradient, n = np.zeros_like(theta), len(self.y)

@@ -20,13 +20,16 @@ from surrogym_shared.compiled.jit import inlined
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-# Indices of a process's matrices in the tables: HEAD: the scalars that are numbered below. INPUTS (2, d): columns of x
-# that the process reads, and inverse length scales. POINTS (S, d): points divided by the length scales, then their
-# mirror images if there is a reflection. WEIGHTS (1, S): weights of the points in the mean. POLYNOMIALS (5 + 2 n, d):
-# coefficients of x and x^2 in the mean, of x^2 and x^4 in the prior variance, of the mirror image's exponent, and of
-# the polynomial covariances with the n points (first linear, then quadratic). FACTOR (n, n): Cholesky factor L. KEPT,
-# TURNED (d, 256): frequencies of posterior samples, divided by the length scales: KEPT for inputs whose sign a
-# reflection keeps, TURNED for inputs whose sign it changes.
+# Indices of a process's matrices in the tables:
+# HEAD: the scalars that are numbered below.
+# INPUTS (2, d): columns of x that the process reads, and inverse length scales.
+# POINTS (S, d): points divided by the length scales, then their mirror images if there is a reflection.
+# WEIGHTS (1, S): weights of the points in the mean.
+# POLYNOMIALS (5 + 2 n, d): coefficients of x and x^2 in the mean, of x^2 and x^4 in the prior variance, of the mirror
+#   image's exponent, and of the polynomial covariances with the n points (first linear, then quadratic).
+# FACTOR (n, n): Cholesky factor L.
+# KEPT, TURNED (d, 256): frequencies of posterior samples, divided by the length scales: KEPT for inputs whose sign a
+#   reflection keeps, TURNED for inputs whose sign it changes.
 HEAD, INPUTS, POINTS, WEIGHTS, POLYNOMIALS, FACTOR, KEPT, TURNED = range(8)
 # Columns of HEAD: scale of the output, constant of the mean, constant of the prior variance, parity of the reflection
 # (0 without one), signal variance, constant of the polynomial covariance, whether there is a polynomial part, number of

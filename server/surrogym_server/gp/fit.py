@@ -44,7 +44,7 @@ def fit(
     """Fit a process to inputs x (n, d) and targets y (n,), both standardised. Runs on the CPU.
 
     Args:
-        warm: theta of an earlier fit, from which to start as well; None for the default start only.
+        warm: theta of an earlier fit, at which a search starts too; None for the default start only.
         reflection: symmetry of the functions to fit, or None.
 
     Raises:

@@ -65,7 +65,7 @@ class Part:
         return condition(self.fewer, self.read(self.reads), self.y)
 
     def read(self, inputs: Inputs) -> Tensor:
-        """Return the samples of the inputs with these indices, (n, d)."""
+        """Return the columns of x that belong to the inputs with these indices, (n, d)."""
         return self.x[:, list(inputs)]
 
     def targets_of(self, other: Part) -> Tensor:

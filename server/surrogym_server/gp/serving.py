@@ -57,8 +57,8 @@ class _Process:
     inputs: Tensor  # columns of x that the process reads
     inverse_lengthscale: Tensor  # (d,) 1 / lengthscale
     scaled: Tensor  # (n, d) points divided by length scales; with a reflection also their mirror images, (2 n, d)
-    factor: Tensor  # (n, n) lower Cholesky factor, L / sigma_f^2
-    polynomial: Tensor | None  # (D, n) coefficients R of the polynomial covariances, over sigma_f^2
+    factor: Tensor  # (n, n) lower Cholesky factor L, divided by sigma_f^2
+    polynomial: Tensor | None  # (D, n) coefficients R of the polynomial covariances, divided by sigma_f^2
     prior: Tensor  # (D,) coefficients of z^2 in the prior variance, without the mirror image's term
     signal_variance: float
     parity: int  # 1 or -1; 0 without a reflection

@@ -179,7 +179,7 @@ class ModelCodec(ABC):
 
     @abstractmethod
     def encode(self, model: DynamicsModel) -> StoredModel:
-        """Return everything of a model except its definition.
+        """Return a model as data, without its definition.
 
         Raises:
             TypeError: the model belongs to another family.

@@ -26,7 +26,7 @@ def learner_of(choice: Choice) -> Learner:
 def in_full(choice: Choice) -> Choice:
     """Replace a short name by the family and the settings for which it stands.
 
-    Settings that ``choice`` gives itself override those. A choice whose name is no short name is returned unchanged.
+    Settings in ``choice`` override those of the short name. A choice whose name is no short name is returned unchanged.
     """
     if (short := SHORT.get(choice.name.casefold())) is None:
         return choice

@@ -119,9 +119,10 @@ def judge(
     """Decide whether the design continues, is ready, or has spent its budget.
 
     A design is ready if the confidence index of every output has reached the target. With the stopping rule
-    ``tested_confidence`` three more conditions hold: leave-one-out errors are known and within the tolerances; ends of
-    episodes and peaks of the reward are known; and at least half as many adaptive queries as initial ones were
-    answered. Logged samples count as initial ones, because they were not chosen to disprove the model.
+    ``tested_confidence`` three more conditions have to be met: leave-one-out errors are known and within the
+    tolerances; ends of episodes and peaks of the reward are known; and at least half as many adaptive queries as
+    initial ones were answered. Logged samples count as initial ones, because they were not chosen to disprove the
+    model.
 
     Args:
         definition: the environment, with the settings of its design.

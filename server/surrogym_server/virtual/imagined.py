@@ -21,8 +21,9 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class ImaginedEpisode:
-    coordinates: Array  # (t + 1, C) states, the start included; t < T if the episode terminated
-    reward: NDArray[np.floating[Any]]  # (t,) reward of each step
+    # (t + 1, C) states, the start included; t is the number of actions, or less if the episode terminated.
+    coordinates: Array
+    reward: NDArray[np.floating[Any]]  # (t,) reward of each of t steps
     terminated: bool
 
 

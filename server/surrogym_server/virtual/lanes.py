@@ -39,7 +39,7 @@ class LaneState:
         return len(self.seed)
 
     def take(self, index: NDArray[Any] | Chosen) -> LaneState:
-        """Return the state of the lanes that an index array or a mask selects, in its order."""
+        """Return the state of the lanes that an index array or a mask selects, in the order of the array."""
         if isinstance(index, slice):
             return self
         at = torch.as_tensor(index, device=self.seed.device)

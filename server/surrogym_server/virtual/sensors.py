@@ -27,8 +27,8 @@ def sensed(definition: EnvironmentDefinition, noise: SensorNoise, lanes: LaneSta
 
 
 def driving(model: DynamicsModel, noise: SensorNoise, process: Tensor) -> Tensor:
-    """Return standard normal numbers ``process`` (N, ..., M), scaled down so that the learned noise that they scale no
-    longer contains the part caused by sensors."""
+    """Return the standard normal numbers ``process`` (N, ..., M), scaled down. Multiplied by the learned noise of each
+    output, they then give only that part of the noise that sensors don't cause."""
     able = offers(model, LearnedNoise)
     if not noise or able is None or model.definition.moves_observation:
         return process

@@ -23,7 +23,7 @@ ROWS, WEIGHTS = range(2)
 FUNCTIONS = ("affine", "cos", "sin", "turned_cos", "turned_sin", "wrapped", "equal", "observed", "grown")
 CODES = {function: code for code, function in enumerate(FUNCTIONS)}
 AFFINE, COS, SIN, TURNED_COS, TURNED_SIN, WRAPPED, EQUAL, OBSERVED, GROWN = CODES.values()
-UNIT_ANGLE = math.sqrt(3) / math.pi  # gives an angle that is uniform on the circle a standard deviation of 1
+UNIT_ANGLE = math.sqrt(3) / math.pi  # factor that gives uniformly distributed angles the standard deviation 1
 
 
 def add_features(tables: TablesBuilder, definition: EnvironmentDefinition, encoder: Encoder) -> int:

@@ -31,8 +31,8 @@ def add_reward(tables: TablesBuilder, reward: DeclaredRewardDefinition) -> int:
 
 @inlined
 def add_declared(numbers: Floats, places: Ints, at: int, q: Floats, u: Floats, total: Floats) -> None:
-    """Add the declared reward of states q (C, B) and actions u (F, B) to ``total`` (B,); ``at`` is the index of its
-    first matrix."""
+    """Add the declared reward of states q (C, B) and actions u (F, B) to ``total`` (B,). ``at`` is the index of the
+    reward's first matrix in the tables."""
     head, weights = matrix(numbers, places, at + HEAD), matrix(numbers, places, at + WEIGHTS)
     terms = matrix(numbers, places, at + TERMS)
     lanes = q.shape[1]

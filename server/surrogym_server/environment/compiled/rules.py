@@ -21,8 +21,8 @@ Ints = NDArray[np.int64]
 # which repeat a past value, and -1 for other coordinates: how the lag is computed, and the index of its source in
 # [coordinates, action].
 REACH_LOW, REACH_HIGH, LOW, HIGH, STOPS, ANGLE, LAG, SOURCE = range(8)
-# How a lag is computed from its source: change in the step, change of an angle, value before the step, or this value +
-# 1.
+# How a lag is computed from its source: change in the step, change of an angle, value before the step, or this value
+# plus 1.
 CHANGE, TURN, REPEAT, COUNT = range(4)
 
 

@@ -28,7 +28,7 @@ def add_terms(tables: TablesBuilder, terms: TermSet) -> int:
 
 
 def tables_of(terms: TermSet) -> Tables:
-    """Return the tables of a single term set, whose index is 0."""
+    """Return tables that contain a single term set. Its index is 0."""
     tables = TablesBuilder()
     add_terms(tables, terms)
     return tables.build()

@@ -147,7 +147,7 @@ def _checked_header(definition: EnvironmentDefinition, stored: StoredModel) -> H
     """Return the header of a stored model, after a check of all its numbers and those of its arrays.
 
     Raises:
-        InvalidInput: another format or other outputs, or numbers that no fit gives.
+        InvalidInput: the model has another format or other outputs, or numbers that no fit can give.
     """
     header, outputs = stored.header, tuple(stored.header["outputs"])
     require_format(header["format"], FORMAT)

@@ -23,8 +23,8 @@ class Inputs:
         return self._of_transition(q, u)
 
     def of_reward(self, q: Tensor, u: Tensor, q_next: Tensor) -> Tensor:
-        """Return the inputs (m, d) of the reward networks: of the state before the step, after it, or both, by
-        ``reward_timing``."""
+        """Return the inputs (m, d) of the reward networks: of the state before the step, after it, or both, as the
+        definition's ``reward_timing`` says."""
         match self.definition.reward_timing:
             case "before":
                 return self._of_state(q, u)

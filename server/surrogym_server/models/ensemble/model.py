@@ -25,7 +25,8 @@ class Noise:
     size: Tensor  # (p,) root mean square of the noise over the samples
 
     def std(self, x: Tensor) -> Tensor:
-        """Return the standard deviation (m, p) of the noise at x (m, d), from the mean of the members' variances."""
+        """Return the standard deviation of the noise at x (m, d), (m, p): the root of the mean variance over the
+        networks."""
         return bounded(self.networks(x)).exp().mean(0).sqrt()
 
 
@@ -40,7 +41,7 @@ class Regression:
     noise: Noise | None = None  # None for rewards, because their noise is not learned
 
     def __call__(self, x: Tensor) -> Tensor:
-        """Return the values of every member at x (m, d), (K, m, p)."""
+        """Return the predictions of each of the K networks at inputs x (m, d), in the outputs' units, (K, m, p)."""
         return self.centre + self.scale * self.networks(x)
 
     def shaken(self, x: Tensor, process: Tensor) -> Tensor:
@@ -52,8 +53,8 @@ class Regression:
 
 @dataclass(frozen=True)
 class NetworkEnsembleModel(SteppedInBlocks, LearnedNoise):
-    """Model of K networks (members). The mean and the standard deviation are those of the members' predictions. The
-    noise of a transition depends on the state; the reward has none."""
+    """Model of K networks (members). A prediction has the mean and the standard deviation of the networks' predictions.
+    The noise of a transition depends on the state; the reward has none."""
 
     rows = 8_192
 
@@ -141,7 +142,7 @@ class NetworkEnsembleModel(SteppedInBlocks, LearnedNoise):
         return q_next, _of_member(rewards, member), spread, doubt
 
     def _rewards(self, q: Tensor, u: Tensor, q_next: Tensor) -> Tensor:
-        """Return the reward that every member predicts, (K, m)."""
+        """Return the reward that each of the K networks predicts, (K, m)."""
         if (declared := self.definition.declared_reward) is not None:
             return declared(q_next if declared.after else q, u).expand(self.transitions.networks.members, -1)
         assert self.reward is not None

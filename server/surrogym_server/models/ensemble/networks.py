@@ -37,7 +37,7 @@ class Networks:
         return (self.first, self.first_bias, self.second, self.second_bias, self.last)
 
     def __call__(self, x: Tensor) -> Tensor:
-        """Return the values of every member at x (m, d), (K, m, p)."""
+        """Return the outputs of each of the K networks (members) at inputs x (m, d), (K, m, p)."""
         quadratic = self.skip.shape[1] > x.shape[-1] + 1
         return basis(x, quadratic) @ self.skip + nonlinear(x, self.hidden)
 
@@ -54,7 +54,7 @@ def basis(x: Tensor, quadratic: bool) -> Tensor:
 
 
 def nonlinear(x: Tensor, hidden: tuple[Tensor, ...]) -> Tensor:
-    """Return the output of the hidden layers at x (m, d), (K, m, p)."""
+    """Return the outputs of the nonlinear part of each of the K networks at inputs x (m, d), (K, m, p)."""
     first, first_bias, second, second_bias, last = hidden
     z = torch.tanh(torch.baddbmm(first_bias, x.expand(len(first), -1, -1), first))
     z = torch.tanh(torch.baddbmm(second_bias, z, second))

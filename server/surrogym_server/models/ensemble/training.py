@@ -55,12 +55,13 @@ class Training:
 
 
 def squared_error(predicted: Tensor, target: Tensor) -> Tensor:
-    """Return the squared error, summed over members and outputs and averaged over samples."""
+    """Return the squared error, summed over networks (members) and outputs and averaged over samples."""
     return (predicted - target).square().mean(1).sum()
 
 
 def cross_entropy(predicted: Tensor, target: Tensor) -> Tensor:
-    """Return the cross entropy of logits and labels 0 or 1, summed over members and averaged over samples."""
+    """Return the cross entropy of logits and labels 0 or 1, summed over networks (members) and averaged over
+    samples."""
     each = binary_cross_entropy_with_logits(predicted, target.expand_as(predicted), reduction="none")
     total: Tensor = each.mean(1).sum()
     return total

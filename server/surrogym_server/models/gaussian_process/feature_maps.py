@@ -15,7 +15,8 @@ CENTRED = 1e-9  # a range counts as centred at 0 if its middle is no farther fro
 
 
 def reward_candidates(definition: EnvironmentDefinition) -> tuple[FeatureMap, ...]:
-    """Return candidate maps of the reward: of the state before the step, after it, or both, by ``reward_timing``.
+    """Return candidate feature maps of the reward: of the state before the step, after it, or both, as the definition's
+    ``reward_timing`` says.
 
     Rewards often depend on features that the observation combines, such as the distance to a target.
     """

@@ -38,7 +38,7 @@ class OutputLearner:
     definition: EnvironmentDefinition
     settings: Settings
     warm: Warm  # free parameters of the previous fits, by "output|feature map"
-    thetas: dict[str, NDArray[np.float64]]  # free parameters of the present fits, by the same keys
+    thetas: dict[str, NDArray[np.float64]]  # free parameters of the present fits, by "output|feature map"
     many: ManySamples = field(default_factory=BySubsets)  # strategy for fits to more than ``subsets.FEW`` samples
     # For each output name, the inputs that have the greatest evidence.
     selections: dict[str, Selection] = field(default_factory=dict)

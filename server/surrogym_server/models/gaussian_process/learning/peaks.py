@@ -35,7 +35,7 @@ REFITS = 3  # greatest number of further fits, each with samples that contradict
 # these.
 BELOW = 10.0
 FEWEST = 3  # least number of samples with a height above 0 from which a process of the logarithms is fitted
-EPS = 4 * torch.finfo(torch.float64).eps  # a reward within this share of the base equals the base
+EPS = 4 * torch.finfo(torch.float64).eps  # a reward within this share of the base counts as equal to the base
 RESOLUTION = 1e-3  # resolution at which explanations of the samples are compared, as a share of the largest reward
 # Least log odds of a process of the logarithms compared with no dependence on inputs, unless the spread alone decides.
 GAIN = 3.0

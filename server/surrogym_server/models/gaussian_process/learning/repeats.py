@@ -60,7 +60,8 @@ def _is_to_learn(learner: OutputLearner, output: OutputModel) -> bool:
 
 
 def _candidate(learner: OutputLearner, place: int, output: OutputModel) -> _Candidate | None:
-    """Return the output with its process as a candidate; None if it can't share samples."""
+    """Return the output as a candidate for a pool; None if it can't share samples. ``place`` is its index in the
+    model."""
     posterior, selection, feature_map = output.posterior, learner.selections.get(output.name), output.feature_map
     if posterior is None or posterior.sparse is not None or feature_map.rates or output.at_limit:
         return None

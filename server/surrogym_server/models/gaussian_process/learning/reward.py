@@ -66,7 +66,8 @@ def _plain(
 
 
 def _without_action(definition: EnvironmentDefinition, samples: Samples) -> dict[FeatureMap, Tensor]:
-    """Encode the samples without the action, because a reward that is paid in one place seldom depends on it."""
+    """Return features of the samples for feature maps without the action. They are candidates because a reward that is
+    paid in one place seldom depends on the action."""
     maps = {replace(m, action="none") for m in reward_candidates(definition) if not m.parity}
     return {
         m: encode(definition, m, samples.q_next if m.after else samples.q, samples.u) for m in sorted(maps, key=str)

@@ -27,9 +27,9 @@ def thresholds(definition: EnvironmentDefinition, q: Tensor, inside: Tensor) -> 
     """Find thresholds that explain which of the states q (n, C) lie inside, (n,) bool.
 
     Returns:
-        At most two pairs of thresholds and their leave-one-out log probability. In the first, a state is inside if it
-        exceeds any of the thresholds. In the second, it is inside if it exceeds none of at least two thresholds. (With
-        one threshold, that would again be a single threshold.)
+        At most two pairs (thresholds, leave-one-out log probability). In the first, a state is inside if it exceeds any
+        of the thresholds. In the second, it is inside if it exceeds none of at least two thresholds. With only one, the
+        second would be the same kind as the first.
     """
     values, labels = Axes.of(definition)(q).numpy(), inside.numpy()
     forms = []

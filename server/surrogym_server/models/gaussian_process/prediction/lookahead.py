@@ -26,7 +26,7 @@ from surrogym_server.gp import Joint
 from surrogym_server.models.abilities import OutputOutlook, PathOutlook, PredictedSteps
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 
-BLOCK = 4_000_000  # greatest number of covariances held at once
+BLOCK = 4_000_000  # greatest number of covariances computed at once
 ROUNDING = 1e-12
 SMALLEST = 1e-300  # lower limit of the largest slope, to avoid a division by 0 if all slopes are 0
 

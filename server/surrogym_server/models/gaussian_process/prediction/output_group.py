@@ -45,7 +45,7 @@ class OutputGroup:
     encoder: Encoder
     serving: Serving
     noise_std: Tensor  # (O,) standard deviation of the learned noise, in each output's unit
-    drawn: tuple[Drawn, ...]  # weights of each output's sampled functions; constant outputs have none
+    drawn: tuple[Drawn, ...]  # samplers of the outputs' functions; constant outputs have none
     end: int  # end of this group's weights among the W weights of a sampled function
     grown: tuple[Grown, ...] = ()
 

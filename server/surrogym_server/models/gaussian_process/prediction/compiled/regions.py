@@ -31,9 +31,10 @@ Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
 # Columns of a region's matrix, one row for each form (thresholds or classifier): weight of the form, whether it is a
-# classifier, and three more numbers. For thresholds: index of the axes, index of the cuts and rules, and whether the
-# form is a complement. For a classifier: index of the features, index of the process, and number of features. If the
-# process is constant, its index is -i - 1, with i the index of the constant.
+# classifier, and three more numbers.
+# For thresholds: index of the axes, index of the cuts and rules, and whether the form is a complement.
+# For a classifier: index of the features, index of the process, and number of features. If the process is constant, its
+# index is -i - 1, with i the index of the constant.
 WEIGHT, CLASSIFIES, FIRST, SECOND, THIRD = range(5)
 LEAST_STD = 1e-9  # lower limit of a standard deviation, to avoid a division by 0
 
