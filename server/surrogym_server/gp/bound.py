@@ -226,7 +226,7 @@ def _searched(
 
 
 class Bound(Parameters):
-    """Negative lower bound of the log evidence, with the priors of theta, and its gradient over theta."""
+    """Negative lower bound of the log evidence, with the priors of theta, as a function of theta; and its gradient."""
 
     def __init__(self, x: Tensor, y: Tensor, rows: Tensor, options: FitOptions, reflection: Reflection | None) -> None:
         """Prepare the bound of x (n, d) and y (n,); ``rows`` (m,) are the indices of the inducing points."""

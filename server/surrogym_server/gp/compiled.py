@@ -177,7 +177,7 @@ def _explain(factor: Floats, k: Floats) -> None:
 
 @inlined
 def _std(head: Floats, rows: Floats, own: Floats, explained: Floats, std: Floats) -> None:
-    """Write the latent standard deviation sqrt(k(x, x) - |L^-1 k|^2), in the output's unit, to ``std`` (B,).
+    """Write the standard deviation without noise, sqrt(k(x, x) - |L^-1 k|^2), in the output's unit, to ``std`` (B,).
 
     Args:
         head: matrix HEAD of the process.
@@ -275,7 +275,7 @@ def predict(
         numbers, places: tables of matrices, see ``compiled.tables``.
         at: index of the process's first matrix in the tables.
         x: all inputs of the model.
-        wanted: whether to write latent standard deviations to ``std``.
+        wanted: whether to write standard deviations (without noise) to ``std``.
         paths: (B, W) weights of one posterior sample for each input, whose value then replaces the mean; or (0, W).
         mean, std: arrays for the results, in the output's unit.
     """

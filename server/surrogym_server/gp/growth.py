@@ -97,8 +97,8 @@ class _GrowingObjective:
         return rates
 
     def plain(self, theta: Array) -> tuple[Evidence, Array]:
-        """Return the objective of the process G at the rates in theta, and the derivatives of its inputs w over the
-        rates, (n, d)."""
+        """Return the objective of the process G at the rates in theta, and the derivatives of its inputs w with respect
+        to the rates, (n, d)."""
         rates, z = self.rates(theta), self._z
         small = np.abs(rates) < FLAT
         safe = np.where(small, 1.0, rates)

@@ -27,7 +27,7 @@ class Joint:
     x: Tensor  # (m, d) inputs of the m points
     whitened: Tensor  # (n, m) L^-1 k(X, x), with L the Cholesky factor of the process
     observed: Tensor  # (p, m) the vector r (see the module) of each of p points that are assumed observed
-    variance: Tensor  # (m,) latent variance at the points
+    variance: Tensor  # (m,) variance at the points, without noise
     noise: float
 
     @classmethod
@@ -52,7 +52,8 @@ class Joint:
         return shared / (self.variance[index] + self.noise).sqrt()
 
     def observe(self, index: int) -> Joint:
-        """Return the joint posterior as if point ``index`` had been observed as well."""
+        """Return the joint posterior as if point ``index`` had been observed too, in addition to earlier
+        observations."""
         row = self.row(index)
         shrunk = (self.variance - row.square()).clamp_min(0)
         return replace(self, observed=torch.cat([self.observed, row[None]]), variance=shrunk)

@@ -99,7 +99,7 @@ class Posterior:
 
     @property
     def left_out(self) -> LeftOut:
-        """Accuracy in predicting each of the fitted points from all others."""
+        """Accuracy with which each of the points that the process was fitted to is predicted from all others."""
         if self.sparse is not None:
             return self.sparse.left_out
         mean, variance = self.leave_one_out()

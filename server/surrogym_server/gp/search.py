@@ -144,7 +144,8 @@ class Evidence(Parameters):
         return Evaluated(float(value), gradient, half, weighted, weights)
 
     def over_inputs(self, theta: Array, terms: Evaluated) -> Array:
-        """Return the gradient of the value over the inputs x, (n, d).
+        """Return the gradient of the value at theta with respect to the inputs x, (n, d). ``terms`` is the result of
+        ``evaluated``.
 
         Valid only without a reflection and without a quadratic part.
         """

@@ -195,7 +195,7 @@ class OutputOutlook(ABC):
 
     @abstractmethod
     def observe(self, index: int) -> OutputOutlook:
-        """Return the forecast as if the candidate ``index`` had been sampled as well."""
+        """Return the forecast as if the candidate ``index`` had been sampled too."""
 
 
 class PathOutlook(ABC):

@@ -84,7 +84,7 @@ def candidate_view(
         model: the model of the round.
         candidates: the m candidates.
         column: index of the output, which must vary in the samples.
-        outlook: predicted effect of answers on the variance of this output.
+        outlook: forecast of how answers would change the variance of this output.
         tolerance: tolerance of this output, in its unit.
         distance: (m,) distance of each candidate to the nearest query so far.
     """

@@ -76,8 +76,8 @@ def log_uncertainty_index(log_model_uncertainty: Tensor, log_probability: Tensor
 def confidences_of(
     model: DynamicsModel, points: Points, std: Tensor, tolerances: Sequence[float]
 ) -> list[OutputConfidence]:
-    """Return the confidence of every output (O,), from its standard deviations (m, O) at the points of the Monte Carlo
-    set."""
+    """Return the confidence of every output (O,), from the standard deviations of all outputs (m, O) at the points of
+    the Monte Carlo set."""
     able = offers(model, LeaveOneOut)
     errors = [None] * len(tolerances) if able is None else able.leave_one_out()
     doubt = log_model_uncertainty(std, std.new_tensor(tolerances)).exp()
@@ -87,8 +87,8 @@ def confidences_of(
 
 
 def confidence(std: Tensor, tolerance: float, errors: LeaveOneOutErrors | None) -> OutputConfidence:
-    """Return the confidence of one output, from its standard deviations (m,) over the Monte Carlo set and its
-    leave-one-out errors."""
+    """Return the confidence of one output, from its standard deviations (m,) at the points of the Monte Carlo set, its
+    tolerance, and its leave-one-out errors (None if unknown)."""
     return OutputConfidence(
         float(certainty(std, tolerance).mean()),
         float(certainty(std, 1.0).mean()),

@@ -64,8 +64,9 @@ def _least(samples: Samples) -> float:
 def _unknown(model: DynamicsModel, samples: Samples, points: Points, tolerance: float) -> Tensor:
     """Return at which of m points the reward is unknown enough to query it, (m,) bool.
 
-    It is if its standard deviation is above the tolerance, or if its prediction is clearly above the rewards of all
-    samples. As long as a trainer can't distinguish the rewards of the samples, it is at every point.
+    That is so if the reward's standard deviation is above the tolerance, or if its prediction is clearly above the
+    rewards of all samples. It is so at every point as long as the rewards of the samples differ too little for a
+    trainer.
     """
     prediction = model.transition(points.q, points.u, reward_std=True)
     assert prediction.reward_std is not None

@@ -273,8 +273,8 @@ def _doubted(model: DynamicsModel, settings: VirtualSettings, moved: Moved) -> M
 
 
 def _untrusted(model: DynamicsModel, settings: VirtualSettings, moved: Moved) -> Tensor | None:
-    """Return which lanes left the trusted range, (N,) bool. A lane has if the predicted standard deviation of any
-    output is above ``trust`` times its standard deviation over the samples. None if ``trust`` is None."""
+    """Return which lanes left the trusted range, (N,) bool. A lane has left it if the predicted standard deviation of
+    any output is above ``trust`` times the output's standard deviation over the samples. None if ``trust`` is None."""
     if settings.trust is None:
         return None
     assert moved.std is not None

@@ -144,7 +144,7 @@ def _networks(name: str, arrays: Arrays, d: int, p: int, *, quadratic: bool) -> 
 
 
 def _checked_header(definition: EnvironmentDefinition, stored: StoredModel) -> Header:
-    """Return the header of a stored model, after a check of all its numbers and those of its arrays.
+    """Return the header of a stored model, after a check of all numbers in the header and in the arrays.
 
     Raises:
         InvalidInput: the model has another format or other outputs, or numbers that no fit can give.

@@ -117,8 +117,8 @@ def conclude(
     rewards: Floats,
     ends: Bools,
 ) -> int:
-    """Complete the step of those of N lanes (parallel environments) that move, from their predictions: rewards,
-    penalties, ends of episodes. The last five array arguments are changed in place.
+    """Complete a step of N lanes (parallel environments), some of which move: compute their rewards, penalties and ends
+    of episodes from the predictions. The last five array arguments are changed in place.
 
     Args:
         moving: (N,) mask of the lanes that move. Row k of q_next, pay, std, over and fallen belongs to the k-th of

@@ -146,8 +146,9 @@ class Predictor:
         return mean + added, variance
 
     def _reward_spread(self, mean: Tensor, spread: Tensor, edges: Tensor | float) -> Tensor:
-        """Return the standard deviation of the reward, (m,). ``mean`` and ``spread`` (m,) are those of the reward's
-        process; ``edges`` is the variance due to jumps of the reward whose edges are uncertain."""
+        """Return the standard deviation of the reward, (m,). ``mean`` and ``spread`` (m,) are mean and standard
+        deviation of the reward's process; ``edges`` is the variance due to jumps of the reward whose edges are
+        uncertain."""
         if self.reward.warp is not None:
             spread = self.reward.warp.std(mean, spread)
         return (spread.square() + edges).sqrt()

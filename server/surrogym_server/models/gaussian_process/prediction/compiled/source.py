@@ -56,7 +56,7 @@ def _matrices(tables: Tables) -> list[Floats]:
 
 
 def _processes(matrices: Sequence[Floats]) -> Iterator[float]:
-    """Yield the index, among the matrices, of each process: those of the outputs, then those of the classifiers in
+    """Yield the index of the first matrix of each process: first of the outputs' processes, then of the classifiers in
     learned regions."""
     head = matrices[layout.HEAD][0].astype(int)
     yield from matrices[head[layout.PROCESSES]][:, PROCESS]
