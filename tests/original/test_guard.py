@@ -8,12 +8,13 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from support.limited import DIARY, SPEC, Cart, PatientCart, with_limits
+from support.limited import DIARY, RAIL, SPEC, Cart, PatientCart, SlowCart, with_limits
 from support.noting import until
 from surrogym_sampler.original.episodes import open_episode
 from surrogym_sampler.original.errors import StepFailed, StepRefused
@@ -22,6 +23,7 @@ from surrogym_sampler.original.limits.queries import GuardedRollouts, GuardedSte
 from surrogym_sampler.original.protocol import RealStep
 from surrogym_sampler.original.rollouts import answering, keeping_limits
 from surrogym_shared.limits import past
+from surrogym_shared.spec import Limits, Term
 
 RIGHT = np.array([1.0])
 KILLED = """
@@ -38,6 +40,32 @@ if __name__ == "__main__":
     print("moving", flush=True)
     time.sleep(60 if sys.argv[1] == "wait" else 0)
     environment.close()
+"""
+
+SLOW = """
+import sys, time
+import numpy as np
+from support.limited import SlowCart
+from surrogym_sampler.original import isolated
+
+def pressed(*_):
+    raise KeyboardInterrupt
+
+if __name__ == "__main__":
+    isolated.CLOSE_LIMIT = 0.1
+    environment = isolated.IsolatedEnvironment(SlowCart, step_limit=0.2)
+    environment.begin(0)
+    for _ in range(3):
+        environment.act(np.array([1.0]))
+    print(environment._process.pid, flush=True)
+    if sys.argv[1] == "SIGTERM twice":
+        environment._process.join(20)
+    if sys.argv[1] == "Ctrl-C":
+        environment._call = pressed
+    try:
+        environment.close()
+    except KeyboardInterrupt:
+        pass
 """
 
 
@@ -95,7 +123,7 @@ def test_if_no_action_arrives_for_a_period_the_safety_fallback_stops_the_cart(
     cart: GuardedRollouts, diary: Path
 ) -> None:
     pushed(cart, 3)
-    until(lambda: len(states(diary)) > 3 and abs(states(diary)[-1, 2]) < 0.1)
+    assert until(lambda: len(states(diary)) > 3 and abs(states(diary)[-1, 2]) < 0.1)
     with pytest.raises(StepFailed, match="no action came"):
         cart.act(RIGHT)
     cart.begin(1)
@@ -140,9 +168,120 @@ def test_the_safety_fallback_stops_the_machine_if_the_sampler_ends_or_is_killed(
         if ends != "close":
             child.send_signal(signal.SIGKILL if ends == "kill" else signal.SIGTERM)
         child.wait()
-    until(lambda: diary.read_text().endswith("close\n"))
+    assert until(lambda: diary.read_text().endswith("close\n"))
     assert len(states(diary)) > 3
     assert abs(states(diary)[-1, 2]) < 0.1
+
+
+class Faulty(Cart):
+    """A cart that raises an error in some of its steps, by number from 1."""
+
+    def __init__(self, faults: dict[int, BaseException]) -> None:
+        super().__init__()
+        self._faults, self._number = faults, 0
+
+    def step(self, action):
+        self._number += 1
+        if self._number in self._faults:
+            raise self._faults[self._number]
+        return super().step(action)
+
+
+def more_than(diary: Path, steps: int) -> bool:
+    return len(states(diary)) > steps
+
+
+def at_rest(diary: Path) -> bool:
+    return abs(states(diary)[-1, 2]) < 0.1
+
+
+@pytest.mark.parametrize("fault", [OSError("no byte came"), StepRefused("not now"), SystemExit(3)])
+def test_the_safety_fallback_stops_the_cart_after_a_step_that_failed(diary: Path, fault: BaseException) -> None:
+    faulty = keeping_limits(answering(Faulty({4: fault})))
+    assert isinstance(faulty, GuardedRollouts)
+    with pytest.raises(type(fault)):
+        pushed(faulty, 4)
+    assert until(lambda: at_rest(diary))
+    with pytest.raises(StepFailed):
+        faulty.act(RIGHT)
+    faulty.close()
+
+
+def test_the_safety_fallback_stops_the_cart_after_a_step_of_an_episode_that_failed(diary: Path) -> None:
+    episode = open_episode("cart:Faulty", None, lambda: Faulty({4: OSError("no byte came")}))
+    episode.reset(0)
+    for _ in range(3):
+        episode.step(RIGHT)
+    with pytest.raises(OSError, match="no byte"):
+        episode.step(RIGHT)
+    episode.close()
+    assert at_rest(diary)
+
+
+def test_the_safety_fallback_continues_after_an_error_in_one_of_its_steps(diary: Path) -> None:
+    faulty = keeping_limits(answering(Faulty({4: OSError("no byte came"), 5: StepRefused("not now")})))
+    assert isinstance(faulty, GuardedRollouts)
+    pushed(faulty, 3)
+    assert until(lambda: at_rest(diary))
+    faulty.close()
+    assert diary.read_text().endswith("close\n")
+
+
+def test_the_safety_fallback_acts_after_a_coordinate_that_was_not_measured() -> None:
+    class Blind(PatientCart):
+        blind = False
+
+        def coordinates(self, observation):
+            return np.array([np.nan, observation[1]]) if self.blind else observation
+
+    cart, gently = Blind(), np.array([0.2])
+    guarded = keeping_limits(answering(cart))
+    assert isinstance(guarded, GuardedRollouts)
+    pushed(guarded, 2, gently)
+    x = cart.x
+    cart.blind = True
+    assert np.asarray(guarded.act(gently).action)[0] == pytest.approx(0.2)
+    cart.blind = False
+    fallback = np.clip(-0.5 * x - 1.6 * cart.v, -1, 1)
+    assert np.asarray(guarded.act(gently).action)[0] == pytest.approx(fallback)
+    assert np.asarray(guarded.act(gently).action)[0] == pytest.approx(0.2)
+
+
+def test_a_reset_does_not_wait_until_the_safety_fallback_has_stopped_the_machine(diary: Path) -> None:
+    rolling = with_limits(Limits(keep=(RAIL,), fallback=(Term.linear(x=0),)))
+    cart = keeping_limits(answering(SlowCart(rolling)))
+    assert isinstance(cart, GuardedRollouts)
+    pushed(cart, 2)
+    assert until(lambda: len(states(diary)) > 4)
+    cart.begin(1)
+    steps = len(states(diary))
+    assert steps < 100
+    time.sleep(3 * (SPEC.sampling_period or 0))
+    assert len(states(diary)) == steps
+
+
+@pytest.mark.parametrize("ends", ["close", "Ctrl-C", "SIGTERM twice"])
+def test_an_environment_that_ends_slowly_is_not_killed_before_the_safety_fallback_has_stopped_the_machine(
+    tmp_path: Path, diary: Path, ends: str
+) -> None:
+    program = tmp_path / "program.py"
+    program.write_text(SLOW)
+    path = os.pathsep.join(map(str, ("tests", os.environ.get("PYTHONPATH", ""))))
+    with subprocess.Popen(
+        [sys.executable, str(program), ends],
+        stdout=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONPATH": path},
+    ) as child:
+        assert child.stdout is not None
+        number = int(child.stdout.readline())
+        if ends == "SIGTERM twice":
+            for _ in range(2):
+                taken = len(states(diary))
+                os.kill(number, signal.SIGTERM)
+                assert until(partial(more_than, diary, taken + 1))
+    assert until(lambda: diary.read_text().endswith("close\n"), 20)
+    assert at_rest(diary)
 
 
 def test_an_isolated_environment_keeps_its_declared_limits() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from pathlib import Path
 
 import numpy as np
@@ -83,3 +84,14 @@ class PatientCart(Cart):
     """The same as a simulator, which waits for its actions."""
 
     parallel = True
+
+
+class SlowCart(Cart):
+    """A cart whose weak brake takes many steps, and whose steps take time."""
+
+    def __init__(self, spec: EnvironmentSpec | None = None) -> None:
+        super().__init__(spec or with_limits(Limits(keep=(RAIL,), fallback=(Term.linear(v=-0.4),))))
+
+    def step(self, action):
+        time.sleep(0.03)
+        return super().step(action)

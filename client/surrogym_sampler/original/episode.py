@@ -50,6 +50,10 @@ class Episode(ABC):
     def step(self, action: Array) -> Moment:
         """Apply an action (F,), and return the result."""
 
+    def resume(self, coordinates: Array) -> None:  # noqa: B027
+        """Let the episode continue at coordinates (C,) after a step that failed, where it would not continue by
+        itself."""
+
     @abstractmethod
     def perturb(self, rng: np.random.Generator, sigma: float) -> None:
         """Multiply the physical attributes by normal factors with mean 1 and standard deviation sigma."""

@@ -167,6 +167,10 @@ class RolloutEpisode(OwnEpisode):
             f"this environment can't be set to {coordinates.tolist()}: it can only be reset, so use its own starts"
         )
 
+    def resume(self, coordinates: Array) -> None:
+        if hasattr(self._environment, "resume"):
+            self._environment.resume(coordinates)
+
     def step(self, action: Array) -> Moment:
         return self._stepped(self._environment.act(action))
 

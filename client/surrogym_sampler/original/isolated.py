@@ -52,6 +52,7 @@ class IsolatedEnvironment:
         self._factory = factory
         self._step_limit = step_limit
         self._number = 0  # number of the last request
+        self._rest_seconds = 0.0  # that closing may take longer, because the fallback of limits acts
         self._process: BaseProcess | None = None
         self._pipe: Connection | None = None
 
@@ -79,12 +80,18 @@ class IsolatedEnvironment:
         return at
 
     def close(self) -> None:
-        """Let the environment finish its step and close. If that takes too long, or at Ctrl-C, its process
-        is killed."""
+        """Let the environment finish its step and close. If that takes too long, or at Ctrl-C, its process is killed.
+
+        A process whose fallback may act is not killed at Ctrl-C: it brings the machine to rest, closes and ends.
+        """
         try:
             if self._pipe is not None and self._process is not None and self._process.is_alive():
                 with suppress(StepFailed):
-                    self._call("close", (), self._step_limit + CLOSE_LIMIT)
+                    self._call("close", (), self._step_limit + self._rest_seconds + CLOSE_LIMIT)
+        except KeyboardInterrupt:
+            if self._rest_seconds:
+                self._process = None
+            raise
         finally:
             self._kill()
 
@@ -115,7 +122,7 @@ class IsolatedEnvironment:
             raise value
         if ok is None:
             assert self._process is not None
-            self._process.join(self._step_limit + CLOSE_LIMIT)  # the child closes the environment before it exits
+            self._process.join(self._step_limit + self._rest_seconds + CLOSE_LIMIT)  # the child closes before it exits
             self._kill()
             raise EnvironmentDied(
                 f"the environment ended its process during {method}: {value}; let it raise an exception"
@@ -153,6 +160,7 @@ class IsolatedEnvironment:
         if not ok:
             self._kill()
             raise UnknownEnvironment(value)
+        self._rest_seconds = value
 
     def _kill(self) -> int | None:
         process, self._process = self._process, None
@@ -180,9 +188,14 @@ def _await_answer(pipe: Connection, number: int, limit: float) -> tuple[bool | N
 
 
 class _Ending:
-    """Handler that ends the child process on SIGTERM, but lets a running step finish first."""
+    """Handler that ends the child process on SIGTERM, but lets a running step finish first.
 
-    def __init__(self) -> None:
+    Args:
+        seconds: that the child may run on after its parent has ended.
+    """
+
+    def __init__(self, seconds: float) -> None:
+        self.seconds = seconds
         self._working = self._ending = False
         signal.signal(signal.SIGTERM, self._end_soon)
 
@@ -210,24 +223,26 @@ def _serve(pipe: Connection, factory: Factory, step_limit: float) -> None:
     sys.stdout = sys.stderr
     for number in PARENTS_BUSINESS:
         signal.signal(number, signal.SIG_IGN)
-    threading.Thread(target=_exit_after_parent, args=(step_limit + CLOSE_LIMIT,), daemon=True).start()
-    working = _Ending()
+    working = _Ending(step_limit + CLOSE_LIMIT)
+    threading.Thread(target=_exit_after_parent, args=(working,), daemon=True).start()
     with working:
         try:
             environment = keeping_limits(answering(factory()))
         except RAISED as error:
             pipe.send((False, sentence(error)))
             return
-    closed = False
+    closed, rest_seconds = False, getattr(environment, "rest_seconds", 0.0)
+    working.seconds += rest_seconds
     try:
-        pipe.send((True, None))
+        pipe.send((True, rest_seconds))
         while not closed:
             closed = _serve_one(pipe, environment, working) == "close"
     except (EOFError, OSError):
         return  # the parent has ended
     finally:
         if not closed:
-            environment.close()
+            with working:  # a second SIGTERM does not interrupt the fallback of limits
+                environment.close()
 
 
 def _serve_one(pipe: Connection, environment: Environment, working: _Ending) -> str:
@@ -256,10 +271,10 @@ def _answer(environment: Environment, method: str, arguments: tuple[Any, ...]) -
         return None, sentence(error)
 
 
-def _exit_after_parent(seconds: float) -> None:
-    """Wait for the end of the parent process, and exit ``seconds`` later, so that the environment can close."""
+def _exit_after_parent(working: _Ending) -> None:
+    """Wait for the end of the parent process, and exit some seconds later, so that the environment can close."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         wait([parent.sentinel])
-        time.sleep(seconds)
+        time.sleep(working.seconds)
         os._exit(1)

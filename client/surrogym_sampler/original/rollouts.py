@@ -85,6 +85,10 @@ class FromReset:
             truncated=bool(truncated),
         )
 
+    def resume(self, coordinates: Array) -> None:
+        """Let an episode continue at coordinates (C,) after a step that failed: the fallback of limits still acts."""
+        self._at = coordinates
+
     def save(self) -> bytes:
         """Return a snapshot of the whole state: the environment's own bytes. The coordinates are put before these if
         some of them repeat earlier values (lags).

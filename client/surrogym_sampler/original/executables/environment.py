@@ -74,6 +74,10 @@ class Executable:
             self._at = step.next_coordinates  # type: ignore[assignment]  # an array (C,), from _stepped
         return step
 
+    def resume(self, coordinates: Array) -> None:
+        """Let an episode continue at coordinates (C,) after a step that failed: the fallback of limits still acts."""
+        self._at = coordinates
+
     def save(self) -> bytes:
         """Return the program's snapshot of the current state: the text of its answer, as bytes."""
         return text(self._ask("save", self._deadline()), "snapshot").encode()

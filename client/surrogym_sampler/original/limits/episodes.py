@@ -39,11 +39,13 @@ class GuardedEpisode(Episode):
         """
         with self._watchdog:
             self._watchdog.check()
-            self._watchdog.over()  # no action is due while the environment takes a step
+            self._watchdog.running()
             chosen, fallen = self._guard.choose(action)
             moment = self._episode.step(chosen)
             self._guard.reached(moment.coordinates)
-            if not (moment.terminated or moment.truncated):
+            if moment.terminated or moment.truncated:
+                self._watchdog.over()
+            else:
                 self._watchdog.running()
             return replace(moment, fallback=chosen) if fallen else moment
 
@@ -62,6 +64,7 @@ class GuardedEpisode(Episode):
         return moment
 
     def _fall(self, action: Array) -> bool:
+        self._episode.resume(self._guard.at)
         moment = self._episode.step(action)
         self._guard.reached(moment.coordinates)
         return not (moment.terminated or moment.truncated)

@@ -20,6 +20,7 @@ from surrogym_shared.spec import EnvironmentSpec
 Array = NDArray[np.float64]
 
 MOST_STEPS = 200  # largest number of steps of the fallback, which then ends even if the machine still moves
+MOST_ERRORS = 5  # number of errors of the environment in a row after which the fallback ends
 STILL = 1e-3  # a machine rests if no coordinate changes by more than this share of its largest change in the episode
 
 
@@ -28,27 +29,30 @@ class Guard:
     of the specification's fallback controller.
 
     The choice needs no model and no network, only the last two states. Call ``begin`` at each start, ``choose`` before
-    each step, and ``reached`` after it.
+    each step, and ``reached`` after it. A coordinate that is not finite was not measured: it keeps its last
+    value, and the fallback acts until all are measured again.
     """
 
     def __init__(self, spec: EnvironmentSpec) -> None:
         self._spec = spec
         self._before = self._at = np.zeros(len(spec.coordinates))
         self._fastest = np.zeros(len(spec.coordinates))  # (C,) largest change of a step in this episode
+        self._measured = True  # whether all coordinates of the last state are finite
 
     def begin(self, coordinates: Array) -> None:
         """Start an episode at coordinates (C,)."""
-        self._before = self._at = np.asarray(coordinates, dtype=np.float64)
+        self._at = self._read(coordinates)
+        self._before = self._at
         self._fastest = np.zeros(len(self._at))
 
     def reached(self, coordinates: Array) -> None:
         """Note that a step led to coordinates (C,)."""
-        self._before, self._at = self._at, np.asarray(coordinates, dtype=np.float64)
+        self._before, self._at = self._at, self._read(coordinates)
         self._fastest = np.maximum(self._fastest, np.abs(self._at - self._before))
 
     def choose(self, action: Array) -> tuple[Array, bool]:
         """Return the action (F,) to apply, and whether it is the fallback controller's instead of the requested one."""
-        if bool(falls_back(self._spec, self._before[None], self._at[None])[0]):
+        if not self._measured or bool(falls_back(self._spec, self._before[None], self._at[None])[0]):
             return self.fallback(), True
         return action, False
 
@@ -57,9 +61,20 @@ class Guard:
         return fallback_action(self._spec, self._at)
 
     @property
+    def at(self) -> Array:
+        """The present coordinates (C,), as far as they were measured."""
+        return self._at
+
+    @property
     def at_rest(self) -> bool:
-        """Whether the last step hardly moved any coordinate."""
-        return bool((np.abs(self._at - self._before) <= STILL * self._fastest).all())
+        """Whether the last step hardly moved any coordinate, as far as they were measured."""
+        return self._measured and bool((np.abs(self._at - self._before) <= STILL * self._fastest).all())
+
+    def _read(self, coordinates: Array) -> Array:
+        read = np.asarray(coordinates, dtype=np.float64)
+        finite = np.isfinite(read)
+        self._measured = bool(finite.all())
+        return np.where(finite, read, self._at)
 
 
 class Watchdog:
@@ -68,7 +83,8 @@ class Watchdog:
 
     An episode runs from its first action on. A simulator waits for its actions, so nothing is watched there.
 
-    The environment is used by one thread at a time: hold the watchdog (``with watchdog:``) around every call of it.
+    The environment is used by one thread at a time: hold the watchdog (``with watchdog:``) around every call of it. The
+    watchdog lets other threads call it between two steps of the fallback, so that a reset need not wait for the rest.
 
     Args:
         spec: specification with limits and a sampling period.
@@ -84,9 +100,11 @@ class Watchdog:
         self._guard = guard
         self._step = step
         self._changed = threading.Condition(threading.RLock())
-        self._deadline: float | None = None  # time at which the fallback acts; None if no action is due
+        self._due: float | None = None  # when the fallback's next step is due; None: no episode runs
         self._wanted = self._closed = False
         self._fallen = ""  # why the episode was ended by the watchdog; empty if it was not
+        self._steps = self._errors = 0  # of the fallback in this episode; errors of the environment in a row
+        self._end = 0.0  # when the fallback ends although the machine still moves
         self._thread: threading.Thread | None = None
 
     def __enter__(self) -> None:
@@ -97,7 +115,13 @@ class Watchdog:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        self._changed.notify_all()
         self._changed.release()
+
+    @property
+    def rest_seconds(self) -> float:
+        """Longest time in seconds that the fallback takes, besides its last step."""
+        return 0.0 if self._waits else MOST_STEPS * self._period
 
     def check(self) -> None:
         """Raise ``StepFailed`` if the watchdog has ended the episode."""
@@ -106,55 +130,65 @@ class Watchdog:
 
     def reset(self) -> None:
         """Note that the machine is at the start of an episode, at rest until its first action."""
-        self._fallen, self._deadline = "", None
+        self._fallen, self._due = "", None
 
     def running(self) -> None:
-        """Note that an action was applied. The next one is due within a sampling period."""
+        """Note that an action is applied, so that the next one is due within a period. Call this before the step too:
+        the machine may move although the step raised an error."""
         if self._waits:
             return
-        self._deadline = time.monotonic() + self._period
+        self._due = time.monotonic() + self._period
         if self._thread is None:
             self._thread = threading.Thread(target=self._watch, name="limits", daemon=True)
             self._thread.start()
-        self._changed.notify_all()
 
     def over(self) -> None:
-        """Stop waiting for an action, because no episode runs or the environment is taking a step."""
-        self._deadline = None
-
-    def fall_back(self, reason: str) -> None:
-        """If the watchdog waits for an action, apply the fallback controller until the machine rests, and end the
-        episode. ``reason`` is the message of the error that ``check`` then raises."""
-        if self._deadline is None:
-            return
-        self._deadline, self._fallen = None, reason
-        for _ in range(MOST_STEPS):
-            if not self._step(self._guard.fallback()) or self._guard.at_rest:
-                return
+        """Stop waiting for an action, because no episode runs."""
+        self._due = None
 
     def close(self, reason: str) -> None:
-        """Apply the fallback controller if the watchdog waits for an action, and end the watchdog."""
+        """Apply the fallback until the machine rests, if an episode runs, and end the watchdog."""
         with self:
             self._closed = True
-            try:
-                self.fall_back(reason)
-            finally:
-                self._changed.notify_all()
+            if self._due is None:
+                return
+            self._fall(reason)
+            while self._due is not None:
+                time.sleep(max(0.0, self._due - time.monotonic()))
+                self._fall(reason)
 
     def _watch(self) -> None:
+        reason = (
+            f"no action came for {self._period:g} s (sampling_period), so the fallback brought the machine to rest and "
+            "the episode ended: reset it, or send actions faster"
+        )
         with self._changed:
             while not self._closed:
-                if self._deadline is None:
+                if self._due is None:
                     self._changed.wait()
-                elif (left := self._deadline - time.monotonic()) > 0:
+                elif (left := self._due - time.monotonic()) > 0:
                     self._changed.wait(left)
-                elif not self._wanted:  # otherwise the action has come, and its thread waits for this one
-                    try:
-                        self.fall_back(
-                            f"no action came for {self._period:g} s (sampling_period), so the fallback brought the "
-                            "machine to rest and the episode ended: reset it, or send actions faster"
-                        )
-                    except RAISED:
-                        continue  # the environment raised an error, which its next call will raise again
-                else:
+                elif self._wanted:  # another thread calls the environment, and waits for this one
                     self._changed.wait(self._period)
+                else:
+                    self._fall(reason)
+
+    def _fall(self, reason: str) -> None:
+        """Take a step of the fallback, and note when the next one is due. The episode has ended then.
+
+        An error of the environment does not end the fallback at once: the next step is tried a period later.
+        """
+        if not self._fallen:
+            self._fallen, self._steps, self._errors = reason, 0, 0
+            self._end = time.monotonic() + self.rest_seconds
+        self._steps += 1
+        self._due = time.monotonic()
+        try:
+            moves = self._step(self._guard.fallback()) and not self._guard.at_rest
+            self._errors = 0
+        except RAISED:
+            self._errors += 1
+            self._due += self._period
+            moves = self._errors < MOST_ERRORS
+        if not moves or self._steps >= MOST_STEPS or time.monotonic() >= self._end:
+            self._due = None

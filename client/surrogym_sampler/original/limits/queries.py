@@ -70,11 +70,12 @@ class GuardedRollouts:
     """
 
     def __init__(self, environment: RolloutEnvironment) -> None:
-        self._environment: Any = environment  # Any, because the methods save and restore are optional
+        self._environment: Any = environment  # Any, because the methods save, restore and resume are optional
         self._spec = environment.spec()
         self.parallel = runs_in_parallel(environment)
         self._guard = Guard(self._spec)
         self._watchdog = Watchdog(self._spec, self._guard, self._fall, waits=self.parallel)
+        self.rest_seconds = self._watchdog.rest_seconds  # that ``close`` may take longer
 
     def spec(self) -> EnvironmentSpec:
         return self._spec
@@ -91,7 +92,7 @@ class GuardedRollouts:
         """
         with self._watchdog:
             self._watchdog.check()
-            self._watchdog.over()  # no action is due while the environment takes a step
+            self._watchdog.running()
             return self._acted(self._guard.choose(action)[0])
 
     def save(self) -> bytes:
@@ -127,6 +128,8 @@ class GuardedRollouts:
 
     def _fall(self, action: Array) -> bool:
         """Apply the fallback controller's action (F,), and return whether the episode continues."""
+        if hasattr(self._environment, "resume"):
+            self._environment.resume(self._guard.at)
         step: RealStep = self._environment.act(action)
         self._guard.reached(np.asarray(step.next_coordinates, dtype=np.float64))
         return not (step.terminated or step.truncated)
