@@ -385,6 +385,6 @@ class WrittenInC(ABC):
     def step_source(self) -> StepSource | None:
         """Return the C source of the mean step, which agrees with ``transition`` except for the last bits.
 
-        None if numba is not installed, which the model's tables of numbers need, or if the model is on another device
-        than the CPU.
+        None if numba is not installed, which the model's tables of numbers need, if the model adds to a prior model, or
+        if it is on another device than the CPU.
         """
