@@ -159,9 +159,10 @@ def _check_fallback(spec: EnvironmentSpec, declared: Limits) -> None:
         for part in term.parts:
             require_known(f"limits: fallback {number}", part.weights, spec.coordinate_names)
         constant = all(part.function == "one" for part in term.parts)
-        value = sum(part.coefficient for part in term.parts)
-        whole = isinstance(spec.action, BoxAction) or (constant and float(value).is_integer())
-        require(whole, f"limits: expected the number of a discrete action as fallback {number}, got {value:g}")
+        value = float(evaluate(spec, term, np.zeros((1, len(spec.coordinates))))[0])  # at any state, if constant
+        whole = isinstance(spec.action, BoxAction) or (constant and value.is_integer())
+        got = f"{value:g}" if constant else "a term of the state"
+        require(whole, f"limits: expected the number of a discrete action as fallback {number}, got {got}")
         require(
             not constant or low <= value <= high,
             f"limits: fallback {number} leaves the action's range: expected {low:g} to {high:g}, got {value:g}",

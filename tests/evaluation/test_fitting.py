@@ -7,6 +7,8 @@ from functools import partial
 import numpy as np
 import pytest
 
+from support.limited import SPEC as CART
+from support.limited import with_limits
 from support.moody import SPEC as LINE
 from support.moody import Line
 from support.rail import SPEC as RAIL
@@ -72,6 +74,18 @@ def test_the_error_for_a_policy_that_does_not_fit_names_the_difference(trained: 
 def test_a_policy_with_action_bins_of_other_bounds_is_refused() -> None:
     with pytest.raises(PolicyMisfit, match=r"expected actions from \[-1\] to \[1\], got \[-2\] to \[2\]"):
         check_policy(acting(-1, 1, bins=5), acting(-2, 2, bins=5))
+
+
+def test_a_policy_trained_with_limits_is_refused_in_an_environment_without_them() -> None:
+    """Nothing would keep the limits there: the sampler's guard reads the environment's own specification."""
+    with pytest.raises(PolicyMisfit, match=r"got no limits: .* --spec FILE"):
+        check_policy(CART, with_limits(None))
+    assert CART.limits is not None
+    wider = CART.limits.model_copy(update={"probability": 0.5})
+    with pytest.raises(PolicyMisfit, match="got other limits"):
+        check_policy(CART, with_limits(wider))
+    check_policy(CART, CART)
+    check_policy(with_limits(None), CART)
 
 
 def test_a_policy_with_narrower_action_bounds_fits_the_environment() -> None:

@@ -10,10 +10,11 @@ from pydantic import ValidationError
 
 from support.limited import BRAKE, LIMITS, RAIL, SPEC, with_limits
 from surrogym_shared.limits import fallback_action, falls_back, nearest, past, room
-from surrogym_shared.spec import DiscreteAction, EnvironmentSpec, Limit, Limits, Term
+from surrogym_shared.spec import Coordinate, DiscreteAction, EnvironmentSpec, Limit, Limits, Term, Uniform
 
 X = Term.linear(x=1.0)
 STILL = (Term.constant(0.0),)
+HALF = Term.constant(1.0).model_copy(update={"high": 0.5})  # 1, clipped to 0.5
 
 
 def limit(**changed: Any) -> Limit:
@@ -68,9 +69,18 @@ def test_a_declared_limit_on_an_angle_is_refused_and_on_its_sine_accepted() -> N
     assert spec_with(coordinates=coordinates, limits=Limits(keep=(sine,), fallback=STILL).model_dump()).limits
 
 
+@pytest.mark.parametrize("place", ["limit", "coordinate"])
+def test_a_unit_with_control_characters_is_refused(place: str) -> None:
+    """A unit is printed on the terminal of whoever reads the status."""
+    with pytest.raises(ValidationError, match="string_pattern_mismatch"):
+        limit(unit="\x1b[31mrad") if place == "limit" else Coordinate(
+            name="x", sampling=Uniform(low=-1, high=1), unit="\x1b[31mrad"
+        )
+
+
 def test_a_discrete_safety_fallback_must_be_a_valid_action_number() -> None:
     discrete = DiscreteAction(n=3).model_dump()
-    for fallback, accepted in ((Term.constant(1.0), True), (Term.constant(0.5), False), (BRAKE, False)):
+    for fallback, accepted in ((Term.constant(1.0), True), (Term.constant(0.5), False), (HALF, False), (BRAKE, False)):
         limits = Limits(keep=(limit(),), fallback=(fallback,)).model_dump()
         if accepted:
             assert fallback_action(spec_with(action=discrete, limits=limits), np.zeros(2)).tolist() == [1.0]

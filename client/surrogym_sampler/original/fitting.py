@@ -32,8 +32,8 @@ def check_shape(trained: EnvironmentSpec, own: EnvironmentSpec, called: str) -> 
 
 
 def check_policy(trained: EnvironmentSpec, own: EnvironmentSpec) -> None:
-    """Check that an environment has what a policy was trained for: coordinates, action, observation and sampling
-    period.
+    """Check that an environment has what a policy was trained for: coordinates, action, observation, sampling
+    period and, if the policy was trained with limits, the same limits.
 
     Limits of continuous actions must lie within the environment's, because actions beyond them would be clipped. Bins
     must be equal, because a policy outputs their numbers. Access, ranges and starts may differ.
@@ -55,6 +55,11 @@ def check_policy(trained: EnvironmentSpec, own: EnvironmentSpec) -> None:
         raise PolicyMisfit(
             f"{misfit}: expected a step every {trained.sampling_period:g} s (sampling_period), got "
             f"{own.sampling_period:g} s"
+        )
+    if trained.limits is not None and trained.limits != own.limits:
+        raise PolicyMisfit(
+            f"{misfit}: expected the limits that the policy was trained with, got {'other' if own.limits else 'no'} "
+            "limits: declare them in the environment's specification, or give that with --spec FILE"
         )
     expected, got = _observation_in_words(trained), _observation_in_words(own)
     if len(trained.observation) != len(own.observation):

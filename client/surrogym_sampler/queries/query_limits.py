@@ -38,7 +38,8 @@ def check_environment(surrogate: str, asked: EnvironmentSpec, own: EnvironmentSp
     if asked.limits is not None and asked.limits != own.limits:
         raise UnknownEnvironment(
             f"the environment does not fit surrogate {surrogate!r}: expected a specification with the surrogate's "
-            "limits, which the sampler keeps at the machine, got other limits or none; declare them in both"
+            "limits, which the sampler keeps at the machine, got other limits or none; declare them in the "
+            "environment's specification, or give that with --spec FILE"
         )
     _check_ranges("actions", action_ranges(asked), action_ranges(own))
     _check_ranges("coordinates", [sampled(c.sampling) for c in asked.coordinates], _coordinate_ranges(own))

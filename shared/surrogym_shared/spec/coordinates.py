@@ -9,6 +9,7 @@ from pydantic import Field, model_validator
 
 from surrogym_shared.checks import Number, Width, require, require_range
 from surrogym_shared.kinds import CoordinateKind, LagKind
+from surrogym_shared.patterns import VISIBLE
 from surrogym_shared.spec.base import Frozen, Name
 
 
@@ -126,7 +127,7 @@ class Coordinate(Frozen):
     kind: CoordinateKind = "linear"
     sampling: SamplingDistribution
     bounds: Bounds | None = None
-    unit: str = ""
+    unit: Annotated[str, Field(pattern=VISIBLE)] = ""
     lag: Lag | None = None
 
     @property

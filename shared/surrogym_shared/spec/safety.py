@@ -7,6 +7,7 @@ from typing import Annotated, Self
 from pydantic import Field, model_validator
 
 from surrogym_shared.checks import Number, require
+from surrogym_shared.patterns import VISIBLE
 from surrogym_shared.spec.base import MAX_DIMENSIONS, MAX_INEQUALITIES, Frozen, Name
 from surrogym_shared.spec.terms import Term
 
@@ -25,7 +26,7 @@ class Limit(Frozen):
     low: Number | None = None
     high: Number | None = None
     margin: Annotated[Number, Field(ge=0)] = 0.0
-    unit: str = Field(default="", max_length=64)
+    unit: str = Field(default="", max_length=64, pattern=VISIBLE)
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
