@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+import shlex
+from pathlib import Path
 from typing import Any
 
 import pytest
 import typer
 
+from support.limited import SPEC
 from surrogym.cli import sample
 from surrogym_shared.wire import Query
 
@@ -26,6 +29,20 @@ def test_sampling_with_dry_run_shows_the_pending_queries_and_takes_no_real_step(
     assert "action 0" in shown.out
     assert len(json.loads(on_server("sample", cart, *CART, "--dry-run", "--json").out)["queries"]) == 5
     assert json.loads(on_server("status", cart, "--json").out)["ledger"]["total"] == 0
+
+
+def test_the_suggested_sampling_command_has_the_file_that_declares_the_limits(
+    on_server: Any, name: str, tmp_path: Path
+) -> None:
+    """The class declares none, and a sampler needs the surrogate's limits in its own specification."""
+    file = tmp_path / "limits.json"
+    file.write_text(SPEC.model_dump_json())
+    free = "support.limited:FreeCart"
+    said = on_server("register", name, "--env", free, "--spec", str(file)).out.strip()
+    suggested = shlex.split(said.rpartition("next: surrogym ")[2])
+    assert suggested[-2:] == ["--spec", str(file)]
+    assert on_server(*suggested[:-2], "--max-queries", "1").code != 0
+    assert on_server(*suggested, "--max-queries", "1").code == 0
 
 
 def test_a_query_the_user_does_not_approve_takes_no_real_step(

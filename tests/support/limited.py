@@ -95,3 +95,10 @@ class SlowCart(Cart):
     def step(self, action):
         time.sleep(0.03)
         return super().step(action)
+
+
+class FreeCart(Cart):
+    """A cart that declares no limits."""
+
+    def __init__(self) -> None:
+        super().__init__(with_limits(None))

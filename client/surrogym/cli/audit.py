@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from surrogym.cli.groups import Output, PolicyReading, Service, add
+from surrogym.cli.options import SpecFile, read_spec
 from surrogym.cli.pushing import push_or_say
 
 if TYPE_CHECKING:
+    from surrogym_sampler.original.episode import Episode
     from surrogym_shared.port import SurrogatePort
     from surrogym_shared.spec import EnvironmentSpec
     from surrogym_shared.wire import SurrogateView
@@ -47,6 +50,7 @@ def command(
             "steps. This tests all that the policy does where the environment can only be reset."
         ),
     ] = None,
+    spec: SpecFile = None,
     episodes: Annotated[int, typer.Option(min=1, max=100, help="Number of whole episodes, with --env.")] = 3,
     seed: Annotated[
         int, typer.Option(min=0, help="Seed of starts, of sampled functions, and of the places to audit.")
@@ -68,6 +72,7 @@ def command(
     Example: surrogym audit policy.zip --env rig:Rig --episodes 3
     """
     from surrogym.cli.errors import CommandError
+    from surrogym.cli.opening import opener_for_policy
     from surrogym_client.surrogates.waiting import words_of_audit
     from surrogym_client.transport import HttpSurrogate
     from surrogym_shared.terminal import progress
@@ -97,7 +102,8 @@ def command(
         if env is None:
             found = hand_over(subject, asked, lambda view: update(None, words_of_audit(view)))
         else:
-            found = _by_episodes(subject, env, card, EvaluationSettings(episodes, seed), quiet=output.quiet)
+            opener = opener_for_policy(env, read_spec(spec), card, quiet=output.quiet)
+            found = _by_episodes(subject, env, opener, EvaluationSettings(episodes, seed), quiet=output.quiet)
     if found.audit is None:
         raise CommandError(_not_made(view, found.reason))
     noted = card.model_copy(update={"surrogate": name, "spec": card.spec or view.spec, **vars(found)})
@@ -108,12 +114,11 @@ def command(
 
 
 def _by_episodes(
-    subject: Subject, env: str, card: PolicyCard, settings: EvaluationSettings, *, quiet: bool
+    subject: Subject, env: str, opener: Callable[[], Episode], settings: EvaluationSettings, *, quiet: bool
 ) -> Handover:
     """Audit a policy by whole episodes in an environment. The largest number of real steps is printed before the first
     episode. The steps taken are reported to the server, even after an error."""
     from surrogym.cli.errors import CommandError
-    from surrogym.cli.opening import opener_for_policy
     from surrogym_sampler.original.errors import EvaluationFailed
     from surrogym_sampler.original.protocol import LONGEST_EPISODE
     from surrogym_shared.terminal import say
@@ -129,7 +134,7 @@ def _by_episodes(
     say(f"the audit takes {count} in {env}: at most {most} real steps", quiet=quiet)
     note, taken = f"audit, {count} from seed {settings.first_seed}", 0
     try:
-        result = evaluate(subject.predict, opener_for_policy(env, None, card, quiet=quiet), settings, trained_for=spec)
+        result = evaluate(subject.predict, opener, settings, trained_for=spec)
         taken = result.steps
     except (EvaluationFailed, EvaluationInterrupted) as error:
         taken = error.steps

@@ -160,7 +160,7 @@ def command(
         if steps:
             key = None if read is None else _key(view.name, read.content)
             api.report_steps(view.name, steps, note="description", idempotency_key=key)
-    output.give(view.model_dump(mode="json"), lambda: _words(view, environment or ""))
+    output.give(view.model_dump(mode="json"), lambda: _words(view, environment or "", spec))
 
 
 def _sorted_out(
@@ -282,7 +282,7 @@ def _with_tolerances(spec: EnvironmentSpec, tolerances: dict[str, float]) -> Env
         raise CommandError(invalid(error)) from error
 
 
-def _words(view: SurrogateView, environment: str) -> str:
+def _words(view: SurrogateView, environment: str, file: Path | None) -> str:
     from surrogym_client.surrogates.phases import awaits_log, words_of_no_log
     from surrogym_sampler.original.loading import is_known, sample_command
 
@@ -292,4 +292,6 @@ def _words(view: SurrogateView, environment: str) -> str:
     start = sample_command(view.name, view.environment)
     if environment:  # the user gave its name on the command line
         start = f"surrogym sample {view.name}" + ("" if is_known(environment) else f" --env {shlex.quote(environment)}")
+    if file is not None and view.spec.limits is not None:  # the sampler reads limits from its own specification
+        start += f" --spec {shlex.quote(str(file))}"
     return f"{registered}, budget of {view.budget} real steps, target {view.target:g}; next: {start}"
