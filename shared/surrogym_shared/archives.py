@@ -148,7 +148,10 @@ def _header(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, name: str) -> Head
             ) from error
         declared, came = math.prod(shape) * dtype.itemsize, entry.file_size - file.tell()
     if dtype.hasobject or min(shape, default=0) < 0 or declared != came:
-        raise ValueError(f"array {name!r}: expected numbers in {declared} bytes, got {dtype} in {came} bytes")
+        raise ValueError(
+            f"array {name!r}: expected numbers that take as many bytes as the header says, got shape {shape} of "
+            f"{dtype} in {came} bytes"
+        )
     return Header(shape, dtype)
 
 

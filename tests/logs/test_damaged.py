@@ -54,5 +54,5 @@ def test_parquet_lists_of_different_lengths_are_refused(tmp_path: Path, odd: lis
 def test_an_npz_log_with_an_invalid_array_header_is_refused(tmp_path: Path, header: bytes):
     with zipfile.ZipFile(tmp_path / "log.npz", "w") as file:
         file.writestr("x.npy", b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header) + 1) + header + b"\n")
-    with pytest.raises(UnusableLog, match="expected an array 'x'"):
+    with pytest.raises(UnusableLog, match="array 'x'"):
         read_log(tmp_path / "log.npz")

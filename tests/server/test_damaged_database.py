@@ -122,7 +122,7 @@ def test_the_previous_model_is_served_if_the_newest_has_a_flipped_bit(server: Se
     flip(server.folder / "surrogym.db", "models", "blob")
     exported = client.get(f"/v1/surrogates/{NAME}/models/{newest}?format=safetensors")
     assert (exported.status_code, exported.json()["code"]) == (500, "damaged")
-    assert f"checksum of model {newest} of '{NAME}'" in exported.json()["detail"]
+    assert f"model {newest} of '{NAME}' has changed" in exported.json()["detail"]
     predicted = client.post(f"/v1/surrogates/{NAME}/predict", json=said)
     assert predicted.raise_for_status().json()["model_version"] == newest - 1
     assert client.get(f"/v1/surrogates/{NAME}").json()["model_version"] == newest - 1

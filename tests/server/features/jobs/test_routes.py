@@ -93,7 +93,10 @@ def test_a_training_job_for_a_surrogate_without_model_is_refused(api: Api, name:
 def test_more_unfinished_jobs_than_the_limit_are_refused(api: Api, known: str):
     while sum(job.status in ("queued", "running") for job in api.jobs.list(known).jobs) < 20:
         api.jobs.add(known, TRAIN)
-    with Api(api.url, retries=Retries(seconds=0)) as impatient, pytest.raises(Overloaded, match="wait or run"):
+    with (
+        Api(api.url, retries=Retries(seconds=0)) as impatient,
+        pytest.raises(Overloaded, match="running jobs"),
+    ):
         impatient.jobs.add(known, TRAIN)
 
 

@@ -112,7 +112,7 @@ def test_a_body_that_is_not_a_prior_file_is_refused(api: Api, surrogate: str, bo
 
 def test_a_prior_with_an_invalid_description_is_refused(api: Api, surrogate: str, textbook: SurrogateFile):
     other = SurrogateFile("x", textbook.spec, textbook.model, textbook.samples, about={"source": "a\x07b"})
-    with pytest.raises(InvalidInput, match="description of a prior"):
+    with pytest.raises(InvalidInput, match="description of the prior"):
         PriorCalls(api.connection).put(surrogate, other.to_bytes())
 
 

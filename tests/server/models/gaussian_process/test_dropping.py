@@ -132,7 +132,7 @@ def test_dropped_inputs_survive_storage(model, points):
 def test_a_malformed_list_of_dropped_inputs_is_refused(model, dropped):
     output = model.transitions[1]
     wrong = replace(output, feature_map=replace(output.feature_map, dropped=dropped))
-    with pytest.raises(InvalidInput, match="left out"):
+    with pytest.raises(InvalidInput, match="`dropped`"):
         require_output(ROW, wrong)
 
 

@@ -86,9 +86,9 @@ def test_a_learned_termination_survives_storage_bit_equal(spec, count):
 
 
 def test_loading_a_model_whose_termination_kind_differs_from_the_specification_is_refused(model, cartpole_model):
-    with pytest.raises(InvalidInput, match="termination is declared, got learned"):
+    with pytest.raises(InvalidInput, match="termination is declared, got one whose termination is learned"):
         from_bytes(cartpole_model.definition, to_bytes(model))
-    with pytest.raises(InvalidInput, match="termination is learned, got declared"):
+    with pytest.raises(InvalidInput, match="termination is learned, got one whose termination is declared"):
         from_bytes(model.definition, to_bytes(cartpole_model))
 
 

@@ -134,5 +134,5 @@ def test_sample_sharing_survives_storage(model, points):
 
 @pytest.mark.parametrize("shared", [("fifth",), ("reward",)])
 def test_a_stored_model_that_shares_samples_with_an_output_other_than_a_transition_is_refused(model, shared):
-    with pytest.raises(InvalidInput, match="share samples"):
+    with pytest.raises(InvalidInput, match="`shared`"):
         require_output(ROW, replace(model.transitions[1], shared=shared))
