@@ -74,6 +74,23 @@ def test_sampling_with_approve_shows_each_query_before_asking_for_approval(
     assert "(initial): 1 step from a reset" in said.err
 
 
+def test_ending_the_question_of_approve_ends_the_sampler_without_counting_a_step(
+    monkeypatch: pytest.MonkeyPatch, on_server: Any, cart: str
+) -> None:
+    questions: list[str] = []
+
+    def ended(question: str, **_: object) -> bool:
+        questions.append(question)
+        raise typer.Abort
+
+    monkeypatch.setattr(typer, "confirm", ended)
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True)
+    said = on_server("sample", cart, *CART, "--approve")
+    assert len(questions) == 1
+    assert "interrupted after 0 queries" in said.err
+    assert json.loads(on_server("status", cart, "--json").out)["ledger"]["unresolved"] == 0
+
+
 def test_sampling_with_approve_is_refused_without_a_terminal(on_server: Any, cart: str) -> None:
     said = on_server("sample", cart, *CART, "--approve")
     assert said.code != 0

@@ -185,13 +185,20 @@ def _show_queries(api: Api, view: SurrogateView, output: Output) -> None:
 
 
 def approved(spec: EnvironmentSpec, query: Query) -> bool:
-    """Print and draw a query on the terminal, and return whether the person there agrees that it is taken."""
+    """Print and draw a query on the terminal, and return whether the person there agrees that it is taken.
+
+    Raises:
+        KeyboardInterrupt: the person pressed Ctrl-C, or ended the input.
+    """
     from surrogym_sampler.queries.words import words_of_query
     from surrogym_shared.terminal import say
 
     for line in words_of_query(spec, query):
         say(line)
-    return typer.confirm("take it?", default=False, err=True)
+    try:
+        return typer.confirm("take it?", default=False, err=True)
+    except typer.Abort:
+        raise KeyboardInterrupt from None
 
 
 def _sample_here(

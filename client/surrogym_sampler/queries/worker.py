@@ -124,6 +124,7 @@ class Sampler:
         self._refused: set[int] = set()  # ids of refused queries, which the server may offer again
         self._failures = Failures()
         self._steps = 0
+        self._begun: Query | None = None  # query whose real steps began last
         self._returning: Returning | None = None  # the environment's snapshots; None if it has none
         self._phase: Phase | None = None
         self._spec: EnvironmentSpec
@@ -217,20 +218,19 @@ class Sampler:
 
     def _work(self, queries: list[Query]) -> None:
         """Answer queries one by one. Queries that are left after Ctrl-C or the time limit are returned to the queue."""
-        left, begun = list(queries), None
+        left, self._begun = list(queries), None
         try:
             while left:
                 self._failures.check([query.id for query in left])
                 self._pause(self._within_time(self._failures.delay()))
                 if self._stopped() or self._out_of_time():
                     break
-                begun = left[0]
-                self._answer(begun, last=len(left) == 1)
+                self._answer(left[0], last=len(left) == 1)
                 left.pop(0)
         finally:
             for query in left:
                 self._leases.release(query)
-                self._give_back(query, STOPPED, begun=query is begun)
+                self._give_back(query, STOPPED, begun=query is self._begun)
 
     def _return(self, claimed: ClaimedQueries) -> None:
         """Return queries that were not begun to the queue."""
@@ -254,6 +254,7 @@ class Sampler:
             check_query(self._own, query)
             if self._approve is not None and not self._approve(query):
                 raise StepRefused(NOT_APPROVED)
+            self._begun = query
             self._take(query, taken)
         except QueryRefused as refused:
             outcome, error = "refused", str(refused)
