@@ -21,7 +21,7 @@ MAX_UNITS = 1_024  # most units of a layer
 MAX_PARAMETERS = 262_144  # most parameters of all layers together
 MAX_ROLLOUT = 100_000  # most steps of one request
 MAX_LANE_STEPS = 1_000_000  # most steps of all lanes together in one request
-MAX_ACTIVATIONS = 2**24  # most numbers of all lanes in the widest layer: 128 MiB
+MAX_ACTIVATIONS = 2**24  # most activations of the widest layer, summed over all lanes: 128 MiB
 MAX_LOG_DEVIATION = 80  # largest log standard deviation whose exponential is finite in float32
 
 Array = NDArray[np.floating[Any]]

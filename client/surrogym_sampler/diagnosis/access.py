@@ -221,7 +221,7 @@ class _Looking:
         """Return the largest difference between two lists of steps: of next states as a share of the range, of rewards
         relative. It is 1 if the lists have different lengths."""
         if len(ones) != len(others):
-            return 1.0  # one episode ended earlier, so the steps can't be compared
+            return 1.0  # one episode ended earlier than the other, so they count as entirely different
         states = [self._apart(a.next_coordinates, b.next_coordinates) for a, b in zip(ones, others, strict=True)]
         paid = [
             abs(float(a.reward) - float(b.reward)) / max(1.0, abs(float(a.reward)))

@@ -104,5 +104,5 @@ def unbroken(coordinate: Coordinate, values: Array, meet: Meet, to: float) -> Ar
 
 
 def _place(meet: Meet) -> int:
-    """Return the index of the step at which lines meet."""
+    """Return the index of the step at which drawn lines of an angle are to coincide: the first or the last."""
     return 0 if meet == "start" else -1

@@ -44,7 +44,7 @@ class Growing:
     G, and the rate of each input."""
 
     fitted: Fitted  # fit of the process G (see the module); `score` is that of F, and `theta` ends with the rates
-    rates: tuple[float, ...]  # (d,) rate of each input
+    rates: tuple[float, ...]  # (d,) g_j of each input in the module's formula; 0: F does not change faster along it
 
 
 def fit_growing(z: Tensor, t: Tensor, may: Tensor, options: FitOptions, starts: Sequence[Array]) -> Growing:

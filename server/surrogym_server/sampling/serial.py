@@ -31,7 +31,7 @@ FEWEST = 12  # least number of pairs of consecutive steps for a test
 MOST = 256  # greatest number of samples in a test, because its time grows with their third power
 CRITICAL = 5.41  # upper 2 % point of chi-squared with one degree of freedom: the one-sided test has level 1 %
 MAINLY = 0.5  # if at least this share of the noise comes from the sensor, it counts as sensor noise
-SHARES = torch.linspace(0, 1, 21, dtype=torch.float64)  # values of the share to try; see the module's formula
+SHARES = torch.linspace(0, 1, 21, dtype=torch.float64)  # candidate shares of the sensor in the noise (see the module)
 FACTORS = torch.logspace(-0.6, 0.6, 9, dtype=torch.float64)  # values of c to try; see the module's formula
 # Safety factor for an estimated standard deviation, because it is computed with slopes of the model, which has errors.
 CARRIED = 1.25

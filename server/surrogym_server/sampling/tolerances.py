@@ -20,7 +20,8 @@ from surrogym_server.environment.samples import Samples, increments
 
 TOLERANCE = 0.05  # default tolerance, as a share of the output's standard deviation over the initial design
 FLOOR = 1e-9  # increments below this share of a coordinate's standard deviation over its range are rounding errors
-# If the first range of targets is below this share of the later range, it was too small to define a tolerance.
+# A tolerance is derived from the range of the first targets. If that is below this share of the range of all targets so
+# far, it is derived again.
 NOTHING = 1e-3
 
 

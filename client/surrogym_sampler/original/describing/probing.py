@@ -20,7 +20,9 @@ from surrogym_sampler.original.simulator import Taken
 
 PLACES = 4  # number of states in each test
 EXACT = 1e-6  # share of a variable's observed range; a smaller difference is rounding
-SETTABLE = 1e-3  # a state counts as set if the next step differs by at most this share of a variable's observed range
+# Setting a state works if a step after it differs from the one that an episode took there by at most this share of each
+# variable's observed range.
+SETTABLE = 1e-3
 FEW = 3.0  # a difference may be this multiple of the noise, which is measured in few steps only
 FARTHEST = 3.0  # largest shift of a position in a test, in the simulator's unit
 TURN = 2 * np.pi

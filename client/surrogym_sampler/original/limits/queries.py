@@ -52,8 +52,8 @@ class GuardedSteps:
         if bool(falls_back(self._spec, at, at)[0]):
             limit, left = nearest(self._spec, at[0])
             raise StepRefused(
-                f"expected a state at least the margin of {limit.margin:g} inside the limit {limit.name!r}, got one "
-                f"with {left:.4g}"
+                f"expected a state whose distance from the limit {limit.name!r} is at least its margin of "
+                f"{limit.margin:g}, got a distance of {left:.4g}"
             )
         return self._environment.step_from(coordinates, action)
 

@@ -148,7 +148,10 @@ class PolicyService:
         record = self._policies.get(name, str(version))
         owner = record.card.get(PUSHED_BY, by)
         if by not in (None, owner):
-            raise Forbidden(f"expected the token that stored version {version}, {owner}, or an admin's, got {by}")
+            raise Forbidden(
+                f"only {owner}, who stored version {version}, or an admin may add files; got {by}: use one of these "
+                "tokens"
+            )
         own = next((known for known in record.files if known.form == file.form and known.main), None)
         if own is not None and own.digest != file.digest:
             raise InvalidInput(

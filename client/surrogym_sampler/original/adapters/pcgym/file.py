@@ -91,7 +91,9 @@ def _check_range(path: Path, key: str, given: Any) -> None:
 
 def _check_schedule(path: Path, key: str, given: Any, count: int) -> None:
     if not isinstance(given, dict) or not given:
-        raise _expected(path, key, "an object with a list of numbers for at least one name", given)
+        raise _expected(
+            path, key, 'an object that gives at least one name a list of numbers, such as {"T": [1, 2]}', given
+        )
     for name, values in given.items():
         if not _numbers(values):
             raise _expected(path, f"{key} of {name}", "a list of finite numbers", values)

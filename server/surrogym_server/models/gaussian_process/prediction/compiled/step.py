@@ -389,7 +389,7 @@ class StepsOfModel(ArraySteps):
     tables: Tables
     outputs: int
     has_regions: bool  # whether the model has a learned termination or learned jumps of the reward
-    points: int  # number of points of all processes, mirror images included
+    points: int  # training points of all Gaussian processes, with the mirrored copies that a symmetry adds
     prior: StepsOfModel | None  # steps of the prior model, whose mean is added to the columns that ``uses`` marks
     uses: Floats  # (columns,) 1 for a column to which the prior is added, 0 for the others
 
