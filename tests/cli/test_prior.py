@@ -8,6 +8,7 @@ import threading
 import pytest
 
 from support.hinge import Real, hinge_spec
+from support.noting import until
 from surrogym_client.transport import Api
 from surrogym_client.transport.priors import PriorCalls
 from surrogym_sampler.queries.settings import SamplerSettings
@@ -32,6 +33,7 @@ def test_with_a_calibrated_simulator_prior_the_design_needs_few_real_steps(on_se
         beside.start()
         said = on_server("prior", hinge, "support.hinge:Textbook", *PARAMETERS, "--steps", "60", "--json")
         beside.join()
+        assert until(lambda: api.surrogate(hinge).phase != "fitting"), "the prior's last calibration is fitted too"
         view, others = api.surrogate(hinge), [one.name for one in api.surrogates()]
     assert said.code == 0
     result = json.loads(said.out)

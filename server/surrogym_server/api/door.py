@@ -87,10 +87,8 @@ def door_of(route: APIRoute) -> Door:
     """Return the conditions that a route declares. Raises ``TypeError`` if the route does not declare its roles."""
     declared = [depends.dependency for depends in route.dependencies]
     access = [one for one in declared if isinstance(one, Access)]
-    if len(access) + (everybody in declared) != 1:
-        raise TypeError(
-            f"route {route.path}: expected one declaration of who may call it, such as READ, got {len(access)}"
-        )
+    if (count := len(access) + (everybody in declared)) != 1:
+        raise TypeError(f"route {route.path}: expected one declaration of who may call it, such as READ, got {count}")
     extra = route.openapi_extra or {}
     content = extra.get("requestBody", {}).get("content", {JSON: {}} if route.body_field else {})
     limits: dict[str, int | None] = dict.fromkeys(content)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from typing import Any
 
@@ -15,7 +14,7 @@ from surrogym_server.storage import port
 from surrogym_server.storage.port import LATEST
 from surrogym_server.storage.records import ModelRecord, NewModel
 from surrogym_server.storage.sql.database import Database, damaged
-from surrogym_server.storage.sql.rows import NAMELESS, Span, append_event, find, hold, touch, within
+from surrogym_server.storage.sql.rows import NAMELESS, Span, append_event, checksum, find, hold, touch, within
 from surrogym_server.storage.sql.tables import models, policies, policy_aliases, policy_evaluations
 
 COLUMNS = [
@@ -55,7 +54,7 @@ class SqlModels(port.Models):
     def blob(self, name: str, version: int | None = None) -> bytes:
         with self._database.read() as connection:
             row = _one(connection, name, version, models.c.version, models.c.blob, models.c.checksum)
-        if _checksum(row.blob) != row.checksum:
+        if checksum(row.blob) != row.checksum:
             raise damaged(f"model {row.version} of {name!r} has changed since it was stored: its checksum differs")
         return bytes(row.blob)
 
@@ -72,10 +71,6 @@ class SqlModels(port.Models):
     def add(self, name: str, model: NewModel) -> int:
         with self._database.write() as connection:
             return insert_model(connection, hold(connection, name), model)
-
-
-def _checksum(blob: bytes) -> str:
-    return hashlib.sha256(blob).hexdigest()
 
 
 def newest_of(connection: Connection, span: Span) -> dict[int, tuple[int, float]]:
@@ -106,7 +101,7 @@ def insert_model(connection: Connection, surrogate: Row[Any], model: NewModel) -
             description=model.description,
             fit_seconds=model.fit_seconds,
             blob=model.blob,
-            checksum=_checksum(model.blob),
+            checksum=checksum(model.blob),
         )
     )
     fields = {"samples": model.samples, "fit_seconds": model.fit_seconds, "fidelity": model.fidelity}

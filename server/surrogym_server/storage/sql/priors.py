@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
@@ -11,7 +9,7 @@ from surrogym_server.storage import port
 from surrogym_server.storage.records import JSON, PriorRecord
 from surrogym_server.storage.sql import surrogates as stored
 from surrogym_server.storage.sql.database import Database, conflict_insert, damaged
-from surrogym_server.storage.sql.rows import append_event, find, hold, touch
+from surrogym_server.storage.sql.rows import append_event, checksum, find, hold, touch
 from surrogym_server.storage.sql.tables import priors
 
 
@@ -34,7 +32,7 @@ class SqlPriors(port.Priors):
             row = connection.execute(sa.select(priors.c.blob, priors.c.checksum).where(own)).one_or_none()
         if row is None or row.blob is None:
             return None
-        if _checksum(row.blob) != row.checksum:
+        if checksum(row.blob) != row.checksum:
             raise damaged(f"the prior of {name!r} has changed since it was stored: its checksum differs")
         return bytes(row.blob)
 
@@ -59,7 +57,7 @@ class SqlPriors(port.Priors):
 
     def _store(self, connection: Connection, name: str, blob: bytes | None, about: JSON) -> None:
         surrogate = hold(connection, name)
-        columns = {"created_at": surrogate.now, "about": about, "blob": blob, "checksum": _checksum(blob or b"")}
+        columns = {"created_at": surrogate.now, "about": about, "blob": blob, "checksum": checksum(blob or b"")}
         insert = conflict_insert(connection, priors).values(surrogate_id=surrogate.id, **columns)
         connection.execute(insert.on_conflict_do_update(index_elements=["surrogate_id"], set_=columns))
         if blob is not None:
@@ -71,7 +69,3 @@ def _plan_anew(connection: Connection, name: str) -> None:
     surrogate, before = hold(connection, name), stored.read(connection, name)
     touch(connection, surrogate, **stored.withdraw_unbegun(connection, surrogate, before, None))
     append_event(connection, surrogate, "phase", phase=before.phase, error=before.error)
-
-
-def _checksum(blob: bytes) -> str:
-    return hashlib.sha256(blob).hexdigest()

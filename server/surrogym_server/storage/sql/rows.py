@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from itertools import chain
 from typing import Any
@@ -57,6 +58,11 @@ def hold(connection: Connection, name: str, *extra: sa.ColumnElement[Any]) -> Ro
 def within(table: sa.Table, span: Span) -> sa.ColumnElement[bool]:
     """Return the SQL condition that a row of a table belongs to a surrogate in a range of ids."""
     return table.c.surrogate_id.between(*span)
+
+
+def checksum(blob: bytes) -> str:
+    """Return the SHA-256 of stored content, by which damage is found."""
+    return hashlib.sha256(blob).hexdigest()
 
 
 def unknown_surrogate(name: str) -> UnknownSurrogate:
