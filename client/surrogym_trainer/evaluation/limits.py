@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import binomtest
 
 from surrogym_shared.limits import limits_of, past, room
 from surrogym_shared.spec import EnvironmentSpec
@@ -38,12 +37,16 @@ class LimitsKept:
 
     def interval(self) -> tuple[float, float]:
         """Return the exact 95 % interval (Clopper and Pearson) of the share of episodes that leave a limit."""
+        from scipy.stats import binomtest  # on first use, because it takes a second to load
+
         found = binomtest(self.violations, self.episodes).proportion_ci(method="exact")
         return float(found.low), float(found.high)
 
     @property
     def broken(self) -> bool:
         """Whether more episodes left a limit than the declared probability explains, at a level of 5 %."""
+        from scipy.stats import binomtest
+
         found = binomtest(self.violations, self.episodes, self.probability, alternative="greater")
         return self.violations > 0 and bool(found.pvalue < LEVEL)
 

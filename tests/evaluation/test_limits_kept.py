@@ -1,0 +1,68 @@
+"""An evaluation counts the episodes that left a limit, and the steps in which the fallback acted."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from support.limited import SPEC, PatientCart, with_limits
+from surrogym_sampler.original.episodes import open_episode
+from surrogym_trainer.evaluation.evaluator import Evaluation, EvaluationSettings, evaluate
+from surrogym_trainer.evaluation.limits import LimitsKept, limits_kept
+
+
+def pushed_right(*, limited: bool) -> Evaluation:
+    """Evaluate a policy that always pushes the cart to the right."""
+    spec = SPEC if limited else with_limits(None)
+    return evaluate(
+        lambda shown: np.ones((len(shown), 1)),
+        lambda: open_episode("cart:Cart", spec, lambda: PatientCart(spec)),
+        EvaluationSettings(episodes=3),
+    )
+
+
+def counted(violations: int, episodes: int) -> LimitsKept:
+    return LimitsKept(episodes, violations, 0, 40 * episodes, {"rail": 0.0}, 0.01)
+
+
+def test_a_policy_that_drives_off_the_rail_is_stopped_by_the_fallback_and_counted() -> None:
+    kept = pushed_right(limited=True).limits
+    assert kept is not None
+    assert (kept.violations, kept.episodes, kept.steps) == (0, 3, 120)
+    assert 0 < kept.fallbacks < kept.steps
+    assert kept.least_room["rail"] >= 0
+
+
+def test_the_trace_of_an_evaluation_has_the_actions_that_were_applied() -> None:
+    result = pushed_right(limited=True)
+    applied = np.concatenate([trace.action for trace in result.traces])
+    assert result.limits is not None
+    assert int((applied != 1.0).sum()) == result.limits.fallbacks
+
+
+def test_an_environment_without_limits_reports_none_and_leaves_the_rail() -> None:
+    result = pushed_right(limited=False)
+    assert result.limits is None
+    assert "limits" not in result.summary()
+    kept = limits_kept(SPEC, [trace.coordinates for trace in result.traces], 0)
+    assert kept.violations == 3
+    assert kept.least_room["rail"] < 0
+
+
+@pytest.mark.parametrize(
+    ("violations", "episodes", "broken"),
+    [(0, 100, False), (1, 8, False), (1, 4, True), (3, 100, False), (4, 100, True)],
+)
+def test_limits_count_as_broken_if_chance_does_not_explain_the_violations(
+    violations: int, episodes: int, broken: bool
+) -> None:
+    """At an allowed 1 %, one violation in four episodes has a probability of 3.9 %, one in eight of 7.7 %."""
+    assert counted(violations, episodes).broken == broken
+
+
+def test_the_summary_of_limits_is_json_with_an_exact_interval() -> None:
+    summary = json.loads(json.dumps(counted(0, 100).summary()))
+    assert summary["interval"] == pytest.approx([0.0, 0.0362], abs=1e-4)
+    assert "0 of 100 episodes left a limit" in counted(0, 100).words()
