@@ -50,11 +50,19 @@ def falls_back(spec: EnvironmentSpec, before: Array, coordinates: Array) -> Bool
 
     It acts if the distance to a limit is below its margin, now or after one more step with the same change.
     """
-    now = room(spec, coordinates)
-    soon = 2 * now - room(spec, before)
-    margins = np.array([limit.margin for limit in limits_of(spec).keep])
-    with np.errstate(invalid="ignore"):  # the distance to a missing end is infinite
-        return np.asarray((np.fmin(now, soon) < margins).any(axis=1))
+    return is_near(margins(spec), room(spec, coordinates), room(spec, before))
+
+
+def margins(spec: EnvironmentSpec) -> Array:
+    """Return the margin (L,) of each limit."""
+    return np.array([limit.margin for limit in limits_of(spec).keep])
+
+
+def is_near(margin: Array, now: Array, before: Array) -> Bools:
+    """Whether (n,) a distance to a limit, ``now`` (n, L), is below its margin (L,), or would be after one more step
+    with the change from the distance ``before`` (n, L)."""
+    with np.errstate(invalid="ignore"):  # a side without an end has infinite room
+        return np.asarray((np.fmin(now, 2 * now - before) < margin).any(axis=-1))
 
 
 def fallback_action(spec: EnvironmentSpec, coordinates: Array) -> Array:

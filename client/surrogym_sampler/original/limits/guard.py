@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surrogym_sampler.original.errors import RAISED, StepFailed
-from surrogym_shared.limits import fallback_action, falls_back
+from surrogym_shared.limits import fallback_action, is_near, margins, room
 from surrogym_shared.spec import EnvironmentSpec
 
 Array = NDArray[np.float64]
@@ -35,24 +35,30 @@ class Guard:
 
     def __init__(self, spec: EnvironmentSpec) -> None:
         self._spec = spec
-        self._before = self._at = np.zeros(len(spec.coordinates))
+        self._at = np.zeros(len(spec.coordinates))
+        self._change = np.zeros(len(spec.coordinates))  # (C,) absolute change of the last step
+        self._margins = margins(spec)
+        self._room = self._room_before = np.full(len(self._margins), np.inf)  # (L,) distances to the limits
         self._fastest = np.zeros(len(spec.coordinates))  # (C,) largest change of a step in this episode
         self._measured = True  # whether all coordinates of the last state are finite
 
     def begin(self, coordinates: Array) -> None:
         """Start an episode at coordinates (C,)."""
         self._at = self._read(coordinates)
-        self._before = self._at
+        self._change = np.zeros(len(self._at))
+        self._room = self._room_before = room(self._spec, self._at[None])[0]
         self._fastest = np.zeros(len(self._at))
 
     def reached(self, coordinates: Array) -> None:
         """Note that a step led to coordinates (C,)."""
-        self._before, self._at = self._at, self._read(coordinates)
-        self._fastest = np.maximum(self._fastest, np.abs(self._at - self._before))
+        before, self._at = self._at, self._read(coordinates)
+        self._change = np.abs(self._at - before)
+        self._room_before, self._room = self._room, room(self._spec, self._at[None])[0]
+        self._fastest = np.maximum(self._fastest, self._change)
 
     def choose(self, action: Array) -> tuple[Array, bool]:
         """Return the action (F,) to apply, and whether it is the fallback controller's instead of the requested one."""
-        if not self._measured or bool(falls_back(self._spec, self._before[None], self._at[None])[0]):
+        if not self._measured or bool(is_near(self._margins, self._room, self._room_before)):
             return self.fallback(), True
         return action, False
 
@@ -68,7 +74,7 @@ class Guard:
     @property
     def at_rest(self) -> bool:
         """Whether the last step hardly moved any coordinate, as far as they were measured."""
-        return self._measured and bool((np.abs(self._at - self._before) <= STILL * self._fastest).all())
+        return self._measured and bool((self._change <= STILL * self._fastest).all())
 
     def _read(self, coordinates: Array) -> Array:
         read = np.asarray(coordinates, dtype=np.float64)
