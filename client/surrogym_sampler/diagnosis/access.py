@@ -109,7 +109,7 @@ def examine(environment: IsolatedEnvironment | Executable | Simulated, spec: Env
     """Set, save and restore states of the environment, and compare steps that should be equal.
 
     Args:
-        environment: the opened original environment; some 20 real steps are taken in it.
+        environment: the opened original environment; at most 18 real steps are taken in it.
         spec: specification of the environment. States are set only if it declares ``query="step"``, so that queries may
             begin in any state.
 

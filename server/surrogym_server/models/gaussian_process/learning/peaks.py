@@ -26,7 +26,7 @@ from surrogym_server.models.gaussian_process.prediction.warp import Warp
 
 FAINT = 0.1  # the greatest height above the base is compared with this quantile of the heights above 0
 # A peak is considered if the greatest height is this many decades above the FAINT quantile. A quadratic reward of one
-# input is no such peak: only its lowest 6 % are so far below the greatest height.
+# input is no such peak: its 10 % quantile is two decades below the greatest height.
 SPREAD = 3.0
 # Heights that spread over this many decades are always a peak, because neither noise nor rounding gives such a spread.
 DECADES = 10.0
