@@ -11,8 +11,8 @@ step late. A row has one design and one policy, with limits or without:
 - the mean real return of 50 episodes of a policy trained in the model, how many of them left a limit, and the share of
   steps in which the fallback acted.
 
-A row without limits is judged by the same limits. Rows are kept in ``--out``/limits.csv, so that the same command goes
-on after Ctrl-C.
+A row without limits is judged by the same limits. Rows are saved in ``--out``/limits.csv, so that the same command
+continues after Ctrl-C.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ in the changed plant, and real returns there, means of 200 episodes:
 - renewed: of a policy trained in a model whose prior is the old one, with a quarter of the fresh design's real steps.
 
 ``share`` is how much of the fresh policy's gain over the old policy's plant without an action the renewed one has.
-Rows are kept in ``--out``/renewal.csv, so that the same command goes on after Ctrl-C.
+Rows are saved in ``--out``/renewal.csv, so that the same command continues after Ctrl-C.
 """
 
 from __future__ import annotations

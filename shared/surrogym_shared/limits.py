@@ -5,11 +5,12 @@ Shapes: n states, C coordinates, L limits, F action entries.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from itertools import product
+from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from surrogym_shared.checks import require, require_known, require_unique
 from surrogym_shared.spec import BoxAction, DiscreteAction, EnvironmentSpec, limits
@@ -82,11 +83,22 @@ def nearest(spec: EnvironmentSpec, coordinates: Array) -> tuple[Limit, float]:
     return limits_of(spec).keep[index], float(every[index])
 
 
-def words_of_steps(spec: EnvironmentSpec, before: Array, after: Array) -> list[str]:
-    """Describe for each limit how many real steps from ``before`` to ``after`` (n, C) went beyond it; empty without
-    steps. The last line counts the steps after which the fallback should have acted."""
-    if not len(after):
+class Step(Protocol):
+    """A real step, of which the states are read: coordinates (C,) before and after it."""
+
+    @property
+    def coordinates(self) -> ArrayLike: ...
+
+    @property
+    def next_coordinates(self) -> ArrayLike: ...
+
+
+def words_of_steps(spec: EnvironmentSpec, steps: Iterable[Step]) -> list[str]:
+    """Describe how real steps kept each limit. Empty without limits, whose steps are not read, and without steps."""
+    pairs = [] if spec.limits is None else [(step.coordinates, step.next_coordinates) for step in steps]
+    if not pairs:
         return []
+    before, after = np.array(pairs, dtype=np.float64).transpose(1, 0, 2)
     least, near = room(spec, after), falls_back(spec, before, after).sum()
     lines = [
         f"limit {limit.name}: {(least[:, i] < 0).sum()} of {len(after)} real steps beyond it, least room "

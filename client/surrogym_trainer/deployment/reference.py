@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from surrogym_shared.limits import is_near
 from surrogym_trainer.deployment.controller import (
     LATE,
     LIMITED,
@@ -80,14 +81,12 @@ def decide(controller: Controller, memory: Memory, measurements: Array, age: Arr
 
 
 def _falls_back(guard: Guard, memory: Memory, coordinates: Array) -> Bools:
-    """Return whether (N,) the fallback of the limits acts instead of the policy at coordinates (N, C), because a limit
-    would be left soon."""
-    acts = np.zeros(len(coordinates), dtype=np.bool_)
-    known = memory.acted & memory.measured
-    for limit in guard.limits:
-        now, before = (_room(limit, q) for q in (coordinates, memory.coordinates))
-        acts |= np.minimum(now, np.where(known, 2 * now - before, now)) < limit.margin
-    return acts
+    """Whether (N,) the fallback of the limits acts at coordinates (N, C)."""
+    now, before = (
+        np.stack([_room(limit, q) for limit in guard.limits], axis=1) for q in (coordinates, memory.coordinates)
+    )
+    known = (memory.acted & memory.measured)[:, None]
+    return is_near(np.array([limit.margin for limit in guard.limits]), now, np.where(known, before, now))
 
 
 def _room(limit: KeptLimit, coordinates: Array) -> Array:

@@ -108,17 +108,9 @@ def _summary(view: SurrogateView, samples: Sequence[SampleView]) -> str:
         ("model", view.model_version),
         ("queries", ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in view.queries)),
         *([("last error", view.error)] if view.error else []),
-        *(("limits", words) for words in _limits(view, samples)),
+        *(("limits", words) for words in words_of_steps(view.spec, samples)),
     ]
     return section("State of the design", rows(facts))
-
-
-def _limits(view: SurrogateView, samples: Sequence[SampleView]) -> list[str]:
-    """Return lines on how the real steps kept the limits of the specification; empty without limits or steps."""
-    if view.spec.limits is None or not samples:
-        return []
-    before, after = (np.array([getattr(s, name) for s in samples]) for name in ("coordinates", "next_coordinates"))
-    return words_of_steps(view.spec, before, after)
 
 
 def _spent(view: SurrogateView) -> str:
