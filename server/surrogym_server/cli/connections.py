@@ -47,12 +47,12 @@ class Patient(HttpToolsProtocol):
     seconds: float  # longest time in which a request has to arrive
     most: int  # largest number of connections
     _timer: asyncio.TimerHandle | None = None
-    _head_bytes = 0  # size of target, headers and trailers of this request
+    _head_bytes = 0  # bytes of the present request's target, headers and trailers so far
     _head_lines = 0
     _head_complete = False
     _too_much: TooMuch | None = None
     _working: RequestResponseCycle | None = None  # the request that the app is answering, or answered last
-    _unparsed = 0  # bytes received since the parser last completed an element
+    _unparsed = 0  # bytes received since the parser last completed a header, a chunk or another part of a request
 
     def data_received(self, data: bytes) -> None:
         self._unparsed += len(data)
@@ -85,7 +85,8 @@ class Patient(HttpToolsProtocol):
     def on_header(self, name: bytes, value: bytes) -> None:
         self._head_lines += 1
         self._count(len(name) + len(value))
-        if not self._head_complete:  # a trailer counts towards the limit, but is not used
+        # A trailer (header after the body) counts towards the limits, but the app does not get it.
+        if not self._head_complete:
             super().on_header(name, value)
 
     def on_headers_complete(self) -> None:

@@ -28,7 +28,7 @@ from surrogym_server.settings import Settings
 logger = logging.getLogger(__name__)
 
 GRACE_SECONDS = 5
-YOUNG_OBJECTS = 20_000  # threshold of Python's garbage collector for generation 0
+YOUNG_OBJECTS = 20_000  # number of new objects after which Python collects garbage among them
 PARENT_LOOK_SECONDS = 0.5
 Tell = Callable[[str], None]
 
@@ -36,8 +36,8 @@ ANY_ADDRESS = {"0.0.0.0": "127.0.0.1", "::": "::1"}
 
 
 class Runner(uvicorn.Server):
-    """uvicorn's server, extended: it announces its address, ends long polls at shutdown, and ends normally after a
-    signal.
+    """uvicorn's server, extended: it announces its address, ends waiting requests at shutdown, and returns normally
+    after a signal.
     """
 
     def __init__(self, app: FastAPI, settings: Settings, url: str, ready_file: Path | None, tell: Tell) -> None:
@@ -95,7 +95,7 @@ def run(settings: Settings, ready_file: Path | None, exit_with_parent: bool, tel
     Args:
         settings: the server's settings.
         ready_file: file to write the URL to, once requests are accepted.
-        exit_with_parent: end when the parent process ends.
+        exit_with_parent: whether to end when the parent process ends.
         tell: called with the URL, once requests are accepted.
 
     Raises:
@@ -112,9 +112,9 @@ def run(settings: Settings, ready_file: Path | None, exit_with_parent: bool, tel
 
 @contextmanager
 def _fits(settings: Settings) -> Iterator[Fits | None]:
-    """Return a context with an object that runs fits in child processes; with None if fits may run in a cluster. The
-    first child process is started now, because a fork is cheap and safe only before other modules and threads are
-    loaded."""
+    """Return a context whose value runs fits in child processes, or is None if another engine than ``local`` decides
+    where fits run. The first child process is started now, because a fork is cheap and safe only before other modules
+    and threads are loaded."""
     if settings.engine != "local":
         yield None
         return

@@ -16,7 +16,8 @@ from surrogym_server.errors import InvalidInput, SurrogymError
 from surrogym_shared.terminal import give, progress
 
 WORKERS_VARIABLE = "WEB_CONCURRENCY"
-OF_THE_COMMAND = ("ready_file", "exit_with_parent", "as_json", "quiet")  # options that are no settings of the server
+# Options of the command that are not in ``Settings``.
+OF_THE_COMMAND = ("ready_file", "exit_with_parent", "as_json", "quiet")
 
 Host = Annotated[str | None, typer.Option(help="Address to listen on. [default: 127.0.0.1]")]
 Port = Annotated[int | None, typer.Option(help="Port to listen on; 0 takes any free one. [default: 8000]")]
@@ -30,9 +31,12 @@ Synchronous = Annotated[
         "failure can lose the latest commits. [default: full]"
     ),
 ]
-TokenFile = Annotated[Path | None, typer.Option(help="File with one token per line: an admin token, or role:token.")]
+TokenFile = Annotated[
+    Path | None, typer.Option(help="File with one token per line: role:token, or an admin's token alone.")
+]
 Insecure = Annotated[
-    bool | None, typer.Option("--insecure", help="Allow an address other than loopback without a token.")
+    bool | None,
+    typer.Option("--insecure", help="Allow to listen without a token on addresses that other machines can reach."),
 ]
 PublicUrl = Annotated[str | None, typer.Option(help="URL of the server as browsers see it, if it is behind a proxy.")]
 TlsCertificate = Annotated[
@@ -40,7 +44,8 @@ TlsCertificate = Annotated[
 ]
 TlsKey = Annotated[Path | None, typer.Option(help="PEM file with the certificate's private key.")]
 Device = Annotated[
-    str | None, typer.Option(help="Device that steps sessions: cpu, or cuda if torch supports it. [default: cpu]")
+    str | None,
+    typer.Option(help="Device that computes the steps of sessions: cpu, or cuda if torch supports it. [default: cpu]"),
 ]
 Threads = Annotated[
     int | None,
@@ -56,7 +61,7 @@ FitSeconds = Annotated[
 ]
 Engine = Annotated[
     str | None,
-    typer.Option(help="Where sessions live: local in this process, or ray in a Ray cluster. [default: local]"),
+    typer.Option(help="Where sessions run: local for this process, or ray for a Ray cluster. [default: local]"),
 ]
 RayAddress = Annotated[
     str | None,
@@ -67,7 +72,8 @@ RayHosts = Annotated[
     typer.Option(help="Number of processes in the cluster that hold sessions, each with one CPU. [default: 2]"),
 ]
 FitWorkers = Annotated[
-    int | None, typer.Option(help="Number of surrogates that are fitted at once, each in a process. [default: 1]")
+    int | None,
+    typer.Option(help="Number of surrogates that are fitted at the same time, each in a process. [default: 1]"),
 ]
 LogLevel = Annotated[
     str | None, typer.Option(help="Lowest level to log: critical, error, warning, info or debug. [default: info]")
@@ -82,7 +88,9 @@ ExitWithParent = Annotated[
 AsJson = Annotated[
     bool, typer.Option("--json", help="Print URL and version as JSON, once the server accepts requests.")
 ]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Show no remarks. The log still follows --log-level.")]
+Quiet = Annotated[
+    bool, typer.Option("--quiet", "-q", help="Don't print the address or progress. The log still follows --log-level.")
+]
 
 
 def register(app: typer.Typer) -> None:
@@ -152,8 +160,8 @@ def serve(
 
 
 def _refuse_options_of_ray(given: Mapping[str, Any]) -> None:
-    """Raise ``InvalidInput`` if an option for Ray is given, but another engine is chosen. Environment variables for Ray
-    are ignored."""
+    """Raise ``InvalidInput`` if an option for Ray is given, because another engine is chosen. Environment variables for
+    Ray are not checked."""
     for name in ("ray_address", "ray_hosts"):
         if given[name] is not None:
             raise InvalidInput(
@@ -166,5 +174,6 @@ def _refuse_workers() -> None:
     workers = os.environ.get(WORKERS_VARIABLE, "1")
     if workers != "1":
         raise InvalidInput(
-            f"expected one worker process, got {WORKERS_VARIABLE}={workers}: sessions live in one process, so unset it"
+            f"expected one server process, got {WORKERS_VARIABLE}={workers}: unset this variable, because sessions "
+            "live in one process"
         )

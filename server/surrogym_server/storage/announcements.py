@@ -26,7 +26,7 @@ class Announcements(ABC):
     def listen(self, hear: Hear) -> None:
         """Call ``hear``, in a thread, for each later announcement of another server. May be called once.
 
-        After a lost connection is restored, ``hear`` is called with None.
+        After a lost connection is restored, ``hear`` is called with None, because announcements may have been lost.
         """
 
     @abstractmethod

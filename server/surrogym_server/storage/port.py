@@ -130,8 +130,8 @@ class Surrogates(ABC):
 
 
 class Designs(ABC):
-    """Part of the storage interface for designs. A server fits a surrogate under a lease, which only one server
-    holds."""
+    """Part of the storage interface for designs. A server fits a model only while it holds the surrogate's lease for
+    fits, which one server holds at a time."""
 
     @abstractmethod
     def improve(
@@ -169,9 +169,9 @@ class Designs(ABC):
         """Return the names of the surrogates that have to be fitted now, oldest first.
 
         Such a surrogate has samples, no pending or leased query, and a change since its last fit (a sample, a query set
-        aside, an ``improve``, another budget or target, a damaged model). After the import of a log, it may have open
-        queries. It is not paused, and no server holds the lease of its fit. A lease with more time left than its
-        duration, because the clock was set back, counts as expired.
+        aside, an ``improve``, another budget or target, a damaged model). After the import of a log, it may have
+        pending or leased queries. It is not paused, does not wait for a prior, and no server holds the lease of its
+        fit. A lease with more time left than its duration, because the clock was set back, counts as expired.
         """
 
     @abstractmethod
@@ -215,8 +215,8 @@ class Designs(ABC):
     def commit(self, lease: FitLease, design: NewDesign) -> int:
         """Store the result of a fit (model, state, phase, next queries), and end its lease. Return the model's version.
 
-        The error of the design is cleared. The queries get the new round and the purpose ``adaptive``. Samples that
-        arrived after ``begin`` make the next fit due.
+        The error of the design is cleared. The queries get the number of this round and the purpose ``adaptive``.
+        Samples that arrived after ``begin`` make the next fit due.
 
         Raises:
             LeaseExpired: another server has taken the lease, or it was withdrawn.

@@ -41,7 +41,7 @@ class NewSurrogate:
 
 @dataclass(frozen=True)
 class Standing:
-    """Id, phase and pause of a surrogate, which frequent requests read."""
+    """The fields of a surrogate that frequent requests read: its id, its phase, and whether it is paused."""
 
     id: int
     phase: Phase
@@ -59,28 +59,28 @@ class SurrogateRecord:
     phase: Phase
     paused: bool
     round: int  # number of rounds of the design so far
-    state: JSON  # state of the design
+    state: JSON  # what the design keeps from one fit to the next, as ``DesignState.to_json`` returns it
     error: str | None
     extra_queries: int  # number of real steps that ``Designs.improve`` requested and no fit has chosen yet
-    checkpoint: str | None  # name of the occupancy in the last request to improve
+    checkpoint: str | None  # name of the occupancy (visited states) that the last ``Designs.improve`` named, if any
     created_at: float
 
 
 @dataclass(frozen=True)
 class Granted:
-    """Result of ``Designs.improve``: the surrogate, and the increase of its budget."""
+    """Result of ``Designs.improve``, a request for more queries: the surrogate, and the increase of its budget."""
 
-    record: SurrogateRecord  # the surrogate after the change
+    record: SurrogateRecord  # the surrogate after the request
     raised: int  # increase of the budget, in real steps
 
 
 @dataclass(frozen=True)
 class FitLease:
-    """Lease of the fit of one surrogate, which ``Designs`` renews and ends."""
+    """Lease that allows one server to fit a surrogate's model. ``Designs`` begins, renews and ends it."""
 
     surrogate: str
     token: str
-    revision: int  # revision of the surrogate when the fit began
+    revision: int  # revision (counter of changes) of the surrogate when the fit began
     extra_queries: int  # number of real steps that this fit has to choose even if the design has ended
     checkpoint: str | None
     expires: float
@@ -100,7 +100,7 @@ class NewModel:
 class ModelRecord:
     """Description of a stored model, without the model's file."""
 
-    version: int  # 1, 2, ... for each surrogate
+    version: int  # number of the model among the surrogate's models: 1, 2, ...
     created_at: float
     samples: int
     data_hash: str
@@ -130,15 +130,15 @@ class NewDesign:
 
 @dataclass(frozen=True, kw_only=True)
 class QueryRecord(Query):
-    """A stored query with its status and attempts."""
+    """A stored query with its status, the number of its leases, and its last error."""
 
     id: int
     purpose: Purpose
     status: QueryStatus
     round: int
-    attempts: int  # number of leases so far
+    attempts: int  # how often the query has been leased so far
     sampler: str | None  # name of the sampler that claimed the query last
-    error: str | None  # error of the last failed attempt
+    error: str | None  # error of the last lease that ended without an answer; None if there is none
     # Time left of the open lease, by the database's clock; negative after it has expired; None without an open lease.
     lease_seconds_left: float | None = None
 
@@ -150,7 +150,7 @@ class LeasedQuery(Query):
     id: int
     number: int  # number of earlier queries of the same surrogate
     purpose: Purpose
-    attempt: int  # 1 for the first lease of this query
+    attempt: int  # number of this lease among the leases of the query: 1, 2, ...
     token: str
     expires: float
 
@@ -178,7 +178,7 @@ class Sample(RealStep):
     observation: Vector | None = None
     next_observation: Vector | None = None
     query_id: int | None = None
-    step: int = 0  # index of this step in its rollout
+    step: int = 0  # index of this step in the answer to a rollout; 0 for a single step
 
 
 @dataclass(frozen=True)
@@ -274,13 +274,13 @@ class SurrogateSummary:
     phase: Phase
     paused: bool
     round: int
-    error: str | None  # error of the design, which may explain the phase
+    error: str | None  # why the design failed or can't continue; None if it has no error
     created_at: float
     environment: str
     ledger: LedgerRecord
     queries: QueryCounts
-    model_version: int | None  # version of the latest model
-    confidence_index: float | None  # confidence index of the latest model
+    model_version: int | None  # version of the newest undamaged model; None without a model
+    confidence_index: float | None  # confidence index of the newest undamaged model; None without a model
 
 
 @dataclass(frozen=True)
@@ -295,9 +295,9 @@ class PriorRecord:
 @dataclass(frozen=True)
 class OccupancyRecord:
     checkpoint: str
-    round: int  # round of the design in which the occupancy was submitted
+    round: int  # number of rounds that the design had had when the states were submitted
     created_at: float
-    states: Array  # (m, C) visited states
+    states: Array  # (m, C) coordinates of the m states that policies visited
 
 
 @dataclass(frozen=True)

@@ -42,7 +42,7 @@ def test_the_serve_command_refuses_a_port_in_use_in_one_sentence(server_process:
         (["--host", "0.0.0.0"], {}, "host 0.0.0.0 is not loopback: expected a token"),
         (["--port", "70000"], {}, "setting port"),
         (["--token-file", "/no/such/file"], {}, "/no/such/file"),
-        ([], {"WEB_CONCURRENCY": "4"}, "expected one worker process, got WEB_CONCURRENCY=4"),
+        ([], {"WEB_CONCURRENCY": "4"}, "expected one server process, got WEB_CONCURRENCY=4"),
         (["--database", "mysql://x/y"], {}, "mysql"),
         (["--ray-hosts", "1"], {}, "--ray-hosts: expected --engine ray with it, got the engine local"),
         (["--ray-address", "auto"], {"SURROGYM_ENGINE": "local"}, "--ray-address: expected --engine ray with it"),

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 CHANNEL = "surrogym"
-QUIET_SECONDS = 30.0  # longest wait for a message before the thread checks whether the server stops
+QUIET_SECONDS = 30.0  # after this time without a message, the listening thread checks whether the server stops
 FIRST_DELAY, LONGEST_DELAY = 0.1, 10.0  # shortest and longest time in seconds between two attempts to connect
 CLOSING_SECONDS = 2.0
 GAP_SECONDS = 0.05  # pause between announcements, so that several changes of a surrogate are announced as one
@@ -31,7 +31,7 @@ class NotifiedAnnouncements(Announcements):
     def __init__(self, database: Database) -> None:
         self._database = database
         self._origin = uuid4().hex
-        self._waiting: dict[str, None] = {}  # names to announce, as an ordered set
+        self._waiting: dict[str, None] = {}  # names of changed surrogates still to announce, as an ordered set
         self._changed = threading.Condition()
         self._ended = threading.Event()
         self._threads: list[threading.Thread] = []
@@ -53,7 +53,7 @@ class NotifiedAnnouncements(Announcements):
         if not self._threads or self._ended.is_set():
             return
         self._ended.set()
-        self.announce("")  # wakes both threads
+        self.announce("")  # an empty message wakes both threads, so that they end
         for thread in self._threads:
             thread.join(CLOSING_SECONDS)
 
@@ -82,7 +82,7 @@ class NotifiedAnnouncements(Announcements):
                         hear(None)
                     self._hear_all(connection, hear)
             except (Unavailable, psycopg.Error) as error:
-                logger.warning("what other servers announce does not come, the next try follows: %s", error)
+                logger.warning("announcements of other servers can't be received now; trying again: %s", error)
                 missed = True
                 self._ended.wait(delay)
                 delay = min(2 * delay, LONGEST_DELAY)

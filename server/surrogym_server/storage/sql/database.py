@@ -29,7 +29,8 @@ from surrogym_server.storage.records import Synchronous
 from surrogym_server.storage.sql.filelock import FileLock, marks
 
 SQLITE_CODES = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
-SQLSTATES = ("XX001", "XX002", "42P01", "42703")  # data corrupted, index corrupted, undefined table, undefined column
+# PostgreSQL's error codes for corrupted data, a corrupted index, a missing table and a missing column.
+SQLSTATES = ("XX001", "XX002", "42P01", "42703")
 # Pattern of SQLite's messages about missing or different tables; such errors have no code.
 OTHER_SCHEMA = re.compile(r"no such (table|column)|has no column|already exists")
 UNDECODABLE = "Could not decode to UTF-8"  # part of the message of SQLite's driver about damaged text
@@ -58,7 +59,8 @@ def are_broken_pages(error: sa.exc.DBAPIError) -> bool:
 BUSY_SECONDS = 5  # longest wait of a statement for locks of other programs or threads
 STALLED_SECONDS = 10  # time after which PostgreSQL ends an idle transaction, and its locks with it
 BATCH = 250  # largest number of rows that one transaction writes or removes
-PAUSE_SECONDS = 0.002  # pause between two transactions of a batch, so that a waiting writer can begin
+# Pause after each of several transactions that write rows in batches, so that a waiting writer can begin.
+PAUSE_SECONDS = 0.002
 POOL = {"pool_size": 8, "max_overflow": 56, "pool_timeout": BUSY_SECONDS}
 POSTGRESQL = {  # UTF-8 for every database, because with SQL_ASCII psycopg would return bytes instead of text
     "client_encoding": "utf8",

@@ -31,7 +31,7 @@ from surrogym_shared.nouns import Query
 from surrogym_shared.states import Phase
 
 INTERRUPTED_SECONDS = 60.0  # if initial queries are incomplete for longer, the server that queued them has died
-# The following SQL expressions are conditions on a row of the table of surrogates, and parts of such conditions.
+# SQL expressions for conditions on a row of the table of surrogates, such as IS_DUE, and for parts of such conditions.
 OWN_QUERIES = sa.select(queries.c.id).where(queries.c.surrogate_id == surrogates.c.id)
 OWN_SAMPLES = sa.select(samples.c.id).where(samples.c.surrogate_id == surrogates.c.id)
 # The statuses are constants in the SQL text, because with parameters PostgreSQL would not use an index.
@@ -44,8 +44,8 @@ OPEN_QUERY = sa.exists(OWN_QUERIES.where(queries.c.status.in_(OPEN)))
 
 _EXPIRES = surrogates.c.fit_expires
 _SET_BACK = NOW + surrogates.c.fit_seconds < _EXPIRES  # the clock was set back, so the lease would last too long
-# Whether a surrogate has to be fitted now: it has changed since its last fit, no server fits it, and it has no open
-# query. With a new log, it may have open queries.
+# Whether a surrogate has to be fitted now: it has changed since its last fit, no server fits it, and it has no pending
+# or leased query. After a new log was stored, it may have pending or leased queries.
 IS_DUE = sa.and_(
     surrogates.c.paused.is_(False),
     surrogates.c.revision > surrogates.c.fitted_revision,
@@ -188,9 +188,8 @@ def _to_raise(connection: Connection, record: SurrogateRecord, queries: int, *, 
     missing = max(0, queries - unspoken)
     if missing and not allowed:
         raise BeyondBudget(
-            f"expected at most {max(0, unspoken)} more queries, because {record.name!r} has a budget of "
-            f"{record.budget} real "
-            f"steps, got {queries}: a token of role admin may raise it "
+            f"expected at most {max(0, unspoken)} more real steps, which the budget of {record.name!r} "
+            f"({record.budget} real steps) has left, got {queries}: a token of role admin may raise the budget "
             f"(surrogym change {record.name} --budget {record.budget + missing})"
         )
     return missing
@@ -199,7 +198,10 @@ def _to_raise(connection: Connection, record: SurrogateRecord, queries: int, *, 
 def _hold_right(connection: Connection, lease: FitLease) -> Row[Any]:
     surrogate = hold(connection, lease.surrogate, surrogates.c.fit_token)
     if surrogate.fit_token != lease.token:
-        raise LeaseExpired(f"the lease of the fit of {lease.surrogate!r} has ended: start the fit again")
+        raise LeaseExpired(
+            f"this server may no longer store its fit of {lease.surrogate!r}, because its lease has ended: "
+            "start the fit again"
+        )
     return surrogate
 
 

@@ -62,7 +62,8 @@ class FileLock:
         with _turn:
             if not path.exists():
                 self._require_own_log(b"")
-            if _identity(path) in _locked_files:  # opening and closing it again would drop its locks
+            # Opening and closing the file again would drop this process's locks on it.
+            if _identity(path) in _locked_files:
                 raise _unavailable(path)
             self._descriptors = [_lock_byte(path)] if WHOLE_DESCRIPTION else [_lock_beside(path), _open(path)]
             self._index_descriptor: int | None = None
@@ -105,11 +106,11 @@ class FileLock:
         if self._overwritten:
             raise self._foreign()
         if _identity(self._path) != self._identity:
-            raise _displaced(self._path, "put it back in its place")
+            raise _displaced(self._path, "put the database file back in its place")
         for path, identity in self._beside.items():
             if _identity(path) != identity:
                 raise _displaced(
-                    path, "stop the server without killing it, so that it can save the data that it still holds"
+                    path, "stop the server by Ctrl-C or SIGTERM, so that it can save the data that it still holds"
                 )
 
     def is_as_noted(self) -> bool:
@@ -276,7 +277,7 @@ def is_merged(index: bytes) -> bool:
     lock, so that the index does not change.
     """
     if len(index) < INDEX_BYTES or struct.unpack_from("=I", index)[0] != INDEX_VERSION:
-        return True  # with an index of unknown format, the log is marked again, which does no harm
+        return True  # if the index has an unknown format, the caller marks the log once more, which does no harm
     frames, merged = struct.unpack_from("=I", index, 16)[0], struct.unpack_from("=I", index, 96)[0]
     return bool(frames == merged)
 

@@ -23,7 +23,8 @@ from surrogym_server.storage.sql.rows import NAMED, append_event, has_ended, hol
 from surrogym_server.storage.sql.tables import leases, queries, samples, surrogates
 from surrogym_shared.states import Purpose
 
-Returned = Literal["failed", "expired", "unbegun", "refused"]  # outcome of a lease that ended without an answer
+# How a lease of a query ended without an answer; unbegun: before a real step.
+Returned = Literal["failed", "expired", "unbegun", "refused"]
 BEFORE_A_STEP = ("unbegun", "refused")
 EXPIRED = "no answer before the lease ended"
 NEW_LEASE = sa.insert(leases)
@@ -83,7 +84,7 @@ def _new(surrogate: Row[Any], query: LeasedQuery, sampler: str, seconds: float) 
 
 
 def of_query(connection: Connection, surrogate_id: int, query_id: int, token: str) -> Row[Any]:
-    """Return the lease of a query with this token: (id, expires, outcome). The surrogate need not be locked.
+    """Return the columns id, expires and outcome of a query's lease with this token. The surrogate need not be locked.
 
     Raises:
         UnknownQuery: the surrogate has no such query.
@@ -218,16 +219,16 @@ class Reported(NamedTuple):
 
 @dataclass(frozen=True)
 class Answered:
-    """A lease under which samples are reported, with its query."""
+    """A lease of a query under which a sampler reports samples as the answer, with fields of the query."""
 
     lease_id: int
     query_id: int
     purpose: Purpose
     steps: int  # largest number of real steps of the query
     attempt: int
-    live: bool
+    live: bool  # whether the lease has not ended
     contested: bool  # whether the query has another lease that has not ended
-    reported: dict[int, Reported]  # samples that are already stored for this lease, by step
+    reported: dict[int, Reported]  # samples that were stored before as the answer under this lease, by step
 
 
 def read_answered(connection: Connection, surrogate: Row[Any], batch: Sequence[NewSample]) -> list[Answered | None]:
@@ -293,7 +294,7 @@ def _lock_queries(connection: Connection, surrogate: Row[Any], query_ids: set[in
 
 
 def _leases(connection: Connection, surrogate: Row[Any], by_id: dict[int, Row[Any]]) -> dict[tuple[int, str], Answered]:
-    """Read all leases of these queries. Return them by query id and token."""
+    """Read all leases of the queries ``by_id``. Return the leases by query id and token."""
     if not by_id:
         return {}
     rows = connection.execute(LEASES, {"asked": list(by_id), "now": surrogate.now}).all()

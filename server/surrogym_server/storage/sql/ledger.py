@@ -20,13 +20,14 @@ from surrogym_server.storage.sql.rows import Span, append_event, find, hold, rec
 from surrogym_server.storage.sql.tables import evaluations, leases, queries, samples, surrogates
 
 COUNTED = ("initial", "adaptive", "manual", "audit", "logged", "evaluation", "failed", "expired")
-MOST_KEPT = 100_000  # largest number of surrogates whose counts are cached
+MOST_KEPT = 100_000  # largest number of surrogates whose numbers of samples are cached
 
 PURPOSE = sa.type_coerce(samples.c.purpose, sa.Text)  # read as text, because the column's type refuses unknown words
 BY_PURPOSE: sa.Select[Any] = sa.select(
     samples.c.surrogate_id, PURPOSE, sa.func.count(), sa.func.max(samples.c.id)
 ).group_by(samples.c.surrogate_id, samples.c.purpose)
-COUNTED_AT_ONCE = 500  # surrogates in one statement, because SQLite limits the depth of an expression to 1,000
+# Largest number of surrogates in one statement, because SQLite limits the depth of an expression to 1,000.
+COUNTED_AT_ONCE = 500
 SINCE = BY_PURPOSE.where(samples.c.surrogate_id == sa.bindparam("owner"), samples.c.id > sa.bindparam("newest"))
 
 

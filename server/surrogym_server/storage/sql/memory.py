@@ -15,7 +15,7 @@ from surrogym_server.storage.sql.rows import find, hold
 from surrogym_server.storage.sql.tables import events, occupancies, surrogates
 from surrogym_server.storage.sql.tables import sessions as saved
 
-MAX_CHECKPOINTS = 1_000  # largest number of stored occupancies of a surrogate
+MAX_CHECKPOINTS = 1_000  # largest number of occupancies (named sets of visited states) stored for a surrogate
 NEWEST = sa.select(
     surrogates.c.name,
     sa.select(sa.func.max(events.c.id)).where(events.c.surrogate_id == surrogates.c.id).scalar_subquery(),
@@ -34,8 +34,8 @@ class SqlOccupancy(port.Occupancy):
             others = sa.select(sa.func.count()).where(occupancies.c.surrogate_id == surrogate.id)
             if connection.execute(others).scalar_one() >= MAX_CHECKPOINTS:
                 raise TooLarge(
-                    f"expected at most {MAX_CHECKPOINTS} checkpoints of {name!r}, got one more: reuse the name of "
-                    "one of them"
+                    f"expected at most {MAX_CHECKPOINTS} names for visited states (checkpoints) of {name!r}, got "
+                    "one more: submit the states under one of the earlier names"
                 )
             connection.execute(
                 sa.insert(occupancies).values(
@@ -87,7 +87,7 @@ class SqlSessions(port.Sessions):
 class SqlEvents(port.Events):
     def __init__(self, database: Database) -> None:
         self._database = database
-        self._pruned = 0  # id of the newest event at the last call of ``prune``
+        self._pruned = 0  # id of the newest event of all surrogates at the last call of ``prune``
 
     def newest(self, names: Sequence[str]) -> dict[str, int]:
         with self._database.read() as connection:

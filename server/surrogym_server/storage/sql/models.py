@@ -128,7 +128,10 @@ def _one(connection: Connection, name: str, version: int | None, *columns: sa.Co
         return row
     if version is None:
         raise NoModel(f"expected a model of {name!r}, but no model has been fitted yet: start surrogym sample")
-    raise UnknownModel(f"expected a version of the models of {name!r}, got {version}, which does not exist")
+    raise UnknownModel(
+        f"expected a version of the models of {name!r}, got {version}, which does not exist: "
+        "leave out the version for the newest model"
+    )
 
 
 class SqlPolicyNames(port.PolicyNames):

@@ -61,7 +61,9 @@ OLDEST_FREE: sa.Select[Any] = (
     .limit(sa.bindparam("most", type_=sa.Integer()))
     .with_for_update(skip_locked=True)
 )
-LEAST_AUDITED = 128  # real steps that audits may take even with a smaller budget; three audits take at most 120
+# All audits of a surrogate may take this many real steps even if its budget is smaller: three
+# audits of 40 steps.
+LEAST_AUDITED = 128
 
 
 class SqlQueries(port.Queries):
@@ -290,7 +292,8 @@ def _give_up_queries(connection: Connection, surrogate: Row[Any], names: Sequenc
         touch(connection, surrogate, extra_queries=surrogates.c.extra_queries + again)
 
 
-INITIAL, NO_KEY = "initial", ""  # operation and key of a row of ``requests``; clients can't use an empty key
+# Operation and key of the row of ``requests`` that counts the queued initial queries. Clients can't use an empty key.
+INITIAL, NO_KEY = "initial", ""
 _OF_DESIGN = (requests.c.operation == INITIAL) & (requests.c.key == NO_KEY)
 IS_INCOMPLETE = sa.exists(  # condition on a row of surrogates: some of its initial queries are missing
     sa.select(requests.c.key).where(requests.c.surrogate_id == surrogates.c.id, _OF_DESIGN)

@@ -240,7 +240,8 @@ def store_logged(
         old = next((place for place, link in enumerate(links) if link not in stored_ids), len(links))
         if old == len(links) or not _continued(connection, surrogate, chain[old]):
             break
-        before = chain[old + 1]  # the start of this log's own digests; a repeat of the log gets the same start
+        # The stored log continues differently, so this log gets digests of its own, computed from another start value.
+        before = chain[old + 1]
         if after is not None:
             return AddedSamples((), 0, restart=before)
     new = [row | {"fingerprint": link} for row, link in zip(rows[old:], links[old:], strict=True)]

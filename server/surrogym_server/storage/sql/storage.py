@@ -145,13 +145,14 @@ def _upgrade(connection: Connection) -> None:
     config.set_main_option("path_separator", "os")
     try:
         command.upgrade(config, "head")
-    except CommandError as error:  # the table alembic_version has no valid entry
+    except CommandError as error:  # raised by Alembic if the table alembic_version has no valid entry
         raise damaged(error) from error
 
 
 def _take_turn(connection: Connection) -> None:
     if connection.dialect.name == "postgresql":
-        connection.execute(sa.text("SET LOCAL lock_timeout = 0"))  # wait for another migration without limit
+        # Wait without limit until another server's migration has ended.
+        connection.execute(sa.text("SET LOCAL lock_timeout = 0"))
         # A migration may compute for a while between two statements.
         connection.execute(sa.text("SET LOCAL idle_in_transaction_session_timeout = 0"))
         connection.execute(sa.select(sa.func.pg_advisory_xact_lock(MIGRATION_LOCK)))

@@ -269,7 +269,7 @@ class _Named(msgspec.Struct):
 _NAMED = msgspec.json.Decoder(_Named)
 
 
-# Statuses that only few queries have, so that counting these queries by an index is fast.
+# Statuses that few queries have at a time. So an index makes it fast to count the queries with one of these statuses.
 UNANSWERED = ("pending", "leased", "set_aside", "refused")
 OPEN_COUNTS = [
     sa.select(sa.func.count())
@@ -279,7 +279,7 @@ OPEN_COUNTS = [
     for status in UNANSWERED
 ]
 NEWEST = sa.select(sa.func.max(samples.c.id)).where(samples.c.surrogate_id == surrogates.c.id).scalar_subquery()
-AT_ONCE = 1_000  # largest number of surrogates that one statement reads
+AT_ONCE = 1_000  # largest number of surrogates that one SQL statement reads
 
 
 class Counted:
@@ -291,7 +291,7 @@ class Counted:
 
     def __init__(self, samples: CountedSamples) -> None:
         self._samples = samples
-        self._answers: dict[int, tuple[int | None, int]] = {}  # id of the newest sample, and number of answered queries
+        self._answers: dict[int, tuple[int | None, int]] = {}  # surrogate id: id of its newest sample, answered queries
 
     def read(self, connection: Connection, newest: Mapping[int, int | None]) -> dict[int, tuple[SampleCounts, int]]:
         """Return the numbers of samples and of answered queries of each surrogate, by surrogate id.
@@ -366,7 +366,7 @@ def _take_name(connection: Connection, name: str) -> int:
 
 
 def _interrupted(connection: Connection) -> list[int]:
-    """Return the ids of deleted surrogates whose rows are not all removed."""
+    """Return the ids of deleted surrogates that still have rows, because a crash interrupted their deletion."""
     return [*connection.execute(NAMELESS).scalars()]
 
 

@@ -51,7 +51,9 @@ class Floats(sa.types.TypeDecorator[Vector]):
         try:
             return None if value is None else struct.unpack(f"<{len(value) // 8}d", value)
         except (TypeError, struct.error) as error:
-            raise damaged(f"expected a vector of floats: {error}") from error
+            raise damaged(
+                f"expected a vector of float64 in a column of the database, got other bytes: {error}"
+            ) from error
 
 
 class Json(sa.types.TypeDecorator[Any]):
@@ -163,8 +165,9 @@ surrogates = sa.Table(
     sa.Column("extra_queries", sa.Integer, nullable=False),
     sa.Column("checkpoint", sa.Text),
     sa.Column("revision", sa.BigInteger, nullable=False),  # increases with each change that makes a fit due
-    sa.Column("fitted_revision", sa.BigInteger, nullable=False),  # revision at the last fit
-    # Revision with which the last log is complete. Until this revision is fitted, open queries don't delay a fit.
+    # Revision of the surrogate up to which its last fit read the data.
+    sa.Column("fitted_revision", sa.BigInteger, nullable=False),
+    # Revision with which the last log is complete. Pending or leased queries don't delay the fit of this revision.
     sa.Column("logged_revision", sa.BigInteger, nullable=False, server_default="0"),
     sa.Column("fit_token", sa.Text),
     sa.Column("fit_owner", sa.Text),
@@ -184,11 +187,12 @@ queries = sa.Table(
     sa.Column("status", Word("queries.status", QueryStatus), nullable=False),
     sa.Column("round", sa.Integer, nullable=False),
     sa.Column("kind", Word("queries.kind", QueryKind), nullable=False, server_default="step"),
-    sa.Column("coordinates", Floats, nullable=False),  # empty for a rollout
+    sa.Column("coordinates", Floats, nullable=False),  # state at which the query's step begins; empty for a rollout
     sa.Column("action", Floats, nullable=False),  # all actions of a rollout, concatenated
     sa.Column("steps", sa.Integer, nullable=False, server_default="1"),
     sa.Column("snapshot", sa.Text),  # name of the snapshot at which a rollout begins; NULL: a reset
-    sa.Column("extra", sa.Boolean, nullable=False, server_default=sa.false()),  # chosen only because of ``improve``
+    # Whether the query was chosen only because ``improve`` requested more.
+    sa.Column("extra", sa.Boolean, nullable=False, server_default=sa.false()),
     sa.Column("attempts", sa.Integer, nullable=False),
     sa.Column("sampler", sa.Text),
     sa.Column("error", sa.Text),
@@ -208,7 +212,8 @@ leases = sa.Table(
     sa.Column("begun", sa.Double, nullable=False),
     sa.Column("expires", sa.Double, nullable=False),
     sa.Column("seconds", sa.Double, nullable=False, server_default="0"),  # duration of the lease at its last renewal
-    sa.Column("outcome", sa.Text, nullable=False),  # open, answered, failed, unbegun, refused, expired
+    # "open", or how the lease ended: answered, failed, unbegun, refused, expired.
+    sa.Column("outcome", sa.Text, nullable=False),
     sa.Index(None, "surrogate_id", "outcome", "expires"),
     sa.Index(  # unique, so that a query has at most one open lease
         "uq_leases_open",
@@ -248,7 +253,7 @@ samples = sa.Table(
     sqlite_autoincrement=True,
 )
 
-snapshots = sa.Table(  # names and coordinates of snapshots that samplers hold
+snapshots = sa.Table(  # names and coordinates of snapshots (saved states) to which samplers can return
     "snapshots",
     metadata,
     row_id(),
