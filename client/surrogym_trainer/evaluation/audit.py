@@ -21,23 +21,26 @@ from surrogym_trainer.evaluation.systematic import Inputs, Systematic, columns, 
 from surrogym_trainer.policies.evidence import Audit, Promise
 
 AUDIT_STEPS = 8
-# largest number of steps of an audit; more than the usual ones are taken only while the result is undecided
+# an audit takes at most this number of steps, and more than it began with only while its result is undecided
 MOST_STEPS = 40
-ALARM = 0.01  # probability that the test of output errors fails for a right model
-# probability that the errors of a right model ever seem to have a part that all steps share, however many steps are
-# taken
+ALARM = 0.01  # probability that the sizes of the output errors fail the test although the model is right
+# probability that a right model ever fails the test for errors that all steps share, however many steps are taken
 SHIFT_ALARM = 0.05
-# if the return leaves the promised interval with more than this probability, an audit takes more steps and widens the
-# interval
+# if shared errors move the return out of the promised interval with more than this probability, an audit takes more
+# steps and widens the interval
 UNDECIDED = 0.05
-MISPLACED_ENDS = 2  # an audit fails if the model predicted the termination of this many steps wrongly
-# share of the gain over an untrained policy by which a new promise may leave the interval of the previous promise
+# an audit fails if the model wrongly predicted, in at least this number of steps, whether the step ends its episode
+MISPLACED_ENDS = 2
+# a return or a new promise may leave the promised interval by this share of the policy's gain over an untrained policy
 SLACK = 0.1
-# distance at which states count as far apart, in standard deviations of a coordinate over the policy's states
+# two states are far apart if a coordinate differs by more than this number of its standard deviations over the policy's
+# states
 FAR = 1.0
-MOST_UNTESTED = 0.2  # share of a policy's states that may be far from every step of an audit
-QUANTILES = 200  # number of quantiles that represent a promise's distribution
-# share of the gain over an untrained policy; if the lower half of a promise is wider, more real steps may narrow it
+# an audit does not support a promise if more than this share of the policy's states is far from every step of the audit
+MOST_UNTESTED = 0.2
+QUANTILES = 200  # to widen a promise, its distribution is represented by this number of quantiles
+# if the lower half of a promised interval is wider than this share of the gain over an untrained policy, more real
+# steps may narrow it
 UNSURE = 0.2
 
 Array = NDArray[np.float64]
@@ -142,7 +145,8 @@ class Consequence:
         return self.shifted.evidence >= 1 / SHIFT_ALARM and len(moved) > 0 and self.beyond.sum() > len(moved) / 2
 
     def fault(self, compared: Compared) -> str | None:
-        """Return a sentence about the error with the largest effect; None if nothing is proven."""
+        """Return a sentence about the output whose errors most probably have a shared part, and about the return with
+        this part; None if the model is not proven wrong."""
         if not self.proven:
             return None
         worst = int(np.argmax(self.shifted.chances))
@@ -265,13 +269,12 @@ def untested(spec: EnvironmentSpec, q: Array, audited: Array) -> float:
 
 
 def unanswered(count: int, of: int) -> str:
-    """Return the sentence that the original environment failed at ``count`` queries ``of`` an audit."""
+    """Return the sentence that the original environment failed at ``count`` of the ``of`` queries of an audit."""
     return f"the original environment failed at {count} of {of} queries, so nothing is known there"
 
 
 def disappointed(audit: Audit, floor: float | None, imagined: float | None = None) -> bool:
-    """Return whether the model that has learned from an audit promises clearly less than the model that chose the
-    policy.
+    """Return whether the model promises clearly less after it has learned from an audit than it did before.
 
     The policy was chosen by its imagined return, the mean return in the model. If this depends on what the model does
     not know, the promise before the audit is already lower. So the promise after the audit is compared with the larger
@@ -343,8 +346,8 @@ def gaps(spec: EnvironmentSpec, q: Array, u: Array, samples: tuple[Array, Array]
     ranges[ranges == 0] = np.inf
 
     def away(states: Array, actions: Array) -> Array:
-        """Return the distance (m, C + F) of each coordinate and action entry in q and u from the nearest value of the
-        same entry in the given states (n, C) and actions (n, F)."""
+        """Return the distance (m, C + F) of each coordinate and action entry of the m states q and actions u from the
+        nearest value of the same entry in ``states`` (n, C) and ``actions`` (n, F)."""
         off = differences(spec, q[:, None], states[None]), u[:, None] - actions[None]
         nearest: Array = np.abs(np.concatenate(off, 2)).min(1)
         return nearest
@@ -369,9 +372,10 @@ def differences(spec: EnvironmentSpec, real: Array, predicted: Array) -> Array:
 
 
 def on_one_scale(spec: EnvironmentSpec, q: Array, u: Array, first: int | None = None) -> Array:
-    """Scale states q (m, C) and actions u (m, F) to points whose distances are meaningful.
+    """Return states q (m, C) and actions u (m, F) as points (m, P) whose distances can be compared. An angle becomes
+    its cosine and sine.
 
-    Each column is divided by its standard deviation over all rows, or over the ``first`` rows.
+    Each of the P columns is divided by its standard deviation over all rows, or over the ``first`` rows.
     """
     at = columns(spec, q, u)
     spread = at[:first].std(0)

@@ -19,10 +19,11 @@ from surrogym_trainer.evaluation.audit import ALARM, Compared, chi_squared, diff
 from surrogym_trainer.evaluation.evaluator import ROUNDING, Trace, span
 from surrogym_trainer.evaluation.systematic import LEAST
 
-MOST = 400  # largest number of real steps to compare
-# smallest expected error in an output's unit, so that an output that is predicted exactly can be tested
+MOST = 400  # at most this number of real steps is compared with the model
+# an output's expected error, in its unit, is taken to be at least this, so that an output without any error can be
+# tested
 LEAST_ERROR = 1e-12
-SHOWN = 3  # number of worst steps, and of worst episodes, to show
+SHOWN = 3  # at most this number of the worst steps, and of the worst episodes, is shown
 
 
 class Step(Protocol):
@@ -84,8 +85,8 @@ def _expected(claim: OutputFidelity, matters: float) -> float:
 
 
 def _alone(claim: OutputFidelity) -> float:
-    """Return the error of an output on left-out samples, which includes the noise. If the family of models can't
-    compute this error, return the output's tolerance."""
+    """Return the error of an output on left-out samples, which includes the noise, but at least ``LEAST`` times the
+    tolerance. If the family of models can't compute this error, return the output's tolerance."""
     known = claim.tolerance if claim.leave_one_out_error is None else claim.leave_one_out_error
     return max(known, claim.noise, LEAST * claim.tolerance, LEAST_ERROR)
 
@@ -205,7 +206,8 @@ def samples_of(found: Disagreements, most: int) -> list[NewSample]:
 
 
 def _in_turns(steps: Sequence[StepOfEpisode]) -> list[StepOfEpisode]:
-    """Order steps so that their episodes take turns."""
+    """Return the steps in another order: the first step of every episode, then the second step of every episode, and so
+    on."""
     rank: dict[int, int] = {}
     turns: list[tuple[int, StepOfEpisode]] = []
     for step in steps:

@@ -20,10 +20,13 @@ from surrogym_trainer.evaluation.imagined import imagine
 from surrogym_trainer.evaluation.systematic import Inputs, Region, Systematic, region
 from surrogym_trainer.policies.predict import Predict
 
-DRAWS = 64  # number of sampled errors that agree with the steps
-STARTS = 4  # number of virtual episodes under each sampled error
-CERTAIN = 0.9  # probability above which an output's errors count as having a part that all steps share
-EFFECT_STARTS = 32  # number of virtual episodes under the errors of a single output
+# the effect on the return is computed for this number of errors that are drawn from their posterior distribution
+DRAWS = 64
+STARTS = 4  # for each drawn error, the return is the mean over this number of virtual episodes
+# if the probability that an output's errors have a part that all steps share exceeds this, the output is reported
+CERTAIN = 0.9
+# for the reported effect of one output's errors, the return is the mean over this number of virtual episodes
+EFFECT_STARTS = 32
 
 Array = NDArray[np.float64]
 
@@ -51,7 +54,7 @@ def changes_of(
         version: version of the model that was compared with the real steps.
         shifted: the test for errors that all steps share, which names the outputs and standardises the inputs.
         weights: the K errors (K, O, 1 + P): for each output, a constant and a factor for each of P standardised inputs.
-        starts: number of virtual episodes for each row of weights.
+        starts: number of virtual episodes for each of the K errors.
     """
     if not weights.any():
         return np.zeros(len(weights))
@@ -86,7 +89,7 @@ class Effect:
     change: float | None
 
     def words(self) -> str:
-        """Return the effect as a sentence."""
+        """Return a sentence about the output's error, where it is largest, and how much it changes the return."""
         where = ""
         if (at := self.region) is not None:
             where = f", {at.error:+.3g} where {at.name} is between {at.low:.4g} and {at.high:.4g}"
@@ -107,8 +110,8 @@ def effects_of(
             leaves the changes out.
 
     Returns:
-        The effects, and the contribution of each step to them (n,): the sum of its errors that the effects explain,
-        each divided by the model's error on left-out samples.
+        The effects, and the contribution (n,) of each step to them: the sum of its errors in the direction of the
+        shared errors, each divided by the model's error on left-out samples and weighted by the size of the effect.
     """
     shifted = compared.together(spec, Inputs.over(spec, compared.states, compared.actions))
     weights, outputs = shifted.expected(), np.flatnonzero(shifted.chances > CERTAIN).tolist()

@@ -28,9 +28,10 @@ Array = NDArray[np.float64]
 Progress = Callable[[float, int], None]
 
 FIRST_SEED = 10_000
-FEW_EQUAL = 3  # number of first episodes that are compared; if they are equal, a remark says so
-EXPLORING = 1  # part of the seed of the random changes of actions
-ROUNDING = 1e-6  # share of its range by which a constant may change within an episode and still count as constant
+FEW_EQUAL = 3  # once this number of episodes has ended and all are equal, a remark says so
+EXPLORING = 1  # second part of the seed of the random changes of actions; the first part is the seed of the episode
+# a constant coordinate may change within an episode by this share of its range and still count as constant
+ROUNDING = 1e-6
 
 
 @dataclass(frozen=True)
@@ -90,7 +91,7 @@ class Evaluation:
     returns: Array  # (N,) return of each episode
     lengths: NDArray[np.int64]  # (N,) number of steps of each episode
     success: NDArray[np.bool_] | None  # (N,) whether each episode succeeded; None if the specification has no criterion
-    traces: tuple[Trace, ...]  # one for each episode
+    traces: tuple[Trace, ...]  # record of each of the N episodes, step by step
     varied: tuple[str, ...] = ()  # names of constants of the specification that changed within an episode
     limit: int | None = None  # largest number of steps in an episode, by the specification or by the environment itself
     seeded: bool = True  # whether a second reset with the first seed began in the same state
@@ -235,7 +236,7 @@ def interquartile_mean(values: Array) -> float:
 
 @dataclass
 class _Tally:
-    """The running sums of one episode, which begins at the current state of ``episode``."""
+    """The sums and the record of one running episode, which begins at the current state of ``episode``."""
 
     number: int  # number of the episode, from 0, in the order of the seeds
     episode: Episode
@@ -296,7 +297,8 @@ class _Run:
         self._tallies: list[_Tally] = []
 
     def on(self, instances: Sequence[Episode], between_steps: Callable[[], None]) -> Evaluation:
-        """Run all episodes in these instances; ``between_steps`` is called after each step of all."""
+        """Run all episodes in these open instances of the environment, and return the result. ``between_steps`` is
+        called each time all running episodes have taken a step."""
         free, running = list(instances), list[_Tally]()
         while running or len(self._tallies) < self.settings.episodes:
             running += self._begin(free)
@@ -345,7 +347,7 @@ class _Run:
         return self._policy(observations)
 
     def _look_for_equal_ones(self) -> None:
-        """Report that the first episodes are equal, while stopping can still save real steps."""
+        """Send a remark if all episodes that have ended are equal, while stopping can still save real steps."""
         over = [tally for tally in self._tallies if tally.over]
         if self._remark is None or len(over) < FEW_EQUAL or len(self._tallies) == self.settings.episodes:
             return
@@ -375,8 +377,8 @@ def _start(episode: Episode, settings: EvaluationSettings, index: int) -> Moment
 
 
 def _reset(episode: Episode, settings: EvaluationSettings) -> Array | None:
-    """Reset once more than there are episodes: before the first one, with its seed. Return the coordinates (C,); if the
-    first episode starts elsewhere, the environment ignores its seed. None if the starts are not chosen by a reset."""
+    """Reset the environment with the seed of the first episode, and return the start (C,). If the first episode then
+    starts elsewhere, the environment ignores seeds. None if a reset does not choose the starts."""
     if settings.wide or settings.start_scale != 1:
         return None
     return episode.reset(settings.first_seed).coordinates

@@ -24,7 +24,8 @@ WHOLE = {**DECLARED, "trust": None}
 # gets a penalty for its missing steps, so the trust limit stays
 PAID_OUTSIDE = DECLARED
 STATISTICS_LANES = 1_024
-STEPS_AT_ONCE = 1_000  # largest number of steps in one reply; an episode may be longer
+# largest number of steps that one request to the server takes; a longer episode needs several requests
+STEPS_AT_ONCE = 1_000
 
 
 @dataclass(frozen=True)
@@ -157,7 +158,7 @@ def _as_arrays(predict: Callable[[NDArray[Any]], NDArray[Any]], port: SurrogateP
 
 
 def _added(sums: NDArray[np.float64], rows: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
-    """Add rows (T, N) to sums (N,) one row at a time, so that rounding does not depend on T."""
+    """Return sums (N,) with rows (T, N) added one row at a time, so that rounding does not depend on T."""
     added: NDArray[np.float64] = np.cumsum(np.concatenate([sums[None], rows]), axis=0)[-1]
     return added
 

@@ -26,8 +26,8 @@ def is_storable(step: StepOfEpisode) -> bool:
 def as_logged(spec: EnvironmentSpec, samples: Sequence[NewSample]) -> list[NewSample]:
     """Return steps in the form in which an import would send them: with wrapped angles.
 
-    The server recognises the steps of a log by their numbers, to the last bit. So steps that it has stored already
-    count as duplicates in an import. Equal steps within the list are all kept, because each was taken.
+    The server recognises the steps of a log by their values, to the last bit. So steps that it has stored already count
+    as duplicates in an import. Equal steps within the list are all kept, because each was taken.
     """
     angles = [i for i, coordinate in enumerate(spec.coordinates) if coordinate.kind == "angle"]
     return [_with_wrapped(angles, sample) for sample in samples]
@@ -76,7 +76,7 @@ def _write_new(folder: Path, stem: str, content: bytes) -> Path:
             file.unlink(missing_ok=True)
             raise
         return file
-    raise AssertionError("numbers have no end")
+    raise AssertionError("unreachable: the loop over file numbers does not end")
 
 
 def _with_wrapped(angles: Sequence[int], sample: NewSample) -> NewSample:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from surrogym_shared.limits import limits_of, past, room
 from surrogym_shared.spec import EnvironmentSpec
 
-LEVEL = 0.05  # probability that limits count as broken although they are kept as declared
+LEVEL = 0.05  # if a policy keeps its limits as declared, they count as broken with at most this probability
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class LimitsKept:
 
     def interval(self) -> tuple[float, float]:
         """Return the exact 95 % interval (Clopper and Pearson) of the share of episodes that leave a limit."""
-        from scipy.stats import binomtest  # on first use, because it takes a second to load
+        from scipy.stats import binomtest  # imported on first use, because SciPy takes a second to load
 
         found = binomtest(self.violations, self.episodes).proportion_ci(method="exact")
         return float(found.low), float(found.high)

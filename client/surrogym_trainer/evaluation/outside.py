@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_trainer.evaluation.audit import on_one_scale
 
-USUAL = 0.99  # quantile of the distances between neighbouring logged steps, which is the log's own spacing
-FARTHER = 2.0  # a step is outside if no logged step is within this multiple of the log's spacing
-LITTLE = 0.05  # share of the policy's steps that may lie outside without a warning
-MOST = 2_000  # largest number of logged steps, and of steps of the policy, to compare
-AT_ONCE = 256  # number of rows in a table of distances, which limits memory
+USUAL = 0.99  # the spacing of a log is this quantile of the distances from each logged step to the nearest other one
+# a step of the policy lies outside the log if every logged step is farther away than this multiple of the log's spacing
+FARTHER = 2.0
+LITTLE = 0.05  # no warning is given if at most this share of the policy's steps lies outside the log
+MOST = 2_000  # at most this number of logged steps is compared with at most this number of steps of the policy
+AT_ONCE = 256  # to limit memory, distances are computed for this number of steps at once
 
 Array = NDArray[np.float64]
 
@@ -90,8 +91,8 @@ def _thinned(count: int) -> NDArray[np.intp]:
 
 
 def _nearest(points: Array, to: Array, *, itself: bool = False) -> Array:
-    """Return the distance (points,) from each point to the nearest of ``to``; ``itself`` means that both are the same
-    points."""
+    """Return the distance (k,) from each of k ``points`` to the nearest point in ``to``. If both are the same points,
+    ``itself`` leaves out the distance of a point to itself."""
     found = np.empty(len(points))
     for first in range(0, len(points), AT_ONCE):
         rows = points[first : first + AT_ONCE]

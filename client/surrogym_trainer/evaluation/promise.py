@@ -16,11 +16,13 @@ from surrogym_trainer.evaluation.imagined import imagine
 from surrogym_trainer.policies.evidence import Promise
 from surrogym_trainer.policies.predict import Predict
 
-FUNCTIONS = 32  # number of functions drawn from the posterior
-STARTS = 8  # number of episodes along each function
+FUNCTIONS = 32  # a promise is computed along this number of functions drawn from the model's posterior
+STARTS = 8  # number of virtual episodes along each drawn function
 EVALUATION_STARTS = 100  # number of real starts whose mean return is promised
 LOW, HIGH = 0.05, 0.95
-UNNOTICED = 0.02  # share of the policy's gain; an audit does not notice errors that change the return by less
+# an audit does not notice errors that change the return by less than this share of the policy's gain over an untrained
+# policy
+UNNOTICED = 0.02
 NORMAL_POINTS = 201  # number of quantiles that represent a normal distribution
 
 Array = NDArray[np.float64]
@@ -48,7 +50,7 @@ def promise_of(
     options = {name: value for name, value in (session or {}).items() if name not in left_out}
     options |= {"variant": "pathwise", "functions": FUNCTIONS, "penalty": 0.0}
     returns = imagine(port, predict, FUNCTIONS * STARTS, seed, **options).returns
-    # environment i of the session follows function i modulo FUNCTIONS
+    # lane i of the session follows function i modulo FUNCTIONS, so each column has the returns along one function
     return interval(returns.reshape(STARTS, FUNCTIONS), floor)
 
 
@@ -74,10 +76,12 @@ def interval(returns: Array, floor: float | None = None) -> Promise:
 
 
 class _Parts(NamedTuple):
-    """The variation of returns, split into that between functions and that between starts."""
+    """The variation of the returns of virtual episodes, split into that between drawn functions and that between
+    starts."""
 
-    functions: Array  # (functions,) mean returns, shrunk to the variance that the functions explain
-    within: float  # standard deviation between starts, of the returns along one function
+    # (S,) mean return along each of S drawn functions, shrunk so that their variance has no part due to the starts
+    functions: Array
+    within: float  # standard deviation of the returns along one function, which differ by their starts
 
 
 def _parts(returns: Array) -> _Parts:
@@ -86,7 +90,8 @@ def _parts(returns: Array) -> _Parts:
     observed = float(means.var(ddof=1))
     explained = max(observed - within / len(returns), 0.0)
     scale = np.sqrt(explained / observed) if observed > 0 else 0.0
-    # first-order correction to Student's t distribution, for a further function that was not drawn
+    # widens the spread to first order as Student's t distribution does, because the plant is a further function that
+    # was not drawn
     scale *= 1 + 1.5 / len(means)
     return _Parts(means.mean() + scale * (means - means.mean()), float(np.sqrt(within)))
 

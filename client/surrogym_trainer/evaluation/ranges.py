@@ -10,8 +10,8 @@ from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.spec.coordinates import Coordinate, limits
 from surrogym_trainer.policies.evidence import RangeLeft
 
-LITTLE = 0.05  # share of a policy's states that may lie beyond an end of a sampling range without a warning
-# share of a policy's states to which the original environment may be unable to be set, without a warning
+LITTLE = 0.05  # no warning is given if at most this share of a policy's states lies beyond an end of a sampling range
+# no warning is given if the original environment can be set to all but this share of a policy's states
 MOST_UNTESTABLE = 0.2
 SIDES: tuple[Side, ...] = ("lower", "upper")
 

@@ -37,7 +37,7 @@ def as_reported(
         environment: name of the environment in which the episodes ran; empty for the surrogate's own.
         trained_for: specification that the policy was trained for, if it is known.
         controller: kind of the controller that chose the actions.
-        paired: index of the episode to compare, see ``paired_start``.
+        paired: index of the episode whose trace is compared with that of other controllers, see ``paired_start``.
     """
     shown: dict[wire.TraceRank, int] = {"paired": paired, **result.ranked()}
     return wire.AddEvaluation(

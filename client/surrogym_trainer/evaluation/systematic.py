@@ -36,13 +36,16 @@ from numpy.typing import NDArray
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import Residual
 
-# possible sizes of a shared error, in standard deviations of the other errors
+# if all steps share an error, the test assumes one of these sizes, as a multiple of the errors' remaining standard
+# deviation
 SIZES = tuple(2.0**i for i in range(-1, 6))
-DEGREES = 0.1  # degrees of freedom of the prior of the errors' scale; so few leave the scale almost unknown
-# standard deviations to which a standardised input is clipped; sessions that add an error to the model clip it likewise
+DEGREES = 0.1  # degrees of freedom of the prior for the errors' standard deviation; so few leave it almost unknown
+# a standardised input is clipped to this number of standard deviations; sessions that add an error to the model clip it
+# likewise
 FARTHEST = 3.0
-LEAST = 1e-3  # smallest error on left-out samples that a model may have in the test, as a share of the tolerance
-PARTS = 3  # number of ranges of an input, with equal numbers of steps, whose mean errors are compared
+LEAST = 1e-3  # in the test, a model's error on left-out samples is taken to be at least this share of the tolerance
+# to find where an error is largest, an input's range is divided into this number of parts with equal numbers of steps
+PARTS = 3
 
 Array = NDArray[np.float64]
 
@@ -60,8 +63,8 @@ def columns(spec: EnvironmentSpec, q: Array, u: Array) -> Array:
 class Inputs(NamedTuple):
     """The standardisation of inputs, by their mean and standard deviation over the states that a policy visits."""
 
-    centre: Array  # (P,) mean of each input
-    scale: Array  # (P,) standard deviation of each input
+    centre: Array  # (P,) mean of each of P inputs: coordinates, with cosine and sine for an angle, and action entries
+    scale: Array  # (P,) standard deviation of each of the P inputs
 
     @classmethod
     def over(cls, spec: EnvironmentSpec, q: Array, u: Array) -> Self:
@@ -77,22 +80,25 @@ class Inputs(NamedTuple):
         return joined
 
     def residual(self, weights: Array) -> Residual:
-        """Return the session option that adds errors with weights (K, O, 1 + P) to the model."""
+        """Return the session option that adds K errors to the model's O outputs. Each is linear in the inputs, with
+        weights (K, O, 1 + P) of a constant and of P inputs."""
         return Residual(centre=self.centre.tolist(), scale=self.scale.tolist(), weights=weights.tolist())
 
 
 class _Form(NamedTuple):
-    """One form that an output's error may have: prior variances of its weights (1 + P,), and how well it explains the
-    errors."""
+    """One form that the shared error of an output may have, a constant plus a linear function of P inputs: the prior
+    variances (1 + P,) of its weights, and how well it explains the errors."""
 
     variances: Array
-    evidence: float  # likelihood ratio to the hypothesis that the model is right
-    mean: Array  # (1 + P,) posterior mean of the weights
-    root: Array  # (1 + P, 1 + P) square root of the weights' posterior covariance
+    # likelihood of the errors under this form, divided by that under the hypothesis that the model is right
+    evidence: float
+    mean: Array  # (1 + P,) posterior mean of the weights of a constant and of P inputs
+    root: Array  # (1 + P, 1 + P) square root R of the posterior covariance R R' of the weights
 
     @classmethod
     def of(cls, errors: Array, x: Array, variances: Array) -> Self:
-        """Explain errors (n,) by inputs x (n, 1 + P) with weights of these prior variances.
+        """Return the form whose weights have the prior ``variances`` (1 + P,), fitted to errors (n,) at the inputs x
+        (n, 1 + P), a constant and P inputs.
 
         Errors and inputs are whitened: without a shared part, the covariance of the errors is the identity, times an
         unknown factor. With a shared part, it is I + x diag(variances) x', whose inverse and determinant follow from
@@ -100,9 +106,8 @@ class _Form(NamedTuple):
         """
         scales, n = np.sqrt(variances), len(errors)
         precision = np.eye(len(scales)) + scales[:, None] * (x.T @ x) * scales
-        covariance = scales[:, None] * np.linalg.solve(
-            precision, np.diag(scales)
-        )  # posterior covariance of the weights
+        # posterior covariance of the weights, before it is scaled by the variance of the errors
+        covariance = scales[:, None] * np.linalg.solve(precision, np.diag(scales))
         score = x.T @ errors
         right = DEGREES + float(errors @ errors)
         wrong = max(right - float(score @ covariance @ score), DEGREES)
@@ -147,8 +152,8 @@ class Systematic:
         """Draw ``count`` shared errors from their posterior distribution, as weights (count, O, 1 + P). The weights of
         an output are 0 in those draws in which it has no shared error.
 
-        The outputs in ``wrong`` (O,) have a shared error in all draws, because the size of their errors has shown that
-        the model is wrong.
+        The outputs that ``wrong`` (O,) marks have a shared error in all draws, because the size of their errors has
+        shown that the model is wrong there.
         """
         size = len(self.inputs.centre) + 1
         weights = np.zeros((count, len(self.names), size))

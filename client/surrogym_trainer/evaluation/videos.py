@@ -29,7 +29,7 @@ FORMS: tuple[Form, ...] = ("mp4", "gif")
 PANEL = 240  # width of one episode's picture in pixels
 LINE, TEXT = 20, 13  # height of a line and of its text in pixels
 MOST_FRAMES = 600  # largest number of frames in a video; longer episodes are shown faster
-GIF_FRAMES_PER_SECOND = 10  # a GIF with all frames would be six times as large as an MP4
+GIF_FRAMES_PER_SECOND = 10  # fewer than in an MP4, because a GIF with all frames would be six times as large
 INK, PAPER = (23, 32, 42), (255, 255, 255)
 
 

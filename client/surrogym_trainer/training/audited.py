@@ -106,7 +106,8 @@ class AuditedTraining:
         return self._best(result)
 
     def _best(self, result: TrainResult) -> TrainResult:
-        """Return the candidate that is best in the model of all real steps so far."""
+        """Return the result whose policy earns most in the latest model: that of the last training, or of an earlier
+        one."""
         return self.candidates.best(self.port, result, self._chosen)
 
     @property
@@ -164,7 +165,7 @@ class AuditedTraining:
 
     def _shifted(self, done: int) -> Callable[[TrainProgress], None] | None:
         """Return a function that reports the progress of a training that follows ``done`` virtual steps of earlier
-        trainings; None if nobody wants reports."""
+        trainings; None if ``progress`` is None."""
         progress = self.progress
         return None if progress is None else lambda now: progress(after(now, done))
 

@@ -14,8 +14,9 @@ from surrogym_trainer.policies.files import load_policy
 from surrogym_trainer.policies.predict import Predict
 from surrogym_trainer.training.settings import TrainResult, TrainSettings
 
-EPISODES = 128  # number of virtual episodes of each policy, from the same starts
-CLEARLY = 2.0  # standard errors of a mean difference; a smaller difference may be chance
+EPISODES = 128  # policies are compared over this number of virtual episodes, with the same starts for each policy
+# an earlier policy replaces the latest one if its mean return is higher by more than this number of standard errors
+CLEARLY = 2.0
 
 
 @dataclass

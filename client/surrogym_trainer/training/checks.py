@@ -15,20 +15,27 @@ from surrogym_trainer.training.settings import CHECK_EPISODES, TrainSettings
 
 Returns = NDArray[np.float64]
 
-GAIN = 0.01  # share of the gain over an untrained network; a smaller gain in the second half of a cycle counts as none
-CLEARLY = 2.0  # number of standard errors above which a difference is clear
-LEARNED = 0.01  # share of the best episode's gain over an untrained network, below which nothing was learned
-MANY = 0.25  # share of the episodes that must show a gain; a few may succeed by a lucky posterior sample
-SATURATED = 3  # number of checks in a row in which every episode earned the highest return so far
+# if the second half of a training cycle gains less than this share of the gain over an untrained network, it counts as
+# no gain
+GAIN = 0.01
+CLEARLY = 2.0  # a mean difference of returns is clear, and not chance, above this number of its standard errors
+# a network that gains less than this share of the best episode's gain over an untrained network has learned nothing
+LEARNED = 0.01
+# this share of the episodes must earn more than with an untrained network, because a few may succeed by a lucky
+# posterior sample
+MANY = 0.25
+# no further gain is possible after this number of checks in a row in which every episode earned the highest return so
+# far
+SATURATED = 3
 
 
 class Checks:
     """The best policy of a training so far, by its imagined return, and whether a further gain is likely.
 
     Args:
-        untrained: returns of an untrained network.
-        saved: returns of the policy of an earlier training. A new network has learned something if it reaches half of
-            that policy's gain.
+        untrained: returns (episodes,) of an untrained network in a check.
+        saved: returns of the policy of an earlier training, if there is one. A new network has learned something only
+            if it exceeds half of that policy's gain over an untrained network.
     """
 
     def __init__(self, untrained: Returns, saved: Returns | None = None) -> None:
@@ -36,8 +43,8 @@ class Checks:
         self.latest: float | None = None  # imagined return of the last check
         self.returns_of_best: Returns | None = None  # (episodes,) returns of the best policy so far
         self._half_way = self.untrained if saved is None else (self.untrained + float(saved.mean())) / 2
-        # the return that the best quarter of the episodes reaches: of an untrained network (few), and the highest so
-        # far (many)
+        # return that the best quarter of the episodes of a check reaches: with an untrained network (few), and the
+        # highest so far (many)
         self._few = self._many = _of_many(untrained)
         self._seen = self.untrained  # highest return of a training episode
         self._most = float(untrained.max())  # highest return of an episode of a check
@@ -53,7 +60,8 @@ class Checks:
         self._seen = max([self._seen, *earned])
 
     def add(self, returns: Returns) -> bool:
-        """Record the returns of a check of the current policy. Returns whether it is the best so far."""
+        """Record the returns (episodes,) of a check of the current policy. Returns whether this policy is the best so
+        far."""
         imagined, most = float(returns.mean()), float(returns.max())
         self._many = max(self._many, _of_many(returns))
         rose, self._most = most > self._most, max(self._most, most)
@@ -79,8 +87,8 @@ class Checks:
 
     @property
     def saturated(self) -> bool:
-        """Whether no further gain is possible: in the last checks, each episode's return equalled the highest one so
-        far, in the training and in all checks."""
+        """Whether no further gain is possible: in the last ``SATURATED`` checks, every episode earned the highest
+        return of all episodes so far."""
         return self._full >= SATURATED
 
     def gained(self, before: Returns | None) -> bool:

@@ -25,9 +25,9 @@ from surrogym_trainer.training.settings import (
 )
 from surrogym_trainer.training.trainer import train
 
-ROUND_SHARE = 0.25  # virtual steps of each round before the last, as a share of a whole training
+ROUND_SHARE = 0.25  # each round before the last training takes at most this share of its virtual steps
 VISIT_LANES = 32
-VISIT_STEPS = 1_000  # number of steps in which a round collects visited states, if the specification has no time limit
+VISIT_STEPS = 1_000  # a round collects visited states in at most this number of steps of each virtual environment
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,8 @@ class LoopSettings:
 
     queries: int  # number of real steps in one round
     rounds: int = 3
-    patience_seconds: float = 3_600.0  # seconds that the sampler may take for one round
+    # longest time in seconds to wait until the sampler has answered the queries of a round
+    patience_seconds: float = 3_600.0
 
 
 @dataclass
@@ -51,9 +52,9 @@ class ClosedLoop:
     Each round submits the states that the policy visits from the declared starts, as a checkpoint that no other
     training shares. So the queries of a round depend on this training alone, and the same seeds choose the same
     queries. The rounds end once the confidence index over these states reaches the target that the design has for the
-    whole range. In the rounds, lanes move by the mean, so that a policy goes where the model predicts the highest
-    return. The settings of the last training depend on the phase that the design has then, see ``chosen_for``. Only the
-    last training may be prolonged, because a later round makes up for a short earlier one.
+    whole range. In the rounds, virtual states follow the model's mean, so that a policy goes where the model predicts
+    the highest return. The settings of the last training depend on the phase that the design has then, see
+    ``chosen_for``. Only the last training may be prolonged, because a later round makes up for a short earlier one.
 
     Attributes:
         api: the connection to the server.
@@ -78,8 +79,8 @@ class ClosedLoop:
     waiting: Callable[[SurrogateView], None] | None = None
     trained: list[TrainResult] = field(default_factory=list, init=False)
     candidates: Candidates = field(default_factory=Candidates)
-    _visited: int = field(default=0, init=False)  # number of virtual steps that collected visited states
-    # confidence index over the states that the policy visited in each round
+    _visited: int = field(default=0, init=False)  # number of virtual steps in which the rounds collected visited states
+    # for each round, the confidence index over the states that its policy visited; None if it is not known
     _known: list[float | None] = field(default_factory=list, init=False)
     _region_known: bool = field(default=False, init=False)
 
@@ -177,9 +178,9 @@ class ClosedLoop:
 def _for_use(view: SurrogateView, settings: TrainSettings, *, region_known: bool) -> TrainSettings:
     """Return the settings of the last training.
 
-    If the model is certain in the states that the last round's policy visits, training continues from that policy.
-    Otherwise it begins with a new network and the variant with posterior samples, because a network that has learned
-    from wrong models keeps what they taught it.
+    If the model is certain in the states that the last round's policy visits (``region_known``), training continues
+    from that policy. Otherwise it begins with a new network and the variant with posterior samples, because a network
+    that has learned from wrong models keeps what they taught it.
     """
     last = chosen_for(view, settings)
     anew = last is not settings and settings.start_from is None and not region_known
@@ -203,7 +204,7 @@ def shares(settings: TrainSettings, rounds: int) -> tuple[int, int]:
 def visit(
     port: SurrogatePort, learned: TrainResult, settings: TrainSettings, checkpoint: str
 ) -> tuple[int, float | None]:
-    """Run the policy of a round from the declared starts, and submit the visited states.
+    """Run the policy of a round from the declared starts, and submit the visited states to the surrogate.
 
     Args:
         port: the surrogate.

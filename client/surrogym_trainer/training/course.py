@@ -15,8 +15,9 @@ class Course:
     """
 
     def __init__(self) -> None:
-        self._share = self._base = 0.0  # the share that is done, now and when the total last changed
-        self._steps = self._begun = 0  # virtual steps, now and when the total last changed
+        # share of the training that is done: now, and when the total number of steps last changed
+        self._share = self._base = 0.0
+        self._steps = self._begun = 0  # virtual steps taken: now, and when the total number of steps last changed
         self._total = 0
         # virtual steps and seconds at the first call of words_of_time_left
         self._first: tuple[int, float] | None = None
@@ -50,5 +51,6 @@ class Course:
 
 
 def after(now: TrainProgress, done: int, total: int = 0) -> TrainProgress:
-    """Return the progress of a training that follows ``done`` virtual steps, of ``total`` planned in all."""
+    """Return the progress ``now`` of a training, counted from before the ``done`` virtual steps of earlier trainings.
+    Its total is at least ``total``."""
     return replace(now, steps=done + now.steps, total_steps=max(total, done + now.total_steps))

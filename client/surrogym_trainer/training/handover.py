@@ -46,13 +46,18 @@ from surrogym_trainer.evaluation.uncontrolled import baseline
 from surrogym_trainer.policies.evidence import Audit, Promise
 from surrogym_trainer.policies.predict import Predict
 
-LEAST_AUDITED = 128  # number of real steps of audits that every surrogate may take
+# all audits of a surrogate together may take this number of real steps, or as many as its budget if that is larger
+LEAST_AUDITED = 128
 MOST_AUDITS = 3  # largest number of audits in one training
-WAY_LANES = 16  # number of virtual episodes from whose states an audit chooses
-MOST_OF_A_WAY = 200  # largest number of steps of an episode that are compared with a log
-ELSEWHERE = 4  # an audit of a ready design takes one of this many steps in a gap of the samples
-ANYWHERE = 1_024  # number of points of the sampling range from which an audit's steps in gaps are chosen
-WIDE = 0.5  # share of the gain over an untrained policy; a promise with a wider lower half is not trusted
+WAY_LANES = 16  # an audit chooses its states from this number of virtual episodes of the policy
+# at most this number of steps of each virtual episode is compared with the log from which the model was learned
+MOST_OF_A_WAY = 200
+ELSEWHERE = 4  # if the design is ready, an audit takes one of this number of steps in a gap between the samples
+# the steps of an audit in gaps between the samples are chosen from this number of points of the sampling range
+ANYWHERE = 1_024
+# a promise is not trusted if the lower half of its interval is wider than this share of the gain over an untrained
+# policy
+WIDE = 0.5
 NO_SAMPLER = "no sampler is connected"
 
 Array = NDArray[np.float64]
@@ -82,7 +87,7 @@ class AuditSettings:
     """The settings of an audit: number of real steps, patience and seed."""
 
     steps: int = AUDIT_STEPS
-    patience_seconds: float = 3_600.0  # seconds that a sampler may take
+    patience_seconds: float = 3_600.0  # longest time in seconds to wait for the sampler's answers
     seed: int = 0
 
 
@@ -94,9 +99,8 @@ class Subject:
     name: str  # name of the surrogate
     port: SurrogatePort
     predict: Predict
-    session: dict[str, Any] = field(
-        default_factory=dict
-    )  # session fields (of OpenSession) that the policy was trained with
+    # fields of OpenSession, the options of a session, that the policy was trained with
+    session: dict[str, Any] = field(default_factory=dict)
     floor: float | None = None  # imagined return of an untrained policy
     seed: int = 0
 
@@ -139,7 +143,8 @@ def _handed_over(
 
 
 def _left_the_log(subject: Subject) -> Outside | None:
-    """Return which part of a policy's states is outside the log; None if the model was not learned from a log alone."""
+    """Return how many of the policy's steps are far from all steps of the log, and where; None if the model was not
+    learned from a log alone."""
     view, spec = subject.api.surrogate(subject.name), subject.port.spec()
     if view.phase != "from_log":
         return None
@@ -240,7 +245,7 @@ def _consequence(
     """Test whether the model's errors in an audit have a part that all steps share, and compute how this part changes
     the return.
 
-    Returns None if there is no step in a state that the policy visits.
+    Returns None if there is no step in a state that the policy visits, or no model.
 
     Args:
         subject: the policy.
@@ -395,7 +400,7 @@ def _verdict(audit: Audit, floor: float | None) -> tuple[bool, str]:
 
 
 def _unaudited(subject: Subject, promise: Promise, why: str) -> Handover:
-    """Return a handover whose promise is not supported by any real step; ``why`` is the reason."""
+    """Return a handover without an audit; ``why`` is the reason. It has no promise if the policy leaves the log."""
     if (left := _left_the_log(subject)) is not None and left.much:
         return Handover(None, None, False, f"{left.words()}: no promise can be made for them")
     return _without(subject.api.surrogate(subject.name), promise, subject.floor, why)
@@ -412,8 +417,8 @@ def _without(view: SurrogateView, promise: Promise, floor: float | None, why: st
 
 
 def _doubtful(promise: Promise, floor: float | None) -> str | None:
-    """Return why the numbers of a promise make it doubtful; None if they don't. ``floor`` is the return of an untrained
-    policy."""
+    """Return why a promise is doubtful although no audit failed, such as a wide interval; None if it is not doubtful.
+    ``floor`` is the return of an untrained policy."""
     if floor is not None and promise.high <= floor:
         return (
             f"the promise is no more than the return of an untrained policy, {floor:.4g}: perhaps no policy can change "

@@ -19,7 +19,7 @@ FUNCTIONS: dict[str, Any] = {"variant": "pathwise"}
 
 START_BOX = 0.5  # default share of episodes that start anywhere in the sampling range
 
-MOST_THREADS = 1_024  # more than any machine has; with too many, torch would end the process
+MOST_THREADS = 1_024  # largest number of threads that may be set, because torch would end the process with too many
 
 TENSORBOARD = "tensorboard"  # name of the default folder of TensorBoard's files, beside the policy
 

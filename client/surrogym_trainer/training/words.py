@@ -87,8 +87,8 @@ def words_of_range(left: RangeLeft) -> str:
 
 
 def words_of_interruption(result: TrainResult, asked: str) -> str:
-    """Return a text about what Ctrl-C has left and how to continue. ``asked`` holds the arguments of the command: the
-    surrogate and its options."""
+    """Return a text about the policy that was saved at Ctrl-C, and about how to continue its training. ``asked`` holds
+    the arguments of the command: the surrogate and its options."""
     return (
         f"interrupted after {result.virtual_steps} virtual steps; the policy so far is in {result.path}; to continue: "
         f"surrogym train {asked} --start-from {result.path} --out {result.path}"
@@ -112,7 +112,8 @@ def _gaining(result: TrainResult) -> str:
 
 
 def _loop(rounds: Sequence[float | None]) -> str:
-    """Return a text about the closed loop, from the confidence index of each round."""
+    """Return a text about the rounds of the closed loop, from the confidence index of each round, which may be unknown
+    (None)."""
     if not rounds:
         return "; the design was ready, so no round was needed"
     return f"; {len(rounds)} round{'s' * (len(rounds) > 1)}{_known(rounds[-1])}"

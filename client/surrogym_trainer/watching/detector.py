@@ -1,4 +1,5 @@
-"""Detection of drift in an endless stream of errors, with a known rate of false alarms. All functions are pure.
+"""Detection of drift in an endless stream of a model's prediction errors, with a known rate of false alarms. All
+functions are pure.
 
 An audit tests once whether its few errors share a part (``evaluation.systematic``). A stream has no end, and the plant
 may change at any step, so the test has to begin again at each step and to forget what was long ago. That is an
@@ -33,18 +34,28 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-FALSE_ALARM_STEPS = 10_000  # average number of steps until a false alarm
-SHIFTS = (0.5, 1.0, 2.0)  # sizes of a change of the mean error that are tested, in standard deviations
-SPREADS = (0.25, 0.5)  # tested increases of the errors' variance: by a factor of 1 / (1 - g) for each g
-BIAS = 3.0  # a mean error up to this number of the model's standard deviations is the model's own error, no drift
-SHARE = 1.5  # factor on the model's standard deviation, which together with the noise gives that of an error
-MOST = 4.0  # standard deviations to which an error is limited, so that one spike gives no alarm
-OUTLYING = 3.0  # standard deviations to which an error is limited before mean and noise are learned from it
-NOISE_STEPS = 20.0  # for the noise, the model's error on left-out samples counts as much as this number of steps
-PAID_STEPS = 100.0  # prior of a bet's average factor on the evidence: 1, with the weight of this number of steps
-# largest average factor of a bet on the evidence that is attributed to heavy tails of the noise, not to a change
+FALSE_ALARM_STEPS = 10_000  # default: without a change, false alarms are at least this number of steps apart on average
+# the detector tests for changes of the mean error of these sizes, in standard deviations of an error
+SHIFTS = (0.5, 1.0, 2.0)
+# the detector tests for an increase of the errors' variance by the factor 1 / (1 - g), for each g
+SPREADS = (0.25, 0.5)
+BIAS = 3.0  # a mean error of up to this number of the model's standard deviations is the model's own error, no drift
+# the variance of an error is expected to be noise ** 2 + (SHARE * d) ** 2, where d is the model's standard deviation
+SHARE = 1.5
+# an error of more than this number of standard deviations counts as one of this size, so that one spike gives no alarm
+MOST = 4.0
+# before the noise is estimated from an error, the error is limited to this number of the noise's standard deviations
+OUTLYING = 3.0
+# the noise is estimated from the steps and from the model's error on left-out samples, which counts as this number of
+# steps
+NOISE_STEPS = 20.0
+# the average factor by which a step multiplies the evidence for a change is taken to be 1 at first, with the weight of
+# this number of steps
+PAID_STEPS = 100.0
+# if steps multiply the evidence for a change by more than 1 on average, an average of up to this factor is attributed
+# to heavy tails of the noise
 MOST_PAID = 1.5
-NEGLIGIBLE = 0.1  # share of the tolerance below which an error is negligible
+NEGLIGIBLE = 0.1  # smallest standard deviation that noise and model are taken to have, as a share of the tolerance
 
 Array = NDArray[np.float64]
 
@@ -80,21 +91,24 @@ class Detector:
         self._squares = NOISE_STEPS * np.maximum(claimed, self._least) ** 2
         count = 2 * len(SHIFTS) + len(SPREADS)
         half = [1 / (4 * len(SHIFTS))] * (2 * len(SHIFTS)) + [1 / (2 * len(SPREADS))] * len(SPREADS)
-        # (B,) weights of the bets: half on a changed mean, half on a larger variance
+        # (B,) weights of B tested changes (bets): half of the weight is on changes of the mean, half on larger
+        # variances
         self._weights = np.array(half) / len(claimed)
-        self._evidence = np.zeros((len(claimed), count))  # (O, B) evidence of each bet for a change at any step so far
-        # (O, B) sum over the steps of each bet's factor on the evidence
+        # (O, B) for O outputs: evidence for each tested change at any step so far
+        self._evidence = np.zeros((len(claimed), count))
+        # (O, B) sum, over the steps, of the factor by which a step multiplies the evidence; divided by the steps, it is
+        # the average
         self._paid = np.full((len(claimed), count), PAID_STEPS)
-        # (O, B) logarithm of the evidence since the step at which a change most likely began
+        # (O, B) logarithm of the evidence of the steps since the one at which each change most likely began
         self._run = np.zeros((len(claimed), count))
-        # (O, B) the step at which a change most likely began
+        # (O, B) number of the step at which each change most likely began
         self._begun = np.zeros((len(claimed), count), dtype=np.int64)
         self.steps = 0
 
     @property
     def evidence(self) -> float:
-        """The evidence that the errors have changed at any of the steps so far. There is an alarm once it reaches
-        ``false_alarm_steps``."""
+        """The evidence that the errors have changed at any of the steps so far. ``step`` returns a drift once it
+        reaches ``false_alarm_steps``."""
         return float((self._evidence * self._weights).sum())
 
     def step(self, error: Array, deviation: Array) -> Drift | None:
@@ -107,7 +121,8 @@ class Detector:
         known = np.isfinite(error)
         uncertain = np.hypot(deviation, self._least)
         noise = np.sqrt(self._squares / (NOISE_STEPS + self._known_steps))
-        # posterior mean of the errors, with the prior N(0, d^2), where d is the model's standard deviation
+        # posterior mean of the errors without a change; their prior is N(0, d^2), where d is the model's standard
+        # deviation
         mean = self._sum / (self._known_steps + (noise / uncertain) ** 2)
         mean = mean.clip(-BIAS * uncertain, BIAS * uncertain)
         beyond = np.where(known, error - mean, 0.0)
@@ -123,8 +138,8 @@ class Detector:
         return self._found() if self.evidence >= self._alarm else None
 
     def _learn(self, known: NDArray[np.bool_], mean: Array, beyond: Array, noise: Array) -> None:
-        """Update the estimated mean and noise of the errors. Large errors are limited before, so that a change or an
-        outlier does not count as noise."""
+        """Update the estimated mean and noise of the errors by one step. Large errors are limited first, so that a
+        change or an outlier does not count as noise."""
         limited = beyond.clip(-OUTLYING * noise, OUTLYING * noise)
         self._sum += np.where(known, mean + limited, 0.0)
         self._squares += np.where(known, limited**2, 0.0)

@@ -24,16 +24,17 @@ from surrogym_shared.spec import EnvironmentSpec, limits
 from surrogym_trainer.evaluation.comparing import StepOfEpisode
 
 LOOK_SECONDS = 1.0  # seconds between two reads of a log that grows
-LATEST = 1_000  # number of rows of a growing log that are kept, by which its clock and units are checked
-CHUNK = 2**20  # largest number of bytes read at once from a stream
-UNITS = (1.0, 1e3, 1e6, 1e9)  # possible numbers of a clock's units in a second
-OFF = 0.1  # share by which the interval of a log's rows may differ from the sampling period
+LATEST = 1_000  # if a growing log has twice as many rows, all but this number of latest rows are dropped
+CHUNK = 2**20  # largest number of bytes that one read takes from a stream
+UNITS = (1.0, 1e3, 1e6, 1e9)  # the clock of a log may count seconds, or this number of units in a second
+OFF = 0.1  # a log is refused if the interval between its rows differs from the sampling period by more than this share
 
 Mapping_ = Path | Mapping[str, Any] | None
 
 
 def steps_after(log: ReadLog, line: int) -> list[StepOfEpisode]:
-    """Return the steps of a log after a line; the ``number`` of each is its line."""
+    """Return the steps of a log that come after a line number. The field ``number`` of each step is its own line
+    number."""
     steps, reward, lines = log.steps, log.reward, log.table.lines[log.steps.row]
     return [
         StepOfEpisode(
@@ -52,7 +53,7 @@ def steps_after(log: ReadLog, line: int) -> list[StepOfEpisode]:
 
 def impossible(spec: EnvironmentSpec, step: StepOfEpisode) -> str | None:
     """Return a sentence about the coordinate of a step that is so far outside its range that its unit or measurement
-    must be wrong; None if there is none."""
+    must be wrong; None if no coordinate is."""
     for number, coordinate in enumerate(spec.coordinates):
         low, high = limits(coordinate.sampling)
         if coordinate.kind == "angle" or low == high:
@@ -129,12 +130,13 @@ class _Growing:
     def __init__(self, where: str, mapping: Mapping_, spec: EnvironmentSpec) -> None:
         self._where, self._spec = where, spec
         self._mapping: Mapping_ | LogMapping = mapping
-        self._text, self._rest = b"", b""  # complete lines, and the beginning of a line that is not complete yet
+        # complete lines that are kept; and the beginning of a line that has not arrived completely
+        self._text, self._rest = b"", b""
         self._dropped = 0  # number of dropped lines between the heading and the latest rows
 
     def add(self, chunk: bytes) -> ReadLog | None:
-        """Add a chunk to the text, and return the latest rows including its rows; None if the chunk completes no line,
-        or no row is a usable step."""
+        """Add a chunk of bytes to the text, and return the latest rows, including those of the chunk. None if the chunk
+        completes no line, or if no row is a usable step."""
         complete, end, self._rest = (self._rest + chunk).rpartition(b"\n")
         if not complete.strip():
             return None
@@ -161,8 +163,8 @@ class _Growing:
 
 
 def _checked(log: ReadLog, spec: EnvironmentSpec) -> ReadLog:
-    """Raise ``UnusableLog`` if the rows of a log have another interval than the declared sampling period. Its clock may
-    count seconds, or milli-, micro- or nanoseconds."""
+    """Return the log, after a check that the interval between its rows is the declared sampling period. The log's clock
+    may count seconds, or milli-, micro- or nanoseconds. Raises ``UnusableLog`` for another interval."""
     period, interval = spec.sampling_period, log.steps.interval
     if period is None or interval is None or log.roles.time is None:
         return log

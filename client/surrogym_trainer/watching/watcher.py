@@ -26,21 +26,23 @@ from surrogym_trainer.evaluation.comparing import StepOfEpisode, compared, stead
 from surrogym_trainer.watching.detector import FALSE_ALARM_STEPS, Detector
 
 BATCH = 500  # largest number of steps in one request
-KEPT = 2_000  # number of latest steps from which a drift is described
+KEPT = 2_000  # a drift is described from at most this number of latest steps
 QUARTERS = ("lowest", "second", "third", "highest")
-TELLING = 0.1  # relative entropy (nats) above which errors are concentrated in a part of an input's range
+# if a quarter of an input's range adds more than this to the relative entropy (nats) between errors and visits, the
+# errors are concentrated in it
+TELLING = 0.1
 
 Array = NDArray[np.float64]
 
 
 class Region(NamedTuple):
-    """The quarter of an input's range that has most of an error."""
+    """The quarter of an input's range in which an error is largest. An input is a coordinate or an action entry."""
 
     name: str
     low: float
     high: float
     quarter: str
-    share: float  # share of the squared errors that is in this quarter
+    share: float  # sum of the squared errors in this quarter, as a share of the sum over the whole range
 
     def words(self) -> str:
         return (
@@ -61,7 +63,7 @@ class Alarm:
         expected: root mean square error that the model predicts at these steps.
         latest: number of steps since the change.
         compared: number of steps that were compared.
-        line: line in the log of the step that gave the alarm.
+        line: line number, in the log, of the step that gave the alarm.
         region: the part of an input's range with most of the error; None if no input has a range.
     """
 
@@ -76,11 +78,12 @@ class Alarm:
 
     @property
     def from_the_start(self) -> bool:
-        """Whether most of the compared steps show the drift, so that there were few steps without it."""
+        """Whether the drift is in most of the compared steps, so that the plant may have differed from the model at the
+        first step."""
         return self.latest > self.compared / 2
 
     def words(self) -> str:
-        """Return a sentence about the error."""
+        """Return a sentence about which output is wrong, by how much, and where."""
         how = "in both directions, root mean square" if self.both else "on average"
         size = f"{self.error:.3g}" if self.both else f"{self.error:+.3g}"
         last = "the last real step" if self.latest == 1 else f"the last {self.latest} real steps"
@@ -106,11 +109,13 @@ class Watcher:
         self._api, self._view = api, view
         self._false_alarm_steps = false_alarm_steps
         self._detector: Detector | None = None
-        # errors (O,), deviations (O,) and inputs (C + F,) of the latest steps
+        # for each of the latest steps: errors (O,) and predicted standard deviations (O,) of O outputs, and inputs
+        # (C + F,)
         self._recent: deque[tuple[Array, Array, Array]] = deque(maxlen=KEPT)
         self._inputs = _inputs_of(view.spec)
         self._visits = np.zeros((len(self._inputs), len(QUARTERS)))
-        self.left_out = 0  # number of steps that were left out, because a constant changed or a lag was not known
+        # number of steps that were not compared, because a constant coordinate changed or a lag was not known
+        self.left_out = 0
 
     @property
     def compared(self) -> int:
@@ -199,8 +204,8 @@ class Watcher:
         )
 
     def _quarters(self, inputs: Array) -> NDArray[np.intp]:
-        """Return in which quarter of its range, from 0, each of the K inputs with a range is, (n, K), for inputs (n, C
-        + F). Values outside of a range count as in its first or last quarter."""
+        """Return the quarter, 0 to 3, of its range in which each of the K inputs with a range is: (n, K), for n rows of
+        coordinates and action entries (n, C + F). Values outside of a range count as in its first or last quarter."""
         names = [*self._view.spec.coordinate_names, *_actions(self._view.spec)]
         columns = inputs[:, [names.index(name) for name, _, _ in self._inputs]]
         low, high = (np.array([one[end] for one in self._inputs]) for end in (1, 2))

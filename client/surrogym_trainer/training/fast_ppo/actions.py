@@ -27,12 +27,12 @@ class Distribution(Sampled, Protocol):
         ...
 
     def arrays(self) -> tuple[tuple[int, ...], Array, Array]:
-        """Return the numbers of choices, the centre and the reach, in the form that compiled code expects; empty if
-        there are none."""
+        """Return, for compiled code, the numbers of choices of discrete actions, and the centre (F,) and the reach
+        (F,), half the width, of the bounds of continuous actions. What does not apply is empty."""
         ...
 
     def slopes(self, outputs: Array, further: Array, actions: Array, by: Array) -> tuple[Array, Array]:
-        """Return the derivatives of a loss with respect to the outputs and to the further parameters.
+        """Return the derivatives of a loss with respect to the outputs (B, A) and to the further parameters (K,).
 
         Args:
             outputs: outputs of the actor (B, A).

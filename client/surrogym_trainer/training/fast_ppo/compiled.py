@@ -23,7 +23,7 @@ from surrogym_trainer.training.fast_ppo.adam import EPSILON, FIRST_DECAY, SECOND
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
 
-BLOCK = 128  # number of rows in a block; 64 and 256 were slower
+BLOCK = 128  # number of rows of a batch that pass through the networks together; 64 and 256 were slower
 LARGEST_TANH = np.float32(7.90531110763549805)  # for larger arguments, tanh is 1 in float32
 NONE, ONE, HALF = np.float32(0), np.float32(1), np.float32(0.5)
 CONSTANT = np.float32(HALF_LOG_TAU)

@@ -35,8 +35,8 @@ from surrogym_trainer.training.fast_ppo.adam import EPSILON, FIRST_DECAY, SECOND
 from surrogym_trainer.training.fast_ppo.mlp import Array, Mlp, orthogonal
 
 HIDDEN_GAIN, ACTION_GAIN, VALUE_GAIN = 2**0.5, 0.01, 1.0
-NARROWEST = 0.1  # smallest new standard deviation of an input, as a share of the previous one
-LEARNER = "learner.npz"  # entry of a policy's file with which training can continue
+NARROWEST = 0.1  # if inputs are standardised again, the smallest new standard deviation, as a share of the previous one
+LEARNER = "learner.npz"  # name of the entry in a policy's file from which its training can continue
 VECTORS = ("parameters", "first", "second")
 
 

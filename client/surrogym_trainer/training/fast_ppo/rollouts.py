@@ -46,7 +46,8 @@ class Collector:
         self._lanes.reset()
         self._scale = RewardScale(lanes.num_envs, gamma)
         self._earned = np.zeros(lanes.num_envs)  # (N,) returns of the running episodes
-        self._penalty = np.zeros(lanes.num_envs)  # (N,) penalties that were subtracted from these returns
+        # (N,) penalties that were subtracted from the returns of the running episodes
+        self._penalty = np.zeros(lanes.num_envs)
         self._penalties: deque[float] = deque(maxlen=LATEST_EPISODES)
 
     @property

@@ -47,16 +47,20 @@ RANGES = {  # Allowed range of each setting; settings with integer bounds must b
     "max_grad_norm": (0.0, 1e6),
 }
 
-CYCLES = 3  # number of cycles of the stage ``learn`` in the suggested steps
-LEARNING = 2  # largest multiple of the suggested steps that a training takes before the stage ``refine``
-REFINING = 1 / 2  # length of the stage ``refine``, as a share of a cycle of the stage ``learn``
-PATIENT_ROLLOUTS = 32  # smallest number of rollouts before a network is replaced
-HELD = 16  # number of steps for which every second network's noise stays the same
-FINE = 0.1  # learning rate of the stage ``refine``, as a share of the usual one
-QUIET = 0.1  # noise at the end of the stage ``refine``, as a share of that at its beginning
-LOOKS = 1 / 8  # largest share of the suggested steps that only collects observations
-CRITIC_ROLLOUTS = 8  # number of rollouts in the stage ``refine`` from which only the critic learns
-STAGE_SEED = 2_000_003  # difference between the noise seeds of two stages
+CYCLES = 3  # the suggested number of steps makes this number of cycles of the stage ``learn``
+LEARNING = 2  # the stage ``learn`` takes at most this multiple of the suggested number of steps
+REFINING = 1 / 2  # the stage ``refine`` takes this share of the steps of a cycle of the stage ``learn``
+PATIENT_ROLLOUTS = 32  # a network that has learned nothing is replaced after this number of rollouts at the earliest
+HELD = 16  # if actions are continuous, the noise of every second new network stays the same for this number of steps
+FINE = 0.1  # learning rate in the stage ``refine``, as a share of that in the stage ``learn``
+# standard deviation of the actions' noise at the end of the stage ``refine``, as a share of that at its beginning
+QUIET = 0.1
+# the stage ``refine`` first collects observations, without learning, in at most this share of the suggested steps
+LOOKS = 1 / 8
+CRITIC_ROLLOUTS = (
+    8  # before the actor learns in the stage ``refine``, only the critic learns in this number of rollouts
+)
+STAGE_SEED = 2_000_003  # the seed of the actions' noise grows by this number from one stage to the next
 
 
 @dataclass(frozen=True)
@@ -77,7 +81,7 @@ class FastPpo(PolicySearch):
 
     n_steps: int = 16  # number of steps of each lane in a rollout
     n_epochs: int = 10
-    batch_size: int | None = None  # None takes about 1,024
+    batch_size: int | None = None  # None takes a batch of about 1,024 steps
     learning_rate: float | None = None  # None lets the learning rate fall from 3e-3 to a fiftieth of that
     # None derives the discount factor from the length of the episodes: the time limit, or that of short training
     # episodes
@@ -194,7 +198,8 @@ class _Training:
         Args:
             stage: stage of the training.
             learner: the network.
-            own: rollouts that it has learned from in this stage. With more of them, the rate of the cycle starts lower.
+            own: number of rollouts that the network has learned from in this stage so far. The more there are, the
+                lower the learning rate with which the cycle begins.
             rollouts: rollouts of this cycle.
             hold: number of steps for which the noise of its actions stays the same.
         """
@@ -223,8 +228,8 @@ class _Training:
         return own == self._patience <= left and not self._checks.learned
 
     def _candidates(self) -> Iterator[tuple[Learner, int]]:
-        """Yield networks to train, each with the number of steps for which its noise stays the same: new ones, and the
-        saved one if it had learned anything."""
+        """Yield networks to train, each with the number of steps for which its noise stays the same: new networks, and
+        the saved one if it has learned something."""
         anew = self._task.settings.anew
         if anew or self._saved is None:
             yield self._new, 1
@@ -260,7 +265,8 @@ class _Training:
         return stage.gamma if self._search.gamma is None else self._search.gamma
 
     def _expect(self, rollouts: int) -> None:
-        """Set the number of rollouts that are left, for the progress."""
+        """Set the number of rollouts that the training still takes, from which reports of progress compute the
+        total."""
         self._expected = self._taken + rollouts
 
     def _collect(self, learner: Learner, hold: int = 1) -> Batch:
@@ -313,7 +319,8 @@ class _Training:
 
 
 def units_of(spec: EnvironmentSpec) -> tuple[int, ...]:
-    """Return the numbers of units in the actor's hidden layers: two wider layers, or the paper's one."""
+    """Return the numbers of units in the actor's hidden layers: two layers of 64, or with the preset ``paper`` one of
+    32."""
     return WIDER if spec.preset.wide_networks else (HIDDEN,)
 
 

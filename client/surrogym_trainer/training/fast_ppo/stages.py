@@ -10,9 +10,9 @@ from surrogym_trainer.training.proportions import suggested_gamma
 from surrogym_trainer.training.search import SearchTask
 from surrogym_trainer.training.settings import TrainSettings
 
-SHORTER = 5  # factor by which a training episode of the stage ``learn`` is shorter than the time limit
-SHORTEST = 40  # smallest number of steps in a training episode of the stage ``learn``
-SIGHT = 1 / 2  # discount horizon of short episodes, 1 / (1 - gamma), as a share of their length
+SHORTER = 5  # in the stage ``learn``, an episode is shorter than the time limit by this factor
+SHORTEST = 40  # in the stage ``learn``, an episode has at least this number of steps
+SIGHT = 1 / 2  # in short episodes, the discount horizon 1 / (1 - gamma) is this share of the length of an episode
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,8 @@ def learn(task: SearchTask) -> Stage:
     A model can start anywhere, which a machine can't. In short episodes each lane sees many states, including those
     near success, and a short horizon finds a first policy in a tenth of the steps. The last reward of a truncated
     episode includes the critic's value of its last state, so short episodes don't change what is optimal. Starts and
-    lengths that the user chose are kept, with the discount of whole episodes; so are those of preset ``paper``.
+    lengths that the user chose are kept, and so are those of the preset ``paper``. The discount factor is then that of
+    whole episodes.
     """
     spec, settings = task.port.spec(), task.settings
     ways = settings.start_box, settings.start_visited, settings.horizon
