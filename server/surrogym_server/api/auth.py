@@ -111,7 +111,10 @@ def fingerprint(token: str) -> str:
 
 
 def holder(scope: Scope) -> str:
-    """Return the role and fingerprint of a request's token as text; ``anybody`` if the server has no tokens."""
+    """Return the role and fingerprint of a request's token as text.
+
+    Without them: ``anybody`` if the server has no tokens, ``nobody`` if the request has none, or "an unknown token".
+    """
     gate: Gate = scope["app"].state.gate
     if gate.open:
         return "anybody"

@@ -23,7 +23,7 @@ from surrogym_server.api.json_body import JSON, JsonRequest
 from surrogym_shared.wire import Role
 
 MEDIA_TYPE = "surrogym.media_type"  # key in the ASGI scope: media type of the body, if the route reads one
-JSON_LIMIT = "x-max-json-bytes"  # key in OpenAPI: largest JSON body of a route
+JSON_LIMIT = "x-max-json-bytes"  # key in a route's OpenAPI description: largest JSON body in bytes
 KIBIBYTE = 1024
 DEFAULT_JSON_BYTES = 64 * KIBIBYTE
 
@@ -47,7 +47,7 @@ class Door:
     bodies: Mapping[str, int | None]
 
     def admit(self, scope: Scope) -> None:
-        """Check a request, and put the media type and the size limit of its body into its scope.
+        """Check the headers of a request, and put the media type and the size limit of its body into its ASGI scope.
 
         Raises:
             Unauthenticated: the token is missing or unknown.
@@ -79,7 +79,7 @@ class Door:
             raise HTTPException(415, f"expected content type {' or '.join(self.bodies)}, got {given or 'none'}")
         encoding = raw_header(scope, b"content-encoding").decode("latin-1").strip().lower()
         if encoding not in ("", "identity"):
-            raise HTTPException(415, f"expected a body without content encoding, got {encoding!r}: send it plain")
+            raise HTTPException(415, f"expected a body without content encoding, got {encoding!r}: don't compress it")
         return given
 
 

@@ -29,7 +29,7 @@ HEADERS = {"cache-control": "no-store", "x-accel-buffering": "no"}
 
 @router.get(
     "/events",
-    summary="Follow whether anything happens",
+    summary="Stream that any surrogate has changed",
     response_class=StreamingResponse,
     dependencies=[READ],
     responses={
@@ -45,7 +45,7 @@ async def changes(request: Request, use: Use) -> StreamingResponse:
 
 @router.get(
     "/surrogates/{name}/events",
-    summary="Follow what happens",
+    summary="Stream the events of a surrogate",
     response_class=StreamingResponse,
     dependencies=[READ],
     responses={

@@ -13,7 +13,8 @@ from surrogym_shared.codes import Code
 
 BODY_LIMIT = "surrogym.body_limit"  # key in the ASGI scope: largest size of this body in bytes, set by ``api.door``
 SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
-OWN_SITE = (b"", b"same-origin", b"none")  # Sec-Fetch-Site of programs, the server's own pages and typed addresses
+# Header Sec-Fetch-Site of requests by programs, by the server's own pages, and by an address that a person typed.
+OWN_SITE = (b"", b"same-origin", b"none")
 
 
 class BodyLimit:
@@ -35,7 +36,7 @@ class BodyLimit:
             nonlocal received
             message = await receive()
             limit = scope.get(BODY_LIMIT)
-            if limit is None:  # the route reads no body
+            if limit is None:  # the route reads no body, so the bytes are dropped
                 return {**message, "body": b""} if "body" in message else message
             size = len(message.get("body", b""))
             received += size

@@ -17,9 +17,9 @@ from surrogym_shared import frames
 M = TypeVar("M", bound=BaseModel)
 
 JSON = "application/json"
-LONG = 16 * 1024  # size in bytes of a body that takes half a millisecond to parse
+LONG = 16 * 1024  # before a body with more bytes, which takes over 0.5 ms to parse, other requests run
 DEEPEST = 200  # largest number of nested levels that the parser jiter accepts
-MOST_FIELDS = 64  # largest number of fields of a body, because each unknown field adds to the error message
+MOST_FIELDS = 64  # largest number of top-level fields of a body, because the error names each unknown one
 SCHEMAS = "#/components/schemas/{model}"
 BINARY: dict[str, Any] = {frames.MEDIA_TYPE: {"schema": {"type": "string", "format": "binary"}}}
 

@@ -20,7 +20,7 @@ from surrogym_shared.wire import AddedLog, AddLog, DraftedLog, DraftLog
 
 router = APIRouter(prefix="/v1", tags=["logs"], route_class=DoorRoute)
 
-KIBIBYTES = 5 * 1024  # largest size of a log in JSON
+KIBIBYTES = 5 * 1024  # largest JSON body with a log, in KiB
 
 
 @router.post(
@@ -38,7 +38,7 @@ async def draft(body: Annotated[DraftLog, example(examples.DRAFT_LOG)], request:
 
 @router.post(
     "/surrogates/{name}/logs",
-    summary="Hand in a log",
+    summary="Store the steps of a log",
     dependencies=[SAMPLE],
     openapi_extra=json_up_to(KIBIBYTES),
     responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST, Code.TOO_LARGE, Code.TOO_MANY_REQUESTS),

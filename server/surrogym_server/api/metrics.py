@@ -31,7 +31,7 @@ router = APIRouter(tags=["service"], route_class=DoorRoute)
 
 @router.get(
     "/metrics",
-    summary="Counters for Prometheus",
+    summary="Metrics for Prometheus",
     dependencies=[READ],
     response_class=Response,
     responses={200: {"content": {"text/plain": {}}}, **documented(Code.UNAVAILABLE)},

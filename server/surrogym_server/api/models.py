@@ -40,7 +40,7 @@ POINT_ERRORS = documented(
 
 @router.get(
     "/models",
-    summary="History of models",
+    summary="List the versions of the model",
     dependencies=[READ],
     responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST),
 )
@@ -51,7 +51,7 @@ def list_all(name: str, use: Use) -> ModelList:
 
 @router.get(
     "/models/{version}",
-    summary="One model",
+    summary="Describe or download a model",
     response_model=ModelView,
     dependencies=[READ],
     responses={
@@ -97,7 +97,7 @@ async def query_uncertainty(
     return resources.uncertainty(said)
 
 
-@router.post("/predict", summary="The stateless transition", dependencies=[READ], responses=POINT_ERRORS)
+@router.post("/predict", summary="Predict one step without a session", dependencies=[READ], responses=POINT_ERRORS)
 async def predict(
     name: str, body: Annotated[Points, example(examples.POINTS)], request: Request, use: Use
 ) -> Prediction:
@@ -106,7 +106,7 @@ async def predict(
     return resources.prediction(await _in_turn(request, lambda: use.models.predict(name, q, u, body.model)))
 
 
-@router.post("/imagine", summary="An episode from a given state", dependencies=[READ], responses=POINT_ERRORS)
+@router.post("/imagine", summary="Simulate episodes from a given state", dependencies=[READ], responses=POINT_ERRORS)
 async def imagine(
     name: str, body: Annotated[Imagine, example(examples.IMAGINE)], request: Request, use: Use
 ) -> Imagined:

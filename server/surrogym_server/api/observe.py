@@ -38,7 +38,8 @@ FREQUENT = frozenset(  # routes that are called very often and change nothing la
         "/v1/surrogates/{name}/imagine",
     }
 )
-MOST_PATH = 256  # characters of a path that are logged, because callers without a token may send very long paths
+# Number of characters of a path that are logged, because callers without a token may send very long paths.
+MOST_PATH = 256
 FAILED = 500  # status recorded for a request that ended before its reply began
 
 _GIVEN = re.compile(r"[A-Za-z0-9._-]{1,64}")

@@ -96,7 +96,7 @@ def problem_of(error: Exception) -> Problem:
         case errors.SeqConflict():
             return _problem(Code.SEQ_CONFLICT, str(error), expected_seq=error.expected)
         case errors.PluginFailed():
-            logger.error("%s", error, exc_info=error)  # the author of the plug-in needs the traceback
+            logger.error("%s", error, exc_info=error)  # with a traceback, for the author of the plug-in
             return _problem(Code.INTERNAL, str(error))
         case errors.SurrogymError():
             return _problem(code_of(error), str(error))

@@ -65,7 +65,7 @@ async def claim(
 @router.post(
     "/queries/{query_id}:renew",
     status_code=204,
-    summary="Keep a lease",
+    summary="Renew the lease of a query",
     dependencies=[SAMPLE],
     responses=LEASE_ERRORS,
 )
@@ -75,7 +75,7 @@ def renew(name: str, query_id: int, body: Annotated[RenewLease, example(examples
     return Response(status_code=204)
 
 
-@router.post("/queries/{query_id}:fail", summary="Give a query back", dependencies=[SAMPLE], responses=LEASE_ERRORS)
+@router.post("/queries/{query_id}:fail", summary="Report a failed query", dependencies=[SAMPLE], responses=LEASE_ERRORS)
 def fail(name: str, query_id: int, body: Annotated[FailQuery, example(examples.FAIL)], use: Use) -> QueryView:
     """End the lease of a query that could not be answered, with an error. Another sampler may then claim the query. A
     query that fails repeatedly is set aside (not leased again), and the design continues without it."""
@@ -87,7 +87,7 @@ def fail(name: str, query_id: int, body: Annotated[FailQuery, example(examples.F
 @router.post(
     "/queries",
     status_code=201,
-    summary="Ask for queries by hand",
+    summary="Add queries of your own",
     dependencies=[SAMPLE],
     openapi_extra=json_up_to(128),
     responses=documented(Code.UNKNOWN_SURROGATE, Code.IDEMPOTENCY_CONFLICT, Code.INVALID_REQUEST),
@@ -100,7 +100,7 @@ def add_queries(name: str, body: Annotated[AddQueries, example(examples.ADD_QUER
 @router.post(
     "/audit",
     status_code=201,
-    summary="Ask for the real steps of an audit",
+    summary="Request the real steps of an audit",
     dependencies=[TRAIN],
     openapi_extra=json_up_to(128),
     responses=documented(Code.UNKNOWN_SURROGATE, Code.IDEMPOTENCY_CONFLICT, Code.BEYOND_BUDGET, Code.INVALID_REQUEST),
@@ -114,7 +114,7 @@ def audit(name: str, body: Annotated[AuditModel, example(examples.ADD_QUERIES)],
 
 @router.post(
     "/audit:withdraw",
-    summary="Take audit queries back",
+    summary="Remove queries of an audit",
     dependencies=[TRAIN],
     responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST),
 )
@@ -125,7 +125,7 @@ def withdraw(name: str, body: Annotated[WithdrawQueries, example(examples.WITHDR
 
 @router.get(
     "/queries",
-    summary="The queue of queries",
+    summary="List queries",
     dependencies=[READ],
     responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST),
 )

@@ -35,7 +35,7 @@ MAX_PAGE = 10_000
 
 @router.post(
     "/add_sample",
-    summary="Hand in real steps",
+    summary="Store samples",
     dependencies=[SAMPLE],
     openapi_extra=json_up_to(128),
     responses=documented(
@@ -56,7 +56,7 @@ def add_sample(name: str, body: Annotated[AddSamples, example(examples.ADD_SAMPL
 
 @router.get(
     "/samples",
-    summary="The real steps",
+    summary="Read samples",
     response_model=SamplePage,
     dependencies=[READ],
     responses={
@@ -82,7 +82,7 @@ def samples(
 
 @router.get(
     "/snapshots",
-    summary="Snapshots that samplers hold",
+    summary="List snapshots",
     dependencies=[READ],
     responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST),
 )
@@ -93,7 +93,7 @@ def snapshots(name: str, use: Use) -> SnapshotList:
 
 @router.post(
     "/snapshots:drop",
-    summary="Report that snapshots are gone",
+    summary="Remove lost snapshots",
     dependencies=[SAMPLE],
     responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST),
 )

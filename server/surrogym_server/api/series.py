@@ -18,7 +18,7 @@ class Family:
     """A metric with its name, type and help text.
 
     ``label`` names the label by which the series of a surrogate differ; empty if there is at most one series.
-    ``series`` returns the series of a surrogate.
+    ``series`` returns pairs of a label's value and the metric's value for one surrogate.
     """
 
     name: str

@@ -18,14 +18,14 @@ router = APIRouter(tags=["service"], route_class=DoorRoute)
 
 
 @router.head("/healthz", include_in_schema=False, dependencies=[PUBLIC])
-@router.get("/healthz", summary="That the process lives", dependencies=[PUBLIC])
+@router.get("/healthz", summary="Whether the server runs", dependencies=[PUBLIC])
 async def healthz(request: Request) -> Health:
     """Return status 200 as long as the server process runs. This needs no token and no database."""
     return Health(version=request.app.version)
 
 
 @router.head("/readyz", include_in_schema=False, dependencies=[PUBLIC])
-@router.get("/readyz", summary="That it can work", dependencies=[PUBLIC], responses=documented(Code.UNAVAILABLE))
+@router.get("/readyz", summary="Whether it can work", dependencies=[PUBLIC], responses=documented(Code.UNAVAILABLE))
 def readyz(use: Use) -> Ready:
     """Return status 200 if the server can work: its database has the tables and accepts writes. Otherwise the status is
     503. This needs no token, and checks the database at most once a second."""
@@ -33,7 +33,7 @@ def readyz(use: Use) -> Ready:
     return Ready(status="ready", storage="ok")
 
 
-@router.get("/v1/access", summary="What the caller may do", dependencies=[READ])
+@router.get("/v1/access", summary="The role of the caller's token", dependencies=[READ])
 async def access(request: Request) -> Access:
     """Return the role of the request's token."""
     gate: Gate = request.app.state.gate

@@ -54,7 +54,7 @@ async def open_session(name: str, body: Annotated[OpenSession, example(examples.
 
 @router.get(
     "/surrogates/{name}/sessions",
-    summary="Activity of the sessions",
+    summary="List open sessions",
     dependencies=[READ],
     responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST),
 )
@@ -64,7 +64,7 @@ async def list_sessions(name: str, use: Use) -> SessionList:
     return SessionList(sessions=[sessions.session_activity(activity) for activity in await use.sessions.activity(name)])
 
 
-@router.get("/sessions/{id}", summary="One session", dependencies=[TRAIN], responses=documented(*SESSION_ERRORS))
+@router.get("/sessions/{id}", summary="Describe a session", dependencies=[TRAIN], responses=documented(*SESSION_ERRORS))
 async def get_session(id: str, use: Use) -> SessionView:
     """Return a session's options, the last sequence number that was answered, and the model version of each lane."""
     return sessions.session_view(await use.sessions.get(id), use.sessions.idle_seconds, use.sessions.replay)

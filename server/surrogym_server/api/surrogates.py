@@ -65,7 +65,7 @@ def check(body: Annotated[CreateSurrogate, example(examples.CREATE)], use: Use) 
     )
 
 
-@router.get("", summary="All surrogates", dependencies=[READ], responses=documented(Code.INVALID_REQUEST))
+@router.get("", summary="List surrogates", dependencies=[READ], responses=documented(Code.INVALID_REQUEST))
 def list_all(
     use: Use,
     after: Annotated[int, Query(ge=0, le=2**63 - 1)] = 0,
@@ -78,7 +78,7 @@ def list_all(
 
 @router.get(
     "/{name}",
-    summary="One surrogate",
+    summary="Describe a surrogate",
     dependencies=[READ],
     responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST),
 )
@@ -117,7 +117,7 @@ async def delete(name: str, use: Use) -> Response:
 
 @router.post(
     "/{name}/improve",
-    summary="Ask the design for more queries",
+    summary="Request more queries from the design",
     dependencies=[TRAIN],
     responses=documented(Code.UNKNOWN_SURROGATE, Code.IDEMPOTENCY_CONFLICT, Code.INVALID_REQUEST, Code.BEYOND_BUDGET),
 )

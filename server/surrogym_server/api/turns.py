@@ -16,7 +16,7 @@ from surrogym_server.errors import Overloaded
 
 T = TypeVar("T")
 
-MAX_WAITING = 2_000  # waiting requests of one kind with one token: an eighth of the default of 16,384 connections
+MAX_WAITING = 2_000  # largest number of waiting requests of one kind with one token: an eighth of all connections
 
 
 class Turns:
@@ -24,7 +24,7 @@ class Turns:
     ``waiting`` more wait."""
 
     def __init__(self, what: str, at_work: int, waiting: int) -> None:
-        """Set the limits. ``what`` is the name of the requests in error messages."""
+        """Set the limits. ``what`` names the requests in error messages, such as "predictions"."""
         self._what = what
         self._most = at_work + waiting
         self._inside = 0
@@ -55,7 +55,7 @@ class Waiting:
     memory."""
 
     def __init__(self, what: str, most: int = MAX_WAITING) -> None:
-        """Set the limits. ``what`` is the name of the requests in error messages."""
+        """Set the limit ``most``. ``what`` names the requests in error messages, such as "open streams of events"."""
         self._what = what
         self._most = most
         self._by_token = Counter[str | None]()

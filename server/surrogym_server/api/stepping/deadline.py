@@ -1,4 +1,5 @@
-"""The header ``x-deadline-ms``: how long a caller waits for a reply. A step that would be later is not computed."""
+"""The header ``x-deadline-ms``: how long a caller waits for a reply. If the reply would come later, the step is not
+computed."""
 
 from __future__ import annotations
 
@@ -15,7 +16,7 @@ PARAMETER: dict[str, Any] = {
     "name": HEADER,
     "in": "header",
     "required": False,
-    "description": "Milliseconds from now. A step that would be answered later is refused before it is computed.",
+    "description": "How many milliseconds the caller waits for the reply. If it would come later, the step is refused.",
     "schema": {"type": "integer", "minimum": 1, "maximum": 10**LONGEST_DIGITS - 1},
 }
 
@@ -30,5 +31,5 @@ def seconds_left(headers: Mapping[str, str]) -> float | None:
     if given is None:
         return None
     if not (given.isascii() and given.isdigit() and len(given) <= LONGEST_DIGITS and int(given)):
-        raise InvalidInput(f"{HEADER}: expected a whole number of milliseconds from 1, got {shown(given)}")
+        raise InvalidInput(f"{HEADER}: expected a whole number of milliseconds, at least 1, got {shown(given)}")
     return int(given) / 1e3

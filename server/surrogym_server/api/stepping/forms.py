@@ -20,7 +20,9 @@ from surrogym_shared.wire import ResetSession, RolloutSession, StepSession
 Operation = Literal["reset", "step", "rollout"]
 Writers = Mapping[type[Advance], Callable[[Reply], bytes]]  # functions that write the reply to each kind of request
 
-SHORT_ROLLOUT = 32  # number of steps up to which a reply is written in the event loop; a longer one takes milliseconds
+# The reply to a rollout of at most this many steps is written in the event loop. A longer one takes milliseconds, so a
+# thread writes it.
+SHORT_ROLLOUT = 32
 
 FRAMES: Mapping[Operation, tuple[type[frames.Request], ...]] = {
     "reset": (frames.ResetRequest,),
@@ -58,8 +60,8 @@ def frame_of(operation: Operation, content: bytes) -> frames.Request:
     """Read a binary frame from a body. Raises ``FrameError`` if the body is not a frame of this operation."""
     request = frames.read_request(content)
     if not isinstance(request, FRAMES[operation]):
-        expected = " or a ".join(kind.__name__ for kind in FRAMES[operation])
-        raise frames.FrameError(f"expected a {expected}, got a {type(request).__name__}")
+        expected = " or ".join(str(kind.__struct_config__.tag) for kind in FRAMES[operation])
+        raise frames.FrameError(f"expected a frame with op {expected}, got op {request.__struct_config__.tag}")
     return request
 
 
@@ -82,7 +84,7 @@ def request_in_frame(frame: frames.Request, session: str, shape: frames.Shape, w
 
 async def carried_out(engine: SessionEngine, request: Advance, writers: Writers) -> bytes:
     """Carry out a request, and return the reply as bytes. ``writers`` has the function that writes the reply to each
-    kind of request. It writes a long reply in a thread."""
+    kind of request. A long reply is written in a thread."""
     reply = await engine.advance(request)
     write = writers[type(request)]
     return write(reply) if steps_of(reply.outcome) <= SHORT_ROLLOUT else await asyncio.to_thread(write, reply)

@@ -54,7 +54,7 @@ class PromptMessages(WebSocketsSansIOProtocol):
     _answer: Prompt | None = None
     _oversized = False  # whether a frame is too large; uvicorn refuses it, and the following bytes belong to it
     _waiting = False  # whether the app waits for the next message
-    _counted = 0  # number of bytes that this connection has added to ``_together``
+    _counted = 0  # bytes of this connection's unfinished message, which ``_together`` includes
     _timer: asyncio.TimerHandle | None = None
 
     def __init__(self, *arguments: Any, **named: Any) -> None:
@@ -103,7 +103,7 @@ class PromptMessages(WebSocketsSansIOProtocol):
         if self.close_sent:  # an invalid frame has closed the connection while the app answered an earlier message
             raise ClientDisconnected
         await super().send(message)
-        self.handshake_complete |= self.close_sent  # else uvicorn would log that a refused handshake is incomplete
+        self.handshake_complete |= self.close_sent  # otherwise uvicorn would log that a refused handshake is incomplete
 
     def _refuse_handshake(self) -> None:
         """Answer a WebSocket handshake that can't be read. uvicorn would leave the connection open without a reply."""

@@ -1,10 +1,10 @@
 """The WebSocket ``/v1/sessions/{id}/stream``: binary frames of reset, step and rollout, each as one message.
 
 It is plain ASGI, which makes a step fast. Requests are carried out one at a time, and each is answered before the next
-is read. The connection may be dropped at any time, because the session continues under its id.
+is read. The connection may be dropped at any time: the client can continue the session, by its id, on another.
 
 A server that offers ``EXTENSION`` may pass on a message as it arrives, without waking a task. If the answer needs no
-waiting, it is sent at once. Other messages use ASGI.
+waiting, the answer is sent at once. Other messages take the usual way of ASGI.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ from surrogym_server.convert.stored import read_stored
 from surrogym_server.features.jobs.records import JobProgress, JobRecord, JobResult, LeasedJob
 from surrogym_shared import wire
 
-JOB = "a job"  # name of this stored document in an error message
+JOB = "a job"  # what error messages call a stored job
 
 
 def claimed_job(job: LeasedJob | None, lease_seconds: float) -> wire.ClaimedJob:

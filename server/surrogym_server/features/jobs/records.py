@@ -13,7 +13,8 @@ from surrogym_shared.states import JobEnd, JobKind, JobStatus
 
 MAX_JOBS = 100  # largest number of ended jobs that are kept for a surrogate
 MAX_OPEN = 20  # largest number of queued and running jobs of a surrogate
-MAX_RUNS = 3  # attempts at a training whose workers disappear; an evaluation has one, because it may move a machine
+# If workers disappear, a training is begun at most this many times; an evaluation once, because it may move a machine.
+MAX_RUNS = 3
 SILENT = "its worker fell silent, and its lease ended"
 
 
@@ -55,7 +56,7 @@ class JobRecord:
     status: JobStatus
     cancelling: bool  # whether the job is running and its worker has been asked to stop
     created_at: float
-    begun: float | None  # time of the last claim
+    begun: float | None  # time of the last claim by a worker; None before the first
     finished_at: float | None
     worker: str | None  # name of the worker that claimed the job last
     attempts: int
@@ -63,7 +64,8 @@ class JobRecord:
     error: str | None
     version: int | None
     evaluation: int | None
-    curve: list[JSON] = field(default_factory=list, repr=False)  # learning curve; left empty in lists of jobs
+    # Learning curve of a training so far; left empty in lists of jobs.
+    curve: list[JSON] = field(default_factory=list, repr=False)
 
 
 @dataclass(frozen=True)
@@ -72,5 +74,5 @@ class LeasedJob:
 
     id: int
     task: JSON
-    attempt: int  # 1 for the first lease of this job
+    attempt: int  # number of this lease among the leases of the job: 1, 2, ...
     token: str

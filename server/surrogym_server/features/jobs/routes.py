@@ -54,7 +54,7 @@ FINISH = {"lease_token": "the token of the claim", "status": "done", "version": 
 
 @router.get(
     "/jobs",
-    summary="All jobs",
+    summary="List jobs and workers",
     dependencies=[READ],
     responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST),
 )
@@ -66,7 +66,7 @@ def list_all(name: str, jobs: Jobs) -> JobList:
 @router.post(
     "/jobs",
     status_code=201,
-    summary="Ask a worker for a training or an evaluation",
+    summary="Queue a training or an evaluation",
     dependencies=[TRAIN],
     responses=documented(
         Code.UNKNOWN_SURROGATE,
@@ -87,7 +87,7 @@ def add(name: str, body: Annotated[AddJob, example(ADD)], jobs: Jobs) -> JobView
     return forms.job_view(jobs.evaluate(name, fields, task.real_episodes, body.idempotency_key))
 
 
-@router.get("/jobs/{job_id}", summary="One job", dependencies=[READ], responses=documented(*THERE))
+@router.get("/jobs/{job_id}", summary="Describe a job", dependencies=[READ], responses=documented(*THERE))
 def get(name: str, job_id: Number, jobs: Jobs) -> JobDetail:
     """Return a job with its learning curve so far."""
     return forms.job_detail(jobs.get(name, job_id))

@@ -1,4 +1,4 @@
-"""Use cases of jobs: people queue jobs, and trainer workers claim them by a long poll, report progress and end them."""
+"""The service of jobs: it queues jobs for people, and leases them to trainer workers, which can wait for a job."""
 
 from __future__ import annotations
 

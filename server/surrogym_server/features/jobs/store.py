@@ -44,7 +44,7 @@ jobs = checked(
         sa.Column("kind", Word("jobs.kind", JobKind), nullable=False),
         sa.Column("status", Word("jobs.status", JobStatus), nullable=False),
         sa.Column("task", Json("jobs.task"), nullable=False),
-        sa.Column("episodes", sa.Integer, nullable=False),  # number of real episodes of an evaluation
+        sa.Column("episodes", sa.Integer, nullable=False),  # number of real episodes of an evaluation; 0 for a training
         sa.Column("created_at", sa.Double, nullable=False),
         sa.Column("attempts", sa.Integer, nullable=False),
         sa.Column("worker", sa.Text),

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from surrogym_server.errors import InvalidInput
 from surrogym_shared import network
 
-MOST_ENTRIES = 10_000  # largest number of entries of a zip file
+MOST_ENTRIES = 10_000  # a zip file with more entries is not accepted as a policy
 ENTRY = b"PK\x01\x02"  # first bytes of each entry in the directory of a zip file
 STABLE_BASELINES = {"data", "policy.pth"}  # names of entries that a file of Stable-Baselines3 has
 
@@ -34,7 +34,7 @@ def check_file(form: str, content: bytes, size: int, digest: str) -> None:
         raise InvalidInput(f"expected a file with SHA-256 {digest}, as announced, got {found}: send the file again")
     expected, looks_right = FORMS[form]
     if not looks_right(content):
-        raise InvalidInput(f"expected {expected} for the form {form!r}, got content that begins with {content[:8]!r}")
+        raise InvalidInput(f"expected {expected} for the format {form!r}, got content that begins with {content[:8]!r}")
 
 
 def _names(content: bytes) -> set[str]:

@@ -34,7 +34,7 @@ class PolicyFile:
     bytes: int
     digest: str
     blob: str | None = None
-    main: bool = False  # whether the policy was stored with this file
+    main: bool = False  # whether this is the file that was announced when the policy was stored
 
 
 @dataclass(frozen=True)

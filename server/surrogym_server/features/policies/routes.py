@@ -70,7 +70,7 @@ DRIFT_EXAMPLE = {
 ALIAS_EXAMPLE = {"version": 1}
 
 
-@router.get("", summary="All policies", dependencies=[READ], responses=documented(*THERE))
+@router.get("", summary="List policies", dependencies=[READ], responses=documented(*THERE))
 def list_all(name: str, policies: Policies) -> PolicyList:
     """List policies, newest first, each with its promise (interval of the return), its files and the statistics of its
     real episodes."""
@@ -96,7 +96,7 @@ def add(
     return forms.pushed_policy(record, created=created)
 
 
-@router.get("/{which}", summary="One policy", dependencies=[READ], responses=documented(*THERE))
+@router.get("/{which}", summary="Describe a policy", dependencies=[READ], responses=documented(*THERE))
 def get(name: str, which: Which, policies: Policies) -> PolicyDetail:
     """Return a policy with the settings and the learning curve of its training. ``which`` is a version, an alias, or
     ``latest``."""
@@ -140,7 +140,7 @@ async def put_file(
 
 @router.get(
     "/{which}/files/{form}",
-    summary="A file of a policy",
+    summary="Download a file of a policy",
     response_class=Response,
     dependencies=[READ],
     responses={200: {"content": {BINARY: {}}}, **documented(*THERE, Code.DAMAGED)},
@@ -186,20 +186,24 @@ def report_drift(
     return forms.policy_view(policies.report_drift(name, version, drift, body.idempotency_key))
 
 
-@router.get("/{which}/evaluations/{id}", summary="One evaluation", dependencies=[READ], responses=documented(*THERE))
+@router.get(
+    "/{which}/evaluations/{id}", summary="Read an evaluation", dependencies=[READ], responses=documented(*THERE)
+)
 def evaluation(
     name: str,
     which: Which,
     id: Annotated[int, Path(ge=1, le=2**63 - 1)],
     policies: Policies,
-    traces: Annotated[bool, Query(description="whether the reply has traces too; they are most of its bytes")] = True,
+    traces: Annotated[
+        bool, Query(description="whether the reply has traces (states, actions, rewards) of some episodes")
+    ] = True,
 ) -> EvaluationDetail:
     """Return an evaluation with the return of each episode, and traces of some episodes. If these can't be read,
     ``missing`` has the reason."""
     return forms.evaluation_detail(*policies.episodes(name, which, id), traces=traces)
 
 
-@router.put("/aliases/{alias}", summary="Name a policy", dependencies=[ADMIN], responses=documented(*THERE))
+@router.put("/aliases/{alias}", summary="Set an alias of a policy", dependencies=[ADMIN], responses=documented(*THERE))
 def put_alias(
     name: str, alias: AliasName, body: Annotated[PutAlias, example(ALIAS_EXAMPLE)], policies: Policies
 ) -> PolicyView:
@@ -208,7 +212,7 @@ def put_alias(
 
 
 @router.delete(
-    "/aliases/{alias}", status_code=204, summary="Take a name away", dependencies=[ADMIN], responses=documented(*THERE)
+    "/aliases/{alias}", status_code=204, summary="Remove an alias", dependencies=[ADMIN], responses=documented(*THERE)
 )
 def drop_alias(name: str, alias: AliasName, policies: Policies) -> Response:
     """Remove an alias of a policy. The policy itself stays."""

@@ -1,4 +1,4 @@
-"""Use cases of policies: store them with their files and evaluations, return them, set aliases, report drift."""
+"""The service of policies: it stores them with files and evaluations, returns them, and records aliases and drift."""
 
 from __future__ import annotations
 
@@ -42,7 +42,8 @@ logger = logging.getLogger(__name__)
 
 MEBIBYTE = 2**20
 ORPHAN_SECONDS = 3_600.0  # age from which a file that no policy names is removed; an upload takes less time
-MUST_AGREE = ("observation", "action")  # parts of a specification on which a policy's inputs and outputs depend
+# Fields of a specification that must be equal in a policy's card and its surrogate.
+MUST_AGREE = ("observation", "action")
 
 
 @dataclass(frozen=True)
@@ -178,7 +179,7 @@ class PolicyService:
         file = next((one for one in record.files if one.form == form and one.blob is not None), None)
         if file is None:
             there = ", ".join(one.form for one in record.files if one.blob is not None) or "none"
-            raise UnknownPolicy(f"expected one of the files of {place} ({there}), got {form!r}")
+            raise UnknownPolicy(f"expected the format of a stored file of {place} ({there}), got {form!r}")
         return record.version, self._content(file.blob, file.digest, f"the {form} file of {place}")
 
     def evaluate(self, name: str, version: int, episodes: Episodes, key: str) -> tuple[PolicyRecord, EvaluationRecord]:
@@ -285,7 +286,7 @@ class PolicyService:
         assert blob is not None
         content = self._blobs.get(blob)
         if hashlib.sha256(content).hexdigest() != digest:
-            raise Damaged(f"{what} has changed since it was stored, as its digest shows: restore a copy of the files")
+            raise Damaged(f"{what} has changed since it was stored, as its digest shows: restore it from a backup")
         return content
 
     def _is_own(self, name: str, environment: str) -> bool:

@@ -45,7 +45,8 @@ policy_files = checked(
         sa.Column("surrogate_id", Id, primary_key=True, autoincrement=False),
         sa.Column("version", sa.Integer, primary_key=True, autoincrement=False),
         sa.Column("form", sa.Text, primary_key=True),
-        sa.Column("main", sa.Boolean, nullable=False),  # whether the policy was stored with this file
+        # Whether the policy was stored with this file, not given it later.
+        sa.Column("main", sa.Boolean, nullable=False),
         sa.Column("bytes", sa.BigInteger, nullable=False),
         sa.Column("digest", sa.Text, nullable=False),  # SHA-256 of the file
         sa.Column("blob", sa.Text),  # name of the blob with the content; NULL: not stored

@@ -25,7 +25,7 @@ Priors = Annotated[PriorService, part(PriorService)]
 THERE = (Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST)
 
 
-@router.get("", summary="The prior", dependencies=[READ], responses=documented(*THERE))
+@router.get("", summary="Describe the prior", dependencies=[READ], responses=documented(*THERE))
 def get(name: str, priors: Priors) -> PriorView:
     """Return the description of a surrogate's prior: its source, and how well its parameters were calibrated."""
     return _view(priors.get(name))
@@ -33,7 +33,7 @@ def get(name: str, priors: Priors) -> PriorView:
 
 @router.put(
     "",
-    summary="Set the prior",
+    summary="Store the prior",
     dependencies=[ADMIN],
     openapi_extra={"requestBody": {"required": True, "content": FILE}},
     responses=documented(*THERE, Code.TOO_LARGE, Code.NOT_INSTALLED),

@@ -1,4 +1,4 @@
-"""Use cases of a surrogate's prior: check and store it, wait for it, remove it."""
+"""The service of a surrogate's prior (a model known beforehand): check and store it, wait for it, remove it."""
 
 from __future__ import annotations
 
@@ -100,7 +100,10 @@ class PriorService:
     def _require_family(definition: EnvironmentDefinition) -> None:
         family = definition.learning.model
         if not isinstance(learner_of(family), TakesPrior):
-            raise InvalidInput(f"expected a surrogate whose family of models takes a prior, got {family.name!r}")
+            raise InvalidInput(
+                "expected a surrogate with a family of models that can use a prior, such as gaussian_process, got "
+                f"{family.name!r}: register another surrogate"
+            )
 
 
 def _require_alike(spec: EnvironmentSpec, other: EnvironmentSpec) -> None:

@@ -49,7 +49,7 @@ class RayEngine(SessionEngine):
     """
 
     lasting = True
-    replay = 10_000  # number of last requests that a client should keep, to repeat those since a checkpoint
+    replay = 10_000  # number of last requests that a client should keep, to repeat those since the last checkpoint
 
     def __init__(
         self, hosts: Sequence[Any], machines: Sequence[str], store: LiveSessions, settings: HostSettings

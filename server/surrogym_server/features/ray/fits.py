@@ -21,7 +21,7 @@ from surrogym_server.plugins import in_one_line
 
 logger = logging.getLogger(__name__)
 
-RETRIES = 1  # further attempts at a job whose process or machine died
+RETRIES = 1  # how often the fit of a design is tried again if its process or machine died
 
 
 class RayFits(Compute):
@@ -45,7 +45,7 @@ class RayFits(Compute):
         self._running.add(asked)
         try:
             outcome = await cast(Awaitable[Any], asked)
-        except RayTaskError as error:  # the result can't be pickled
+        except RayTaskError as error:  # the fit's result, which a plug-in may have made, can't be pickled
             raise PluginFailed(in_one_line(error.cause or error)) from error
         except TaskCancelledError as error:
             raise Unavailable("the fit was ended: this server stops") from error

@@ -137,7 +137,7 @@ class SessionHost:
         """Call the method ``operation`` of the engine. Return its result, or ``Refused`` if it raised a
         ``SurrogymError``."""
         if operation not in OPERATIONS:
-            raise ValueError(f"expected one of {sorted(OPERATIONS)}, got {operation!r}")
+            raise ValueError(f"expected an operation of a session host, one of {sorted(OPERATIONS)}, got {operation!r}")
         await self._started()
         try:
             return await getattr(self._engine, operation)(*arguments)

@@ -16,8 +16,9 @@ from surrogym_server.features.ray.store import LiveSessions
 
 logger = logging.getLogger(__name__)
 
-MAX_BYTES = 16 * 2**20  # largest checkpoint; a larger session has no checkpoints
-BYTES_PER_SECOND = 8 * 2**20  # largest rate at which checkpoints of one session are written
+MAX_BYTES = 16 * 2**20  # largest checkpoint in bytes; a session with a larger state has no checkpoints
+# Largest rate at which checkpoints of one session are written: a session with a large state gets fewer checkpoints.
+BYTES_PER_SECOND = 8 * 2**20
 RENEWALS = 5  # number of renewals within the duration of a lease
 
 
@@ -39,8 +40,9 @@ class _Held:
     lease: SessionLease
     until: float  # end of the lease by this process's clock, not later than by the database's clock
     seq: int  # the session's sequence number at the last checkpoint
-    next_at: float  # earliest time of the next checkpoint
-    recorded: bool = field(default=True)  # whether the last checkpoint has data
+    next_at: float  # earliest time of the next checkpoint, by this process's clock
+    # Whether the last checkpoint has the session's state; False if it was too large.
+    recorded: bool = field(default=True)
 
 
 class Leases:

@@ -164,7 +164,7 @@ def test_a_text_message_on_the_stream_is_refused(stream: ClientConnection):
 
 def test_a_reset_frame_sent_to_the_step_route_is_refused(client: httpx.Client, session: str):
     reply = post(client, session, frames.reset_request(1, None, None), what="step")
-    assert (reply.status_code, reply.json()["detail"]) == (422, "expected a StepRequest, got a ResetRequest")
+    assert (reply.status_code, reply.json()["detail"]) == (422, "expected a frame with op step, got op reset")
 
 
 def test_a_step_with_an_unknown_content_type_is_refused(client: httpx.Client, session: str):

@@ -246,6 +246,6 @@ def test_a_blob_name_that_leaves_the_blob_folder_is_refused(tmp_path: Path) -> N
     storage = open_storage(url)
     blobs = open_blobs(storage, url, None)
     (tmp_path / "secret").write_text("a secret")
-    with pytest.raises(Damaged, match="name of a blob"):
+    with pytest.raises(Damaged, match="name of a stored file"):
         blobs.get("../secret")
     storage.close()
