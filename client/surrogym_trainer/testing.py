@@ -123,11 +123,11 @@ POLICY_SEARCH_LAWS = (
 
 
 class _Failure(Exception):
-    """The error that the check's own progress callback raises."""
+    """Error that ``sessions_are_closed`` raises in the progress callback of a search."""
 
 
 class _Watched:
-    """A port that passes all calls on, and records which sessions are open."""
+    """A port that forwards all calls to another port, and records which sessions are open."""
 
     def __init__(self, port: SurrogatePort) -> None:
         self._port = port

@@ -24,12 +24,14 @@ Activation = Literal["none", "tanh", "relu"]
 
 # bits of a controller's status; 0 means that the action is the policy's
 NOT_FINITE, OUT_OF_RANGE, LATE, NO_ACTION = 1, 2, 4, 8
-LIMITED = 16  # status of a step in which the fallback of the specification's limits acts
-PERIODS = 2  # default timeout in sampling periods, because the duration of a period varies
-LARGEST = 1e37  # largest number in a controller, so that sums of a few still fit in a C float
-SHORTEST = 1e-6  # smallest period or timeout in seconds
+LIMITED = 16  # status of a step in which the fallback for the specification's limits acts instead of the policy
+PERIODS = 2  # default timeout, in sampling periods; above 1, because the duration of a period varies
+# largest absolute value of a number in a controller, so that sums of a few such numbers fit in a C float
+LARGEST = 1e37
+SHORTEST = 1e-6  # smallest period, and smallest timeout, that a controller may have, in seconds
 MOST_WEIGHTS = 1_000_000  # largest number of weights of a network: 8 MB in double, and about 20 MB of source
-TURNS = 100  # default number of turns of an angle that a sensor may count; wrapping more turns loses digits
+# without --range, the reading of an angle is valid up to this number of turns; wrapping more turns loses digits
+TURNS = 100
 
 
 class NotDeployable(SurrogymClientError):
@@ -69,8 +71,9 @@ class Remembered:
         kind: what is repeated: an ``action``, an earlier ``value`` or ``change``, or the number of ``steps``.
         source: index of the repeated coordinate; entry of the action for kind ``action``; -1 for ``steps``.
         angle: whether the repeated coordinate is an angle, so that a change is at most half a turn.
-        of_action: whether it repeats actions. Other lags start again after a fault, because a measurement is missing.
-        start: its value before anything was measured.
+        of_action: whether the lag repeats actions. Other lags begin again at ``start`` after a fault, because a
+            measurement is missing.
+        start: the lag's value before the first measurement.
         low, high: bounds to which it is clipped; infinite without bounds.
     """
 
@@ -116,8 +119,8 @@ class Observed:
 class Dense:
     """A layer of the network: activation(x @ weights + bias)."""
 
-    weights: Array  # (I, O) for I inputs and O outputs
-    bias: Array  # (O,) for O outputs
+    weights: Array  # (I, O) weight of each of I inputs for each of O outputs
+    bias: Array  # (O,) constant that is added to each of O outputs
     activation: Activation
 
 
@@ -130,14 +133,14 @@ class Decision:
     tanh(y), or without the tanh if ``squash`` is false.
     """
 
-    mean: Array  # (D,) mean of each observation entry
-    deviation: Array  # (D,) standard deviation of each observation entry
+    mean: Array  # (D,) mean of each of D observation entries, which is subtracted before the first layer
+    deviation: Array  # (D,) standard deviation of each observation entry, by which it is divided before the first layer
     clip: float  # largest absolute value of a standardised entry; infinite without a clip
     layers: tuple[Dense, ...]
     counts: tuple[int, ...]  # number of choices of each entry of a discrete action; empty for a continuous one
     squash: bool
-    centre: Array  # (F,) middle of a continuous action's range; empty for a discrete action
-    reach: Array  # (F,) half of a continuous action's range; empty for a discrete action
+    centre: Array  # (F,) middle of the range of each of F continuous action entries; empty for a discrete action
+    reach: Array  # (F,) half the width of the range of each continuous action entry; empty for a discrete action
 
 
 @dataclass(frozen=True)
@@ -212,7 +215,7 @@ class Controller:
 
     @property
     def late(self) -> str:
-        """The ages of a measurement that count as faults, in words."""
+        """Text that says at which ages a measurement counts as a fault."""
         if np.isfinite(self.timeout):
             return f"older than {self.timeout:g} s"
         return "of a negative age (no timeout was given)"

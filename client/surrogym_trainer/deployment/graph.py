@@ -47,7 +47,7 @@ def description(controller: Controller) -> dict[str, Any]:
     return {
         "measurements": [
             {"name": m.name, "unit": m.unit, "angle": m.angle, "low": _finite(m.low), "high": _finite(m.high)}
-            | {"sensor": [m.lowest, m.highest]}  # range of valid readings; others are faults
+            | {"sensor": [m.lowest, m.highest]}  # range of valid readings of the sensor; other readings are faults
             for m in controller.measurements
         ],
         "lags": [{"name": lag.name, "is": _lag(lag, names), "start": lag.start} for lag in controller.lags],
@@ -87,8 +87,8 @@ def _limits(guard: Guard, names: tuple[str, ...]) -> dict[str, Any]:
 
 
 class RunningGraph(Running):
-    """The ONNX file in onnxruntime. The reference in NumPy computes the observation, because the file contains only the
-    network.
+    """A controller whose network is an ONNX file, run by onnxruntime. NumPy computes the observation, because the file
+    contains only the network.
 
     Args:
         controller: the controller that the file was made from.
@@ -162,17 +162,18 @@ def _model(controller: Controller) -> Any:
 
 
 def _chosen(graph: _Graph, scores: str, controller: Controller) -> tuple[str, int]:
-    """Add the nodes that choose the largest output of each group. Returns the name of the result, and its type.
+    """Add the nodes that choose the largest of the outputs (``scores``) for each entry of the action. Returns the name
+    of the result, and its type.
 
-    Bins become continuous values; a discrete action is returned as its number.
+    If a continuous action was divided into discrete values, the result is the value; otherwise, the number of the
+    choice.
     """
     from onnx import TensorProto
 
     counts, first, chosen = controller.decision.counts, 0, []
     for count in counts:
-        where = [
-            np.array([i], dtype=np.int64) for i in (first, first + count, 1)
-        ]  # inputs of ONNX's operator Slice: starts, ends and axes
+        # inputs of ONNX's operator Slice: starts, ends and axes
+        where = [np.array([i], dtype=np.int64) for i in (first, first + count, 1)]
         group = graph.add("Slice", scores, *where)
         chosen.append(graph.add("ArgMax", group, axis=1, keepdims=1))
         first += count

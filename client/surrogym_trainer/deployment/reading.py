@@ -36,7 +36,8 @@ if TYPE_CHECKING:
     from torch import nn
 
 CHECKS = 1_000  # number of random observations on which the controller is compared with the policy
-# largest difference of controller and policy, as a share of an action's range; torch computes in float32
+# largest accepted difference of the actions of controller and policy, as a share of their range; torch computes in
+# float32
 TOLERANCE = 1e-4
 CAN = (
     "a deterministic feed-forward network can be deployed: a policy of surrogym train, or one of PPO, A2C, SAC, TD3, "
@@ -200,7 +201,7 @@ def _actor(policy: Any) -> tuple[list[nn.Module], bool, Any]:
     if kind is SACPolicy:
         return [*_flat(policy.actor.latent_pi), *_flat(policy.actor.mu)], True, None
     if kind is TD3Policy:
-        *modules, _ = _flat(policy.actor.mu)  # the last module is the tanh
+        *modules, _ = _flat(policy.actor.mu)  # the last module is the tanh, which the controller applies by itself
         return modules, True, None
     if kind is DQNPolicy:
         return list(_flat(policy.q_net.q_net)), False, None

@@ -35,8 +35,8 @@ TURN = 2 * np.pi
 class Memory:
     """The state of N controllers between two steps: the last coordinates and action."""
 
-    coordinates: Array  # (N, C) coordinates of the last step
-    action: Array  # (N, F) last action of N controllers
+    coordinates: Array  # (N, C) coordinates of N controllers in the last step
+    action: Array  # (N, F) last action of each of N controllers
     acted: Bools  # (N,) whether each controller has taken a step before
     measured: Bools  # (N,) whether the measurements of the last step had no fault
 
@@ -45,8 +45,9 @@ class Decided(NamedTuple):
     """The result of one decision of N controllers."""
 
     memory: Memory
-    action: Array  # (N, F) decided action of N controllers
-    status: Ints  # (N,) bits of the faults of N controllers; 0 if there are none
+    action: Array  # (N, F) action that each of N controllers takes
+    # (N,) status of each of N controllers: the bits of its faults, or LIMITED; 0 if the action is the policy's
+    status: Ints
 
 
 def begin(controller: Controller, number: int = 1) -> Memory:
@@ -62,7 +63,7 @@ def decide(controller: Controller, memory: Memory, measurements: Array, age: Arr
         controller: the controller.
         memory: the memory after the previous step.
         measurements: measurements (N, R).
-        age: age of the measurements in seconds, (N,) or one for all.
+        age: age of the measurements in seconds: (N,), or a single number for all controllers.
     """
     read = np.asarray(measurements, dtype=np.float64)
     status = judged(controller, read, np.broadcast_to(np.asarray(age, dtype=np.float64), len(read)))
@@ -90,7 +91,8 @@ def _falls_back(guard: Guard, memory: Memory, coordinates: Array) -> Bools:
 
 
 def _room(limit: KeptLimit, coordinates: Array) -> Array:
-    """Distance (N,) from coordinates (N, C) to the nearer end of a limit."""
+    """Return the distance (N,) of a limited term, at coordinates (N, C), from the nearer end of its range; negative
+    outside."""
     value = _entry(limit.term, coordinates)
     return np.minimum(value - limit.low, limit.high - value)
 

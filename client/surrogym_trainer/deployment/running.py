@@ -17,7 +17,8 @@ from surrogym_sampler.original.protocol import LONGEST_EPISODE
 from surrogym_trainer.deployment.controller import LIMITED, Array, Controller
 from surrogym_trainer.policies.predict import Predict
 
-NEGLIGIBLE = 1e-6, 1e-4  # largest negligible difference of actions in double and in float, as a share of their range
+# if a controller computes in double, and in float: largest negligible difference of an action, as a share of its range
+NEGLIGIBLE = 1e-6, 1e-4
 
 
 class Running(ABC):
@@ -47,18 +48,18 @@ class Checked:
     returns: Array  # (N,) returns of the controller
     policy_returns: Array  # (N,) returns of the policy
     steps: int  # number of steps of the controller
-    # largest difference between the actions of controller and policy in the controller's states, as a share of the
-    # range
+    # largest difference between an action of the controller and the policy's in the same state, as a share of the
+    # action's range
     largest: float
-    # number of steps with a discrete choice that is not the policy's, or a difference above 1e-6 of the range (1e-4 in
-    # float)
+    # number of steps in which the controller made another discrete choice than the policy, or in which the actions
+    # differ by more than 1e-6 of the range (1e-4 if the controller computes in float)
     different: int
-    faults: int  # number of steps in which the controller took its fallback action
+    faults: int  # number of steps in which the controller took its fallback action because of a fault
     microseconds: float | None
 
 
 class Comparison:
-    """Episodes of a controller and of its policy, each from the same starts.
+    """Runs episodes of a deployed controller and of its policy from the same starts, and compares their actions.
 
     Args:
         controller: the controller that was deployed.
@@ -68,8 +69,8 @@ class Comparison:
     """
 
     def __init__(self, controller: Controller, running: Running, policy: Predict, episode: Episode) -> None:
-        self.begun = 0  # number of begun steps of the environment, those of controller and policy together
-        self.ended = 0  # number of finished episodes, those of controller and policy together
+        self.begun = 0  # number of steps of the environment that have begun, of controller and policy together
+        self.ended = 0  # number of episodes that have ended, of controller and policy together
         self._running, self._policy, self._episode = running, policy, episode
         self._places = [m.place for m in controller.measurements]
         self._width = controller.high - controller.low
@@ -97,7 +98,7 @@ class Comparison:
         )
 
     def _run(self, seed: int, *, deployed: bool) -> float:
-        """Run one episode, of the deployed controller or of the policy, and return its return."""
+        """Run one episode, of the deployed controller or of the policy, and return the sum of its rewards."""
         moment, total = self._episode.reset(seed), 0.0
         self._running.reset()
         for _ in range(self._episode.spec.time_limit or LONGEST_EPISODE):

@@ -89,8 +89,8 @@ def _copy(made: Path, out: Path, names: list[Path]) -> None:
 
 
 def _other(out: Path, made: Path, names: list[Path]) -> str:
-    """Return the name of a file in the folder that is not one of the files to write; empty if there is none. The record
-    of a check is accepted if all files to write exist."""
+    """Return the name of a file in the folder ``out`` that is not one of the files to write; empty if there is none.
+    The record of a check is accepted if all files to write exist."""
     if not out.exists():
         return ""
     if not out.is_dir():

@@ -14,9 +14,10 @@ from surrogym_trainer.deployment.controller import Array, Controller
 from surrogym_trainer.deployment.reference import Memory, begin, decide, judged
 
 EPISODES, STEPS, TRIES = 3, 16, 20
-WALKED = 20.0  # largest distance from 0 of a random walk of an angle, in radians
+WALKED = 20.0  # the random walk of an angle stays within this distance in radians of 0
 ROUNDING = 1e-6  # relative error of a measurement that is rounded to float32
-STEADY = 2e-5  # share of an action's range by which rounding a measurement may change the action
+# a measurement is used only if rounding it changes the action by at most this share of the action's range
+STEADY = 2e-5
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,10 +25,10 @@ class Vector:
     """One step of a test, and the answer that the controller must give."""
 
     first: bool  # whether this step begins an episode
-    measurement: Array  # (R,) measurements
+    measurement: Array  # (R,) value of each of R measurements
     age: float  # age of the measurements in seconds
     status: int
-    action: Array  # (F,) expected action
+    action: Array  # (F,) action that the controller must give, one number for each of F entries
 
 
 def vectors_of(controller: Controller, seed: int = 0) -> list[Vector]:

@@ -39,7 +39,7 @@ class VirtualEpisode(Episode):
             raise SurrogymClientError(f"the check of the controller lost its session: {step.lost}; start it again")
         result = step.result
         ended = bool(result.terminated[0] or result.truncated[0])
-        # when an episode has ended, the environment is already in the next one
+        # after the end of an episode the session has already begun the next one, so its state is not read
         at = np.zeros(0) if ended else self._coordinates()
         return Moment(
             np.asarray(result.observation[0]),

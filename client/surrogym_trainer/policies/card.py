@@ -57,9 +57,9 @@ class PolicyCard(BaseModel):
     promise: Promise | None = None
     audit: Audit | None = None
     trusted: bool | None = None  # whether the promise is supported; None if it was not judged
-    reason: str = ""  # why the promise is trusted or not
-    curve: tuple[CurvePoint, ...] = ()  # training curve
-    networks: int = 1  # number of networks in the last training
+    reason: str = ""  # sentence about why the promise is trusted or not
+    curve: tuple[CurvePoint, ...] = ()  # points of the training curve: virtual steps and imagined return
+    networks: int = 1  # number of networks that the last training began; above 1 if some learned nothing
     settings: dict[str, Any] = Field(default_factory=dict)
     versions: dict[str, str] = Field(default_factory=dict)
 

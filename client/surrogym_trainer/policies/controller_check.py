@@ -30,13 +30,19 @@ class StoredCheck(BaseModel):
     environment: str = Field(description="original environment, or the virtual one of a surrogate")
     policy: str = Field(description="SHA-256 of the policy's file")
     episodes: Count
-    steps: Count = Field(description="steps of the controller")
-    largest_difference: float = Field(ge=0, description="of the actions, as a share of their range")
-    different_actions: Count = Field(description="steps that differ by more than 1e-6 of the range, 1e-4 in float")
-    faults: Count = Field(description="steps in which the controller took its fallback")
+    steps: Count = Field(description="number of steps of the controller")
+    largest_difference: float = Field(
+        ge=0, description="largest difference of an action from the policy's, as a share of the action's range"
+    )
+    different_actions: Count = Field(
+        description="steps whose action differs by more than 1e-6 of its range, 1e-4 in float"
+    )
+    faults: Count = Field(description="steps in which the controller took its fallback action")
     mean_return: float
     mean_return_of_policy: float
-    microseconds: float | None = Field(ge=0, description="of one decision, where it was checked; null: not measured")
+    microseconds: float | None = Field(
+        ge=0, description="duration of one decision on the machine of the check; null if it was not measured"
+    )
 
 
 def write_check(folder: Path, check: StoredCheck) -> Path:

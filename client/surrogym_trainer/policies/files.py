@@ -24,9 +24,10 @@ from surrogym_trainer.policies.predict import Predict
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
 
-# settings that save memory, because a policy that only acts stores no experience
+# settings for loading a policy that only acts; they save memory, because it stores no experience
 BUFFERLESS = {"n_envs": 1, "n_steps": 1, "buffer_size": 1}
-FAMILIES = ("PPO", "SAC", "TD3", "DQN")  # algorithms with different networks; A2C has PPO's, DDPG has TD3's
+# algorithms whose networks differ from each other; A2C has PPO's network, DDPG has TD3's
+FAMILIES = ("PPO", "SAC", "TD3", "DQN")
 ONNX = ".onnx"
 
 

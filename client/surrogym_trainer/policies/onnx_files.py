@@ -119,7 +119,7 @@ def _messages(message: Any) -> Iterator[Any]:
 
 
 def _for_lanes(graph: Any) -> None:
-    """Set the number of observations to a fixed one, and remove the shapes that the file claims, so that they are
+    """Set the number of observations to ``LANES``, and remove the shapes that the file claims, so that all are
     inferred."""
     weights = {array.name for array in graph.initializer}
     inputs = [given for given in graph.input if given.name not in weights]

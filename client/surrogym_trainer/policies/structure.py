@@ -121,7 +121,7 @@ class Structure(BaseModel):
 def save(learner: BaseAlgorithm, path: Path) -> None:
     """Save a policy as ``learner.save`` does, and add the description if the policy can be described."""
     file = io.BytesIO()
-    # the module normalisation recognises policies of other programs by this entry
+    # without this entry, the module normalisation knows that the observations were not normalised
     learner.save(file, exclude=["_last_original_obs"])
     if (structure := describe(learner)) is not None:
         with zipfile.ZipFile(file, "a") as archive:
@@ -198,7 +198,7 @@ def _settings(data: Mapping[str, Any], replaced: set[str]) -> PolicySettings:
     try:
         return PolicySettings.model_validate({name: value for name, value in data.items() if name not in replaced})
     except ValidationError as error:
-        raise ValueError(f"data: {first_fault(error, got=True)}") from error
+        raise ValueError(f"entry data of the file: {first_fault(error, got=True)}") from error
 
 
 def _entry(entries: Mapping[str, bytes], name: str) -> bytes:
@@ -210,8 +210,8 @@ def _entry(entries: Mapping[str, bytes], name: str) -> bytes:
 
 
 def _plain(weights: bytes) -> bytes:
-    """Return the zip that ``torch.save`` wrote without compression, after a check of its size, so that torch inflates
-    nothing."""
+    """Return a zip that ``torch.save`` wrote, rewritten without compression after a check of its size, so that torch
+    inflates nothing."""
     return stored(read_entries(weights, len(weights)))
 
 

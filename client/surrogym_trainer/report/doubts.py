@@ -85,7 +85,7 @@ def next_steps(known: Known) -> list[str]:
 
 
 def _where(known: Known) -> str:
-    """Return the option that names the environment, if the policy's card can't be used for that."""
+    """Return the option ``--env`` for a suggested command; empty if the command finds the environment without it."""
     return env_option(known.view.environment)
 
 

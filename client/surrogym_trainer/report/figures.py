@@ -23,8 +23,8 @@ from surrogym_trainer.report.maps import Cut, pairs
 
 COLOURS = {"logged": "#8c8c8c", "initial": "#4c72b0", "adaptive": "#dd8452", "manual": "#55a868", "audit": "#c44e52"}
 WIDTH = 6.0  # width of a figure in inches
-SMALLEST = 1e-9  # smallest value that is drawn on a logarithmic axis
-DECADES = 6  # number of powers of ten below the largest value of the design's index that are drawn
+SMALLEST = 1e-9  # smaller errors are drawn as this value on a logarithmic axis
+DECADES = 6  # a map of the paper's uncertainty index shows this number of powers of ten below its maximum
 LOG_10 = math.log(10)
 
 
@@ -107,8 +107,8 @@ def draw_coverage(coverage: Coverage) -> Figure:
 
 
 def draw_maps(view: SurrogateView, cuts: Sequence[Cut]) -> Figure:
-    """Draw three maps over two coordinates for each cut: the model's uncertainty, how often policies visit a state
-    (occupancy), and the index by which the design chooses queries."""
+    """Draw three maps for each pair of coordinates in ``cuts``: the model's uncertainty, how often policies visit a
+    state (occupancy), and the paper's uncertainty index, which combines both."""
     figure = Figure(figsize=(1.5 * WIDTH, 0.45 * WIDTH * len(cuts)), layout="constrained")
     rows = figure.subplots(len(cuts), 3, squeeze=False)
     for row, cut in zip(rows, cuts, strict=True):

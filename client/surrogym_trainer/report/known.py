@@ -64,7 +64,7 @@ class Known:
 
 
 def collect(api: Api, name: str, which: str | None = None, controller: Path | None = None) -> Known:
-    """Collect the data of a report; what can't be read is listed in ``missing``.
+    """Collect the data of a report. Its field ``missing`` has a sentence about each part that can't be read.
 
     Args:
         api: the connection to the server.

@@ -23,14 +23,17 @@ SIDE = 33
 
 @dataclass(frozen=True)
 class Cut:
-    """Maps of the model over two coordinates, whose indices are ``across`` and ``up``. The uncertainty and the index
-    are the largest over the outputs."""
+    """Maps of the model over two coordinates, whose indices are ``across`` and ``up``. Each value of ``uncertainty``
+    and of ``log_index`` is the largest over the outputs."""
 
     across: int
     up: int
-    uncertainty: Array  # (S, S) standard deviation as a multiple of the tolerance; rows are ordered from bottom to top
-    occupancy: Array  # (S, S) density of visited states
-    log_index: Array  # (S, S) natural logarithm of the design's index
+    # (S, S) standard deviation as a multiple of the tolerance, at S values of each coordinate; rows go from bottom to
+    # top
+    uncertainty: Array
+    occupancy: Array  # (S, S) density of the states that policies visit
+    # (S, S) natural logarithm of the paper's uncertainty index: the uncertainty times the density of the visited states
+    log_index: Array
 
 
 def pairs(spec: EnvironmentSpec) -> list[tuple[int, int]]:

@@ -108,7 +108,9 @@ def chunks_of_file(path: Path) -> Iterator[bytes]:
     while True:
         with path.open("rb") as file:
             if (size := file.seek(0, os.SEEK_END)) < read:
-                raise UnusableLog(f"expected {path} to grow, got {size} bytes after {read}: watch the new log")
+                raise UnusableLog(
+                    f"expected the log {path} to grow, got {size} bytes after {read}: watch it from the start again"
+                )
             file.seek(read)
             chunk = file.read(size - read)
         read += len(chunk)

@@ -93,7 +93,7 @@ class Outbox:
         self._tell(f"the server does not take the result in {aside}: {error}")
 
     def _sent(self, api: Api, waiting: Waiting) -> str:
-        """Send one result, and return a sentence about the outcome."""
+        """Send one result to the server, and return a sentence about how its job ended there."""
         name, status = waiting.surrogate, waiting.status
         for steps in waiting.steps:
             key = steps.idempotency_key

@@ -31,7 +31,7 @@ class Stand:
     share: float = 0.0
     now: TrainProgress | None = None
     curve: tuple[wire.CurvePoint, ...] = ()
-    # progress of the training; all stands (states of progress) of a job share this object
+    # share of the training that is done, which never falls; all records of a job's progress have the same object
     course: Course = field(default_factory=Course, compare=False)
 
     def trained(self, now: TrainProgress, seconds: float) -> Stand:
@@ -66,7 +66,8 @@ class JobStopped(KeyboardInterrupt):
 
 @dataclass
 class Reporter:
-    """Reports one job from a thread, each second or as often as its lease needs.
+    """Reports the progress of one job to the server from a thread: each second, or as often as is needed to keep the
+    job reserved for this worker.
 
     If the server can't be reached, the next report tries again, and the job continues.
 

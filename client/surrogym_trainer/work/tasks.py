@@ -29,7 +29,7 @@ from surrogym_trainer.training.search import SEARCHES, name_of, with_algorithm
 from surrogym_trainer.training.settings import TrainingInterrupted, TrainResult, TrainSettings
 from surrogym_trainer.work.reporter import Reporter
 
-QUICK = 4  # factor by which a quick training takes fewer steps than the algorithm suggests
+QUICK = 4  # a quick training takes the suggested number of steps of the algorithm, divided by this
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class Gathered:
     policy: Path | None = None
     version: int | None = None
     video: Path | None = None
-    lacks: str | None = None  # why a requested video could not be made
+    lacks: str | None = None  # why the requested video could not be made; None if it was made, or not requested
     evaluations: list[wire.AddEvaluation] = field(default_factory=list)
     steps: list[wire.ReportSteps] = field(default_factory=list)
 

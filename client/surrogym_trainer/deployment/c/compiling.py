@@ -19,7 +19,7 @@ from surrogym_trainer.deployment.controller import Array, Controller, NotDeploya
 from surrogym_trainer.deployment.running import Running
 
 FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror")
-SECONDS = 10.0  # seconds until the program must answer
+SECONDS = 10.0  # the compiled program is stopped if it has not answered within this number of seconds
 
 
 class CompiledController(Running):

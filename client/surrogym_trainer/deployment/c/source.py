@@ -15,8 +15,8 @@ import numpy as np
 
 from surrogym_trainer.deployment.controller import Array, Controller, Decision, Observed, Part
 
-PER_LINE = 6  # number of constants in a line of an array
-UNROLLED = 4  # number of a layer's inputs whose products are added in one pass over its outputs
+PER_LINE = 6  # number of constants in each line of a generated array
+UNROLLED = 4  # the generated loop over the inputs of a layer adds the products of this number of inputs in each pass
 
 WRAPPED = """
 /* An angle in [-pi, pi). */

@@ -29,10 +29,8 @@ class RunningFmu(Running):
 
     def __init__(self, fmu: Any, controller: Controller, period: float) -> None:
         self._fmu, self._period, self._steps = fmu, period, 0
-        inputs, actions = (
-            len(controller.measurements) + 1,
-            len(controller.low),
-        )  # the age of the measurements is a further input
+        # the age of the measurements is one more input of the FMU
+        inputs, actions = len(controller.measurements) + 1, len(controller.low)
         self._inputs = list(range(1, inputs + 1))
         self._actions = list(range(inputs + 1, inputs + actions + 1))
         self._status = [inputs + actions + 1]

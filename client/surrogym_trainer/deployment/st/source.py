@@ -22,8 +22,9 @@ from surrogym_trainer.deployment.controller import Controller, Decision, Dense, 
 
 REAL_TYPES = ("LREAL", "REAL")  # types of numbers with 64 and with 32 bits
 LARGEST = {"LREAL": float(np.finfo(np.float64).max), "REAL": 3.4028234e38}
-PER_LINE = 5  # number of constants in a line of an array
-MOST_TURNS = 1e9  # largest number of turns of an angle, because TRUNC returns a DINT
+PER_LINE = 5  # number of constants in each line of a generated array
+# an angle's reading may be at most this number of turns from 0, because TRUNC returns a DINT (32 bits)
+MOST_TURNS = 1e9
 KINDS = ("action", "steps", "value", "change")
 
 WRAP = """\
@@ -136,9 +137,8 @@ def source_of(controller: Controller, real: str, name: str) -> str:
     for one in controller.measurements:
         if one.angle and max(-one.lowest, one.highest) > 2 * np.pi * MOST_TURNS:
             raise NotDeployable(
-                f"expected --range of the angle {one.name} to span at most {MOST_TURNS:g} turns, which is what "
-                "TRUNC can count: "
-                "narrow it"
+                f"expected --range of the angle {one.name} within {MOST_TURNS:g} turns of 0, because TRUNC counts no "
+                "more turns: narrow it"
             )
     sizes, decision = _sizes(controller.decision), controller.decision
     last = {
