@@ -1,6 +1,6 @@
 """Parts of compiled steps: the tables that they read, and elementary functions.
 
-Files of this room, and those in folders or files named ``compiled`` in other rooms, import numba. All other files
-import them lazily, if ``surrogym_shared.compiled.available`` allows it, because numba does not exist for every
-platform.
+Only the files of this package, and of packages or modules named ``compiled`` elsewhere, import numba. Other files
+import them inside functions, if ``surrogym_shared.compiled.available`` returns True, because numba does not exist for
+every platform.
 """

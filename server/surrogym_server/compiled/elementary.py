@@ -1,8 +1,8 @@
 """Elementary functions of whole arrays, in forms that the compiler can turn into vector instructions.
 
-Each function reduces its argument by a multiple k of log 2 or pi / 2, with k from the low bits of x / step + 1.5 2^52,
-and evaluates a polynomial of the rest. Errors are below 2 units in the last place. The scalar functions of the C
-library, which compiled code would call for each entry, take five to ten times as long.
+Each function subtracts k times a step of log 2 or pi / 2 from its argument x, and evaluates a polynomial of the rest. k
+is in the low bits of x / step + 1.5 2^52. Errors are below 2 units in the last place. The functions of the C library,
+which compiled code would otherwise call for each entry, take five to ten times as long.
 """
 
 from __future__ import annotations
@@ -19,15 +19,16 @@ from surrogym_shared.compiled.jit import compiled, summing
 
 Floats = NDArray[np.float64]
 
-# Added to a number below 2^51, it rounds the number to an integer, which the low bits of the sum hold.
+# If this is added to a float64 x with |x| < 2^51, the low bits of the sum are x, rounded to an integer.
 ROUNDING = 1.5 * 2.0**52
 PER_LOG2 = 1.4426950408889634  # 1 / log 2
-LOG2_HIGH, LOG2_LOW = 6.93147180369123816490e-01, 1.90821492927058770002e-10  # log 2 as a sum of two parts
-LEAST_EXPONENT = -708.0  # e to this power is about the smallest normal number
+# Two numbers whose sum is log 2. The first has so few bits that its product with a whole number k is exact.
+LOG2_HIGH, LOG2_LOW = 6.93147180369123816490e-01, 1.90821492927058770002e-10
+LEAST_EXPONENT = -708.0  # lower exponents are raised to this one: e^-708 is about the smallest normal float64
 PER_RIGHT_ANGLE = 0.63661977236758134  # 2 / pi
 # pi / 2 in three parts, of which the first two have 33 bits, so that their products with a whole number k are exact
 RIGHT_ANGLE = (1.57079632673412561417e00, 6.07710050630396597660e-11, 2.02226624879595063154e-21)
-LARGEST_ANGLE = 1e5  # larger angles are left to the C library, which reduces them exactly
+LARGEST_ANGLE = 1e5  # an array with a larger angle is computed by the C library, which reduces angles exactly
 
 
 def _keep_bits(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -42,19 +43,21 @@ def _float_of(_: Any, _bits: Any) -> Any:
     return types.float64(types.int64), _keep_bits
 
 
-bits_of: Any = intrinsic(_bits_of)  # function: the bits of a float64, as an int64
-float_of: Any = intrinsic(_float_of)  # function: the float64 with the bits of an int64
+bits_of: Any = intrinsic(_bits_of)  # function for compiled code: reinterprets the bits of a float64 as an int64
+float_of: Any = intrinsic(_float_of)  # function for compiled code: reinterprets the bits of an int64 as a float64
 
 
 @compiled
 def exponential(x: Floats) -> None:
-    """Replace x (n,) by e^x in place. Entries are at most 709. For entries below -708 the result is about 1e-308."""
+    """Replace each of n entries of x (n,) by its exponential, in place. Entries must be at most 709. For an entry below
+    -708, the result is about 1e-308."""
     for i in range(x.size):
         v = x[i] if x[i] > LEAST_EXPONENT else LEAST_EXPONENT
         t = v * PER_LOG2 + ROUNDING
         k = t - ROUNDING
         r = (v - k * LOG2_HIGH) - k * LOG2_LOW
-        # (e^r - 1 - r) / r^2 for |r| <= log(2) / 2, interpolated at Chebyshev nodes, with an error of 1e-17
+        # Polynomial for (e^r - 1) / r, with |r| <= log(2) / 2. Its coefficients but the last interpolate
+        # (e^r - 1 - r) / r^2 at Chebyshev nodes, with an error of 1e-17.
         p = 2.510038549551032e-08
         p = p * r + 2.7620088445409746e-07
         p = p * r + 2.7557268459997064e-06
@@ -66,7 +69,7 @@ def exponential(x: Floats) -> None:
         p = p * r + 0.16666666666666669
         p = p * r + 0.5000000000000001
         p = p * r + 1.0
-        # Adding k to the bits of the exponent multiplies by 2^k.
+        # The integer k in the low bits of t is added to the exponent bits of e^r, which multiplies e^r by 2^k.
         x[i] = float_of(bits_of(p * r + 1.0) + (bits_of(t) << 52))
 
 
@@ -115,7 +118,7 @@ def wrapped(angle: float) -> float:
 
 @summing
 def dot(a: Floats, b: Floats) -> float:
-    """Return the sum of a_i b_i for a and b (n,). The order of summation is free, so the compiler may vectorise it."""
+    """Return the scalar product of a (n,) and b (n,). The compiler may sum in any order, to vectorise the sum."""
     total = 0.0
     for i in range(len(a)):
         total += a[i] * b[i]

@@ -12,7 +12,8 @@ from surrogym_shared.compiled.jit import compiled
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-# Numbers of all S matrices (K,); offset, number of rows and number of columns of each matrix (S, 3).
+# S matrices in two arrays: the K numbers of all matrices in succession, (K,); and for each matrix the index of its
+# first number, its number of rows and its number of columns, (S, 3).
 Tables = tuple[Floats, Ints]
 
 
@@ -46,6 +47,6 @@ class TablesBuilder:
 
 @compiled
 def matrix(numbers: Floats, places: Ints, place: int) -> Floats:
-    """Return the matrix with index ``place`` in the tables ``numbers`` and ``places``, (rows, columns), as a view."""
+    """Return the matrix number ``place`` of the tables ``numbers`` and ``places`` (see ``Tables``), without a copy."""
     begin, rows, columns = places[place, 0], places[place, 1], places[place, 2]
     return numbers[begin : begin + rows * columns].reshape((rows, columns))

@@ -1,4 +1,4 @@
-"""Computation of the rows of one call in several threads. Compiled code does not hold the interpreter's lock."""
+"""Computation of blocks of rows in several threads. Compiled code does not hold Python's global interpreter lock."""
 
 from __future__ import annotations
 

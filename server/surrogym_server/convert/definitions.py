@@ -13,8 +13,8 @@ from surrogym_server.plugins import Choice
 from surrogym_server.sampling.acquisition import check_acquisition
 from surrogym_shared import spec as wire
 
-MONTE_CARLO = 1024  # number of Monte Carlo points if the specification has none
-LONGEST_ROLLOUT = 200  # largest number of steps of a rollout if the specification has none
+MONTE_CARLO = 1024  # number of points that estimate the confidence index, if the specification gives no number
+LONGEST_ROLLOUT = 200  # largest number of steps of a requested rollout, if the specification gives no number
 
 
 def definition_from_spec(spec: wire.EnvironmentSpec) -> core.EnvironmentDefinition:
@@ -99,8 +99,8 @@ def _learning(spec: wire.EnvironmentSpec) -> core.LearningDefinition:
 
 
 def _model(spec: wire.EnvironmentSpec) -> Choice:
-    """Return the model family and its settings. For Gaussian processes, the preset gives the settings that the
-    specification leaves open."""
+    """Return the model family that a specification chooses, with its settings. For ``gaussian_process``, settings that
+    the specification leaves open have the values of its preset."""
     choice = in_full(_choice(spec.design.model, GAUSSIAN_PROCESS))
     if choice.name == GAUSSIAN_PROCESS:
         settings = {**spec.preset.gaussian_process, "symmetry": spec.design.symmetry, **dict(choice.settings)}
@@ -148,7 +148,7 @@ def _distribution(distribution: wire.Uniform | wire.Normal | wire.Fixed) -> dist
             return distributions.NormalDefinition(mean, std, *distribution.limits)
         case wire.Fixed(value=value):
             return distributions.FixedDefinition(value)
-    raise InvalidSpec(f"expected a uniform, normal or fixed distribution, got {distribution!r}")
+    raise InvalidSpec(f"distribution of a coordinate: expected uniform, normal or fixed, got {distribution!r}")
 
 
 def _term(term: wire.Term, names: tuple[str, ...]) -> terms.TermDefinition:

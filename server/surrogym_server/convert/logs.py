@@ -18,7 +18,7 @@ from surrogym_shared.logs.text import table_of_text
 from surrogym_shared.spec import EnvironmentSpec
 
 MOST_ROWS = 50_000
-LONGEST_REASON = 300  # largest number of characters of the reason why a row was rejected
+LONGEST_REASON = 300  # the reason why a row of a log was rejected is cut to this many characters
 WHERE = "the log"
 
 
@@ -67,11 +67,11 @@ def added_report(log: ReadLog, added: AddedLog) -> wire.AddedLog:
 def _table(body: wire.DraftLog | wire.AddLog) -> tuple[Table, Roles]:
     if "\0" in body.text or "\ufffd" in body.text:
         raise UnusableLog(
-            f"expected text in UTF-8 in {WHERE}, got another encoding: convert it, or use the command surrogym import"
+            f"expected {WHERE} as text in UTF-8, got another encoding: convert it, or use the command surrogym import"
         )
     table = table_of_text(body.text.removeprefix("\ufeff"), WHERE, MOST_ROWS)
     if not len(table):
-        raise UnusableLog(f"expected rows below the heading in {WHERE}, got none: add the steps")
+        raise UnusableLog(f"expected at least one row below the heading in {WHERE}, got none: add a row for each step")
     return read_roles(table, body.mapping)
 
 

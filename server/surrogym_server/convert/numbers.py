@@ -12,7 +12,7 @@ from surrogym_server.errors import InvalidInput
 
 
 def numbers(what: str, rows: Sequence[Any]) -> NDArray[np.float64]:
-    """Convert nested lists to an array; ``what`` names them in the error.
+    """Convert nested lists of numbers to an array. ``what`` is their name in the error message.
 
     Raises:
         InvalidInput: the rows have different lengths.

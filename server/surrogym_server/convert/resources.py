@@ -31,7 +31,7 @@ from surrogym_shared import spec as wire
 from surrogym_shared import wire as replies
 from surrogym_shared.nouns import Query, Vector
 
-FIDELITY = "the fidelity of a model"  # name of this stored document in an error message
+FIDELITY = "the fidelity of a model"  # how error messages name the stored confidence and errors of a model
 
 
 def surrogate_list(listed: Sequence[Listed], limit: int) -> replies.SurrogateList:
@@ -117,7 +117,9 @@ def requested(body: replies.AddQueries) -> list[Query]:
     """
     q, u = numbers("coordinates", body.coordinates or ()), numbers("action", body.action or ())
     if len(q) != len(u):
-        raise InvalidInput(f"expected as many actions as coordinates, got {len(u)} actions and {len(q)} coordinates")
+        raise InvalidInput(
+            f"expected one action for each row of coordinates, got {len(u)} actions and {len(q)} rows of coordinates"
+        )
     steps = [Query.step(*step) for step in zip(q.tolist(), u.tolist(), strict=True)]
     return steps + [Query.rollout(numbers("rollouts", actions).tolist()) for actions in body.rollouts or ()]
 

@@ -123,7 +123,7 @@ def lane_mask(mask: list[bool] | None) -> NDArray[np.bool_] | None:
 
 
 def reset_reply(reply: Reply) -> dict[str, Any]:
-    """Return the fields of the JSON reply to a reset. They are not validated again, to keep replies fast."""
+    """Return the fields of the JSON reply to a reset of a session. No pydantic model validates them, to save time."""
     assert isinstance(reply.outcome, ResetResult)
     result = reply.outcome
     return {
@@ -134,20 +134,21 @@ def reset_reply(reply: Reply) -> dict[str, Any]:
 
 
 def step_reply(reply: Reply) -> dict[str, Any]:
-    """Return the fields of the JSON reply to a step. They are not validated again, to keep each step fast."""
+    """Return the fields of the JSON reply to a step of a session. No pydantic model validates them, to save time."""
     assert isinstance(reply.outcome, tuple)
     return _step_fields(reply.seq, reply.outcome[0])
 
 
 def rollout_steps(reply: Reply) -> Iterator[dict[str, Any]]:
-    """Yield the fields of each step in the JSON reply to a rollout. All steps have the request's sequence number."""
+    """Yield the JSON fields of each step of a rollout, for the reply. All have the sequence number of the request."""
     assert not isinstance(reply.outcome, ResetResult)
     steps = reply.outcome.steps() if isinstance(reply.outcome, PolicyRollout) else reply.outcome
     return (_step_fields(reply.seq, step) for step in steps)
 
 
 def rollout_actions(reply: Reply) -> dict[str, Any]:
-    """Return the fields of the reply to a rollout that hold a policy's actions; empty if no policy chose them."""
+    """Return the JSON fields with the actions, and their log probabilities, that a policy chose in a rollout. Return an
+    empty dictionary if the caller gave the actions."""
     if not isinstance(reply.outcome, PolicyRollout):
         return {}
     log = reply.outcome.log_probability
@@ -162,7 +163,7 @@ def policy_run(request: replies.RolloutSession) -> PolicyRun:
     given, dtype = request.policy, np.dtype(request.policy.precision)
 
     def array(name: str, rows: Any) -> NDArray[Any]:
-        with np.errstate(over="ignore"):  # a value too large for float32 becomes infinite, which is refused later
+        with np.errstate(over="ignore"):  # too large values become infinite, refused later
             return numbers(name, rows).astype(dtype)
 
     try:

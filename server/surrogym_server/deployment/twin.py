@@ -1,6 +1,7 @@
 """Export of a surrogate as an FMU (FMI 3.0), with the uncertainty of each step.
 
-The FMU steps like a session in the variant ``deterministic``: by the mean, with the standard deviations beside it.
+The FMU steps like a session in the variant ``deterministic``, to the mean next state. Further outputs are the standard
+deviations of the model's predictions.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from surrogym_server.virtual import reward_limits
 from surrogym_shared.fmu import Block, Causality, Names, Variable, WrittenFmu, write_fmu
 from surrogym_shared.surrogate_file import SurrogateFile
 
-MOST_NUMBERS = 4_000_000  # largest number of constants in the C source, which takes about a minute and 1 GB to compile
+MOST_NUMBERS = 4_000_000  # models with more numbers are refused: C code of this size takes a minute and 1 GB to compile
 ANYWHERE = (-math.inf, math.inf)
 
 
@@ -74,11 +75,11 @@ def twin_of(file: SurrogateFile, period: float | None = None) -> Block:
 def _period(seconds: float | None) -> float:
     if seconds is None:
         raise InvalidInput(
-            "the duration of a step is unknown, because the specification has no sampling_period: give --period, in "
-            "seconds"
+            "expected the duration of a step, got neither --period nor a sampling_period in the specification: give "
+            "--period, in seconds"
         )
     if not 0 < seconds < math.inf:
-        raise InvalidInput(f"period: expected the seconds of one step, above 0, got {seconds}")
+        raise InvalidInput(f"period: expected the duration of one step in seconds, above 0, got {seconds}")
     return seconds
 
 
@@ -136,8 +137,8 @@ def _coordinate(coordinate: CoordinateDefinition, name: str, unit: str, start: f
 
 
 def _start(definition: EnvironmentDefinition, index: int) -> float:
-    """Return the start value of the coordinate with this index: that of the first declared start state, or else the
-    median of its start distribution."""
+    """Return the start value of coordinate number ``index``: its value in the first declared start state, or the median
+    of its start distribution if no start state is declared."""
     if definition.starts:
         return definition.starts[0][index]
     middle = torch.tensor(0.5, dtype=torch.float64)
@@ -159,7 +160,7 @@ def _header(definition: EnvironmentDefinition, model: DynamicsModel, rewards: tu
     yield _array("state_high", [min(one.high, _LARGEST) for one in coordinates]) + "\n"
 
 
-_LARGEST = torch.finfo(torch.float64).max  # bound in the place of infinity, so that the FMU refuses an infinite start
+_LARGEST = torch.finfo(torch.float64).max  # replaces infinite bounds, so that the FMU refuses an infinite start value
 
 
 def _array(name: str, values: Sequence[float]) -> str:

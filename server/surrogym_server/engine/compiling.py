@@ -19,17 +19,17 @@ import surrogym_server.virtual.compiled.step
 import surrogym_server.virtual.words
 """
 PACKAGE = "surrogym_server"
-LONGEST = 120.0  # longest wait of a session in seconds; after that, the session compiles its steps itself
+LONGEST = 120.0  # a session waits at most this many seconds for the compilation, then compiles its steps itself
 
 
 class Compiling:
-    """A child process that compiles the code of steps and stores it in the cache on the disk."""
+    """A child process that compiles the numba functions of steps and stores them in a cache on the disk."""
 
     def __init__(self) -> None:
         self._process: subprocess.Popen[bytes] | None = None
 
     def start(self) -> None:
-        """Start the compilation, unless the cache on the disk can't be used or has compiled steps already."""
+        """Start the child process, unless numba or the disk cache can't be used, or compiled code is there already."""
         is_cold = compiled.available() and disk_cache.folder(PACKAGE) is not None and not disk_cache.has_any(PACKAGE)
         if self._process is None and is_cold:
             self._process = subprocess.Popen(

@@ -37,8 +37,8 @@ Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 SESSION_ID_BYTES = 16
-MAX_PARTICLES = 4_000_000  # largest number of particles in all lanes of a session together
-# Largest number of lanes in variant ``pathwise``, in which a lane needs memory for a sampled function.
+MAX_PARTICLES = 4_000_000  # a session of variant probabilistic may have this many particles in all lanes together
+# A session of variant pathwise may have this many lanes, because each lane needs memory for a sampled function.
 MAX_PATHWISE_LANES = 4_096
 
 
@@ -55,7 +55,7 @@ class Models(Protocol):
 def check_size(settings: VirtualSettings, max_lanes: int) -> None:
     """Raise ``TooLarge`` if a session would have more than ``max_lanes`` lanes or too many particles."""
     if settings.num_envs > max_lanes:
-        raise TooLarge(f"expected a session of at most {max_lanes} lanes, got {settings.num_envs}: open fewer")
+        raise TooLarge(f"expected a session of at most {max_lanes} lanes, got {settings.num_envs}: open fewer lanes")
     particles = settings.num_envs * settings.particles
     if settings.variant == "probabilistic" and particles > MAX_PARTICLES:
         raise TooLarge(
@@ -65,7 +65,7 @@ def check_size(settings: VirtualSettings, max_lanes: int) -> None:
     if settings.variant == "pathwise" and settings.num_envs > MAX_PATHWISE_LANES:
         raise TooLarge(
             f"expected at most {MAX_PATHWISE_LANES} lanes in a session of variant pathwise, got {settings.num_envs}: "
-            "open fewer"
+            "open fewer lanes"
         )
 
 
@@ -80,7 +80,7 @@ def opened(
         model: the model that the session begins with, on the same device.
         version: version of this model.
         digest: content hash of the request, to recognise a repeat.
-        place: suffix of the session's id.
+        place: suffix of the session's id, which names the process that runs the session.
     """
     opening = request.opening
     settings = _limited(resolved(opening, definition), request.rewards, model)
@@ -139,16 +139,18 @@ def _limited(settings: VirtualSettings, rewards: SampledRewards | None, model: D
 
 
 def _starts(settings: VirtualSettings, definition: EnvironmentDefinition, states: Array | None) -> Tensor | None:
-    """Return the states (k, C) of real steps at which a share of the episodes starts; None if this share is 0.
+    """Return ``states`` (k, C), those of k real steps, as a tensor if the setting ``start_visited`` is above 0: then
+    this share of the episodes starts at one of them. Return None if the setting is 0.
 
     Raises:
-        InvalidInput: the share is above 0, and the surrogate has no real steps.
+        InvalidInput: the setting is above 0, and the surrogate has no real steps.
     """
     if settings.start_visited == 0:
         return None
     if states is None or not len(states):
         raise InvalidInput(
-            "start_visited: expected a surrogate with real steps, got one without (a file has none): set it to 0"
+            "start_visited: expected a surrogate with real steps, got one without (a file has none): set start_visited "
+            "to 0"
         )
     return torch.tensor(states, dtype=torch.float64, device=definition.device)
 
@@ -162,14 +164,15 @@ def fingerprint_of(request: Advance) -> Fingerprint:
             return Fingerprint("reset", request.seed, request.mask)
         case Rollout():
             return Fingerprint("rollout", _columns(request.actions, 3))
-        case PolicySteps():  # computed now: a hash computed on first use would keep the policy in memory until then
+        case PolicySteps():  # hashed now: a hash on first use would keep the policy's weights in memory until then
             return Fingerprint(digest=digest_of("policy", *parts_of(request.run)))
         case _:
             assert_never(request)
 
 
 def steps_asked(request: Advance) -> int:
-    """Return the largest number of virtual steps that a request may take; a reset counts as one."""
+    """Return how many steps of a session a request takes at most; a reset counts as one step. A policy's rollout may
+    take fewer."""
     match request:
         case Rollout():
             return len(request.actions)
@@ -198,7 +201,7 @@ def carried_out(
         TooLarge: the rollout has too many steps times lanes.
         PluginFailed: the code of the model's family raised an error.
     """
-    if isinstance(request, Step):  # most requests are steps, and ``isinstance`` is faster than the pattern match below
+    if isinstance(request, Step):  # handled first, without pattern matching, because most requests are steps
         u = policy_actions(session.definition.action, request.action, session.settings.num_envs)
         after, result = _step(session, u, request.mask, request.stds, models, interrupts)
         return after, (result,)
@@ -222,7 +225,10 @@ def visited_states(session: Session) -> Array:
         NotReset: the session has visited no state yet.
     """
     if session.visited is None:
-        raise InvalidInput("expected a session opened with occupancy=true, got one without: open a new one")
+        raise InvalidInput(
+            "expected a session opened with occupancy=true, which records visited states, got one without: open a new "
+            "session"
+        )
     if not len(session.visited.states):
         raise NotReset("expected a session that has visited states, got a new one: reset and step it first")
     return session.visited.states
@@ -245,15 +251,16 @@ def _step(
     except SurrogymError:
         raise
     except BaseException as error:
-        # The error comes from a model family, perhaps of a plug-in. A context manager would slow each step.
+        # A model family, perhaps of a plug-in, raised this error. ``plugin_calls`` would convert it too, but a context
+        # manager would slow each step.
         if isinstance(error, KeyboardInterrupt) and not interrupts:
             raise
         raise failure_of(session.definition, error) from error
 
 
 def _columns(action: Array, dimensions: int) -> Array:
-    """Return actions with ``dimensions`` axes: add the last axis if it is missing.
+    """Return an array of actions with ``dimensions`` axes: a last axis of length 1 is added if there is one axis less.
 
-    Some transports omit this axis if an action has one entry. All transports must give the same fingerprint.
+    Some transports omit the last axis if an action has one entry. The hash of a request must not depend on that.
     """
     return action[..., None] if action.ndim == dimensions - 1 else action

@@ -33,7 +33,8 @@ from surrogym_shared.states import Phase, SamplePurpose, Verdict
 
 Array = NDArray[np.float64]
 
-UNCHOSEN: tuple[SamplePurpose, ...] = ("initial", "logged")  # purposes of samples that no model chose
+# Purposes of samples whose states and actions were not chosen by means of a model.
+UNCHOSEN: tuple[SamplePurpose, ...] = ("initial", "logged")
 
 
 @dataclass(frozen=True)
@@ -41,19 +42,19 @@ class DesignJob:
     """Input of one round of a design, as plain arrays and values that pickle."""
 
     definition: EnvironmentDefinition
-    samples: RealSteps  # all real steps so far
-    state: dict[str, Any]  # DesignState as JSON; {} before the first round
-    budget: int  # largest number of real steps of the design
-    target: float  # confidence index at which the design ends
-    pending: tuple[Query, ...] = ()  # queries without an answer: open, or set aside
-    open_steps: int = 0  # number of real steps of the open queries
-    refused: tuple[Query, ...] = ()  # queries that the original environment refused
+    samples: RealSteps  # all real steps of the surrogate so far, from which the model learns
+    state: dict[str, Any]  # state of the design after the previous round (DesignState as JSON); {} before the first
+    budget: int  # largest number of real steps that the design may take
+    target: float  # the design ends when the model's confidence index reaches this number
+    pending: tuple[Query, ...] = ()  # queries without an answer, which a sampler may still take or which were set aside
+    open_steps: int = 0  # number of real steps that the open queries will take
+    refused: tuple[Query, ...] = ()  # queries that the original environment refused, such as an unreachable state
     snapshots: dict[str, tuple[float, ...]] = field(default_factory=dict)  # coordinates (C,) of each snapshot, by name
-    extra_queries: int = 0  # number of further queries that a person requested, also after the end of the design
-    occupancy: Array | None = None  # (m, C) states that policies visited
+    extra_queries: int = 0  # number of queries requested beyond those of the design, also after the design has ended
+    occupancy: Array | None = None  # (m, C) coordinates of m states that policies visited in virtual episodes
     threads: int = 1
-    previous: bytes | None = None  # model of the previous round, which predicts the new samples
-    prior: bytes | None = None  # prior model, such as one learned from a simulator
+    previous: bytes | None = None  # file of the previous round's model, which predicts the samples that came since
+    prior: bytes | None = None  # file of a prior model, such as one learned from a simulator; None without a prior
 
 
 @dataclass(frozen=True)
@@ -62,17 +63,17 @@ class DesignResult:
 
     model: bytes
     description: dict[str, Any]
-    fidelity: dict[str, Any]  # the fields of wire.Fidelity
+    fidelity: dict[str, Any]  # confidence and errors of the model, as the fields of ``wire.Fidelity``
     data_hash: str
     state: dict[str, Any]
     verdict: Verdict
     seconds: float
-    queries: tuple[Query, ...] = ()  # the next queries; the next round begins when they are answered
+    queries: tuple[Query, ...] = ()  # requested real steps; the next round begins when samplers have taken them
 
     @property
     def phase(self) -> Phase:
-        """Phase of the design after this round: ``sampling`` if the verdict is ``continue`` or there are next queries,
-        else the verdict."""
+        """Phase of the design after this round: ``sampling`` if the verdict is ``continue`` or the round chose
+        queries, else the verdict, such as ``ready``."""
         return "sampling" if self.verdict == "continue" or self.queries else self.verdict
 
 
@@ -83,13 +84,13 @@ def run_design_job(job: DesignJob) -> DesignResult:
     """
     begin = time.perf_counter()
     torch.set_num_threads(job.threads)
-    with threadpool_limits(job.threads):  # more threads would slow the small matrix products
+    with threadpool_limits(job.threads):  # limits NumPy's threads, too many of which slow small matrix products
         decision, samples = _decide(job)
     with plugin_calls(job.definition):
         model = to_bytes(decision.model)
     return DesignResult(
         model=model,
-        description=json.loads(json.dumps(decision.model.description)),  # plug-in types become JSON types
+        description=json.loads(json.dumps(decision.model.description)),  # converts a plug-in's types to JSON types
         fidelity=fidelity_fields(
             decision.model,
             decision.confidences,
@@ -106,7 +107,8 @@ def run_design_job(job: DesignJob) -> DesignResult:
 
 
 def judge_stored(job: DesignJob, data: bytes) -> DesignResult:
-    """Compute the confidence of a stored model (safetensors) and the verdict on the design, without a fit.
+    """Compute the confidence of a stored model (``data``, a safetensors file) and the verdict on the design, without a
+    fit.
 
     No queries are chosen. The verdict is ``continue`` if the model was fitted to other samples than those of the job.
 
@@ -144,9 +146,10 @@ def _decide(job: DesignJob) -> tuple[Decision, Samples]:
 
 
 def _new_predictions(job: DesignJob, samples: Samples) -> Predictions:
-    """Predict the latest samples by the model of the previous round, which has not learned from them.
+    """Predict the latest samples that came after the previous round, by that round's model, which has not learned from
+    them. Samples that were not chosen by a model (``UNCHOSEN``) are left out.
 
-    The result is empty if there is no such model, or if it learned from other samples, as an imported model did.
+    The result is empty without a previous model, or if it learned from other samples, as an imported model did.
     """
     if job.previous is None:
         return ()
@@ -162,12 +165,14 @@ def _new_predictions(job: DesignJob, samples: Samples) -> Predictions:
 
 
 def _samples(job: DesignJob) -> Samples:
-    """Return the samples of the job that a model can learn from: those whose lag coordinates are all known."""
+    """Return the samples from which a model can learn: those in which all coordinates that repeat a past value (lags)
+    are known."""
     return Samples.of(job.samples).at(_is_known(job))
 
 
 def _is_known(job: DesignJob) -> torch.Tensor:
-    """For each of the job's n samples, whether all lag coordinates of the sample's first state are known; (n,) bool."""
+    """Return for each of n samples whether all coordinates that repeat a past value (lags) are known before the step,
+    (n,) bool."""
     return job.definition.known(torch.from_numpy(job.samples.coordinates))
 
 

@@ -28,7 +28,7 @@ def fidelity_fields(
         confidences: (O,) confidence of each output.
         tolerances: (O,) tolerance of each output, in its unit.
         target: confidence index that the design aims at.
-        limits: limits of coordinates that samples have reached.
+        limits: ends of coordinates' ranges that samples have reached.
     """
     rows = [
         {"name": name, "structure": structure, "tolerance": tolerance, **asdict(output)}

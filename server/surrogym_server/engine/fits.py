@@ -24,7 +24,9 @@ from surrogym_server.engine.port import Compute
 from surrogym_server.errors import ChoiceFailed, PluginFailed, SurrogymError, Unavailable
 from surrogym_server.plugins import in_one_line
 
-NICENESS = 10  # nice value of fits: a step that shares a core with a fit gets nine tenths of its time
+# Fits run in processes with this nice value (low priority). A step that shares a core with a fit then gets nine tenths
+# of the core's time.
+NICENESS = 10
 Function = Callable[[DesignJob], DesignResult]
 
 
@@ -34,7 +36,7 @@ class Failure:
 
     kind: type[PluginFailed]
     message: str
-    details: str  # traceback of an unexpected error
+    details: str  # traceback of the error if it was unexpected, otherwise empty
 
 
 class Fits(Compute):
@@ -55,7 +57,7 @@ class Fits(Compute):
         self._busy: list[_Process] = []
 
     def start(self) -> None:
-        """Start the first child process, so that the first fit does not wait for it. Does nothing if one is idle."""
+        """Start a child process, so that the first fit need not wait for it. Does nothing if an idle one exists."""
         if not self._idle:
             self._idle.append(_Process("fork" if self._forks else "spawn"))
 
@@ -73,7 +75,7 @@ class Fits(Compute):
                 whole = True
             except BrokenProcessPool:
                 continue
-            except Exception as error:  # the result of the job can't be pickled
+            except Exception as error:  # errors of the job come back as ``Failure``: here its result can't be pickled
                 raise PluginFailed(in_one_line(error)) from error
             finally:
                 self._give_back(process, whole)
@@ -81,8 +83,8 @@ class Fits(Compute):
                 raise error_of(outcome)
             return outcome
         raise Unavailable(
-            "the child process of this fit died twice, perhaps because the machine has too little memory: free some, "
-            "then try again"
+            "expected the process that fits the model to end normally, but it died twice, perhaps because the machine "
+            "has too little memory: free memory, then try again"
         )
 
     def close(self) -> None:
@@ -111,7 +113,9 @@ class _Process:
     def __init__(self, method: Literal["fork", "spawn"] = "spawn") -> None:
         context = get_context(method)
         theirs, self._lifeline = context.Pipe(duplex=False)
-        ours = self._lifeline if method == "fork" else None  # a fork inherits this end of the pipe, and must close it
+        # A forked child inherits the parent's end of the pipe. It must close it, or the pipe stays open when the parent
+        # dies.
+        ours = self._lifeline if method == "fork" else None
         self.pool = ProcessPoolExecutor(1, mp_context=context, initializer=_live_with, initargs=(theirs, ours))
         self._closing = Lock()
         others = active_children()
@@ -149,9 +153,10 @@ def error_of(outcome: Failure) -> PluginFailed:
 
 @contextmanager
 def _terminal_blocked() -> Iterator[None]:
-    """Return a context in which new child processes start with SIGINT and SIGHUP blocked, the signals of a terminal.
+    """Return a context in which SIGINT and SIGHUP, the signals of a terminal, are blocked. Child processes that start
+    in it keep these signals blocked.
 
-    If such signals arrive meanwhile, this process receives them when the context ends.
+    If one of these signals arrives meanwhile, this process receives it when the context ends.
     """
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGHUP})
     try:
@@ -163,7 +168,7 @@ def _terminal_blocked() -> Iterator[None]:
 def _live_with(lifeline: Connection, others_end: Connection | None) -> None:
     if others_end is not None:
         others_end.close()
-    gc.enable()  # a fork inherits the parent's disabled garbage collector
+    gc.enable()  # the parent process may have disabled garbage collection, and a forked child inherits that
     os.nice(NICENESS)
     Thread(target=_exit_when_closed, args=(lifeline,), daemon=True).start()
 

@@ -45,7 +45,8 @@ from surrogym_server.tensors import CPU
 from surrogym_server.virtual import expected_bytes
 
 STEP_THREADS, ROLLOUT_THREADS = 4, 2
-Tolerances = Callable[[int, int], tuple[float, ...]]  # from a surrogate's id and a model version to tolerances (O,)
+# Function that returns the tolerances (O,) of the O outputs of a model, given a surrogate's id and a model version.
+Tolerances = Callable[[int, int], tuple[float, ...]]
 
 
 class LocalEngine(SessionEngine):
@@ -61,7 +62,7 @@ class LocalEngine(SessionEngine):
         place: suffix of the session ids, which distinguishes the engines of several processes.
     """
 
-    def __init__(  # seven parameters, because each comes from a different setting or object of the server
+    def __init__(  # not grouped into one object, because each parameter comes from a different part of the server
         self,
         models: ModelCache,
         tolerances: Tolerances,
@@ -137,7 +138,7 @@ class LocalEngine(SessionEngine):
         self.end(session)
 
     def end(self, session: str) -> None:
-        """End a session, for callers that are no coroutine; ``close`` does the same."""
+        """End a session. Does the same as ``close``, but is not a coroutine."""
         self._live.close(session)
 
     def session(self, id: str) -> Session:
@@ -194,7 +195,8 @@ class LocalEngine(SessionEngine):
         return None if request.within is None else self._live.clock() + request.within
 
     def _tally(self, request: Advance, answer: Answer, began: float) -> Reply:
-        """Count a request with its duration and its steps, and return the reply. Steps of a repeat are not counted."""
+        """Count the duration and the steps of a request that is not a reset, and return the reply. The counts of the
+        session leave out a repeated request; the totals of the engine include it."""
         reply = Reply(answer.seq, answer.outcome)
         tally = self._tallies.of(request.session)
         if isinstance(request, Reset):

@@ -32,7 +32,8 @@ class ModelCache:
         Args:
             load: loads a model, given a surrogate's id and a version; raises ``UnknownModel``, ``UnknownSurrogate`` or
                 ``Damaged``.
-            newest: returns the newest stored version by surrogate id, without damaged models that were set aside.
+            newest: returns for each surrogate's id the newest version of its stored models, damaged ones that were set
+                aside not counted.
             capacity: number of models to keep; the copy of a model on a GPU counts as one more.
         """
         self._load = load
@@ -61,7 +62,7 @@ class ModelCache:
             return self._load(surrogate, version)
         except Damaged:
             with self._lock:
-                self._latest.pop(surrogate, None)  # the damaged version may be the newest known one
+                self._latest.pop(surrogate, None)  # read again: the damaged version may be the one stored here
             raise
 
     def latest(self, surrogate: int) -> int:

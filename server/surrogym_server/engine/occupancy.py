@@ -21,12 +21,12 @@ class Reservoir:
     """
 
     seed: int
-    visits: int = 0  # number of visits so far
-    states: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (m, C) sampled visits
-    priority: Array = field(default_factory=lambda: np.zeros(0))  # (m,) priorities of these visits
+    visits: int = 0  # number of states that the session has visited so far, each visit counted
+    states: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (m, C) coordinates of the m states that are kept
+    priority: Array = field(default_factory=lambda: np.zeros(0))  # (m,) random priority of each state that is kept
 
     def visit(self, states: Array) -> Reservoir:
-        """Return the reservoir after further visits to states (n, C), in order."""
+        """Return a reservoir that also takes into account n further visits to ``states`` (n, C), in order."""
         priority = _priorities(self.seed, self.visits, len(states))
         full = len(self.priority) == CAPACITY
         candidates = np.flatnonzero(priority > self.priority.min()) if full else np.arange(len(states))
@@ -41,9 +41,10 @@ class Reservoir:
 
 
 def _priorities(seed: int, first: int, count: int) -> Array:
-    """Return random numbers ``first`` to ``first + count - 1`` of the stream with the key ``seed``.
+    """Return the random numbers with the indices ``first`` to ``first + count - 1`` of a generator with the key
+    ``seed``, (count,).
 
-    The Philox generator can only start at a block of four numbers, so up to three are dropped.
+    The Philox generator can only start at a multiple of four, so up to three numbers before ``first`` are dropped.
     """
     block, offset = divmod(first, 4)
     generator = np.random.Generator(np.random.Philox(key=seed, counter=block))

@@ -23,7 +23,7 @@ from surrogym_server.engine.tallies import Counts, SessionActivity
 
 
 class SessionEngine(ABC):
-    """Interface of an engine, which runs sessions: it has their models, locks, deadlines, visited states and counts.
+    """Interface of an engine, which runs sessions (virtual environments) and keeps their models, locks and counts.
 
     Laws: a request is carried out once. A repeat with the same sequence number (seq) and body gets the same reply, bit
     for bit, even while the first request still runs. Another seq or body raises ``SeqConflict``, which has the expected
@@ -33,9 +33,10 @@ class SessionEngine(ABC):
     Each method with a session's id raises ``UnknownSession`` or ``SessionExpired`` if the session does not exist.
     """
 
-    idle_seconds: float  # a session without requests for this long expires
-    lasting: bool = False  # whether sessions outlive this process and are open to other processes
-    replay: int = 0  # number of its last requests that a client should keep, to repeat them from a restored checkpoint
+    idle_seconds: float  # a session expires if it gets no request for this many seconds
+    lasting: bool = False  # whether sessions continue after this process has ended, and serve other processes too
+    # A client should keep this many of its last requests, to repeat them if the session goes back to a checkpoint.
+    replay: int = 0
 
     @abstractmethod
     async def open(self, request: Open) -> SessionInfo:

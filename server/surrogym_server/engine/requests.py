@@ -21,9 +21,9 @@ Bools = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Opening:
-    """Settings that a trainer chooses for its session.
+    """Settings with which a caller opens a session.
 
-    A time limit or penalty of None stands for that of the surrogate, a seed of None for a random one.
+    A time limit or penalty of None means that of the surrogate's specification, a seed of None a random seed.
     """
 
     settings: VirtualSettings
@@ -54,29 +54,29 @@ class Open:
     surrogate_id: int
     definition: EnvironmentDefinition
     opening: Opening
-    rewards: SampledRewards | None = None  # range of the samples' rewards; None: virtual rewards have no limits
-    visited: Array | None = None  # (k, C) states of real steps, for a session that starts episodes there
+    rewards: SampledRewards | None = None  # range of the samples' rewards, which limits virtual ones; None: no limits
+    visited: Array | None = None  # (k, C) coordinates of k real steps, at which the session may start episodes
 
 
 @dataclass(frozen=True, eq=False)
 class Reset:
-    """Request for new episodes in the lanes of a mask, or in all lanes."""
+    """Request to begin new episodes in the lanes that ``mask`` selects, or in all lanes of a session."""
 
     session: str
-    seq: int | None  # the session's next sequence number; None: a repeat of the request can't be recognised
+    seq: int | None  # the session's next sequence number; None: the engine can't recognise a repeat of the request
     seed: Seeds = None
-    mask: Bools | None = None  # (N,) lanes that take part; None: all
-    within: float | None = None  # seconds that the caller will wait for the reply
+    mask: Bools | None = None  # (N,) which of the N lanes the request resets or steps; None: all
+    within: float | None = None  # the caller waits at most this many seconds for the reply; None: no limit
 
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """Request for one step in the lanes of a mask, or in all lanes."""
+    """Request for one step in the lanes that ``mask`` selects, or in all lanes of a session."""
 
     session: str
     seq: int | None
-    action: Array  # (N, F), or (N,) if F = 1, as policies send it
-    mask: Bools | None = None  # (N,) lanes that take part; None: all
+    action: Array  # (N, F) a policy's action of F entries for each of N lanes; also (N,) if F = 1
+    mask: Bools | None = None  # (N,) which of the N lanes the request resets or steps; None: all
     stds: bool = False
     within: float | None = None
 
@@ -87,7 +87,7 @@ class Rollout:
 
     session: str
     seq: int | None
-    actions: Array  # (T, N, F), or (T, N) if F = 1, as policies send them
+    actions: Array  # (T, N, F) a policy's actions for each of T steps and N lanes; also (T, N) if F = 1
     within: float | None = None
 
 
@@ -123,9 +123,9 @@ class SessionInfo:
     settings: VirtualSettings
     seed: int
     model: WantedVersion
-    versions: Versions  # (N,) model version of each lane's episode
-    seq: int  # sequence number of the last answered request
-    # Whether the session went back to a checkpoint, so that its client has to repeat its last requests.
+    versions: Versions  # (N,) version of the model that computes the current episode of each lane
+    seq: int  # sequence number of the last request that the session has answered; 0 before the first
+    # Whether the session was restored from an older checkpoint, so that the client has to repeat its last requests.
     behind: bool = False
 
 
@@ -134,7 +134,7 @@ class Visited:
     """States that a session visited, and the model's confidence index over them."""
 
     surrogate_id: int
-    states: Array  # (v, C) visited states
+    states: Array  # (v, C) coordinates of v visited states, a random sample if there were too many
     confidence_index: float
 
 

@@ -22,7 +22,8 @@ from surrogym_shared.port import PolicyRollout, StepResult
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
-# Takes one step of a session, given actions (N, F) as the model encodes them.
+# A function that takes one step of a session under the actions (N, F) of N lanes, encoded for the model. It returns the
+# new session and the result of the step.
 OneStep = Callable[[Session, Floats], tuple[Session, StepResult]]
 
 
@@ -51,7 +52,8 @@ def roll(session: Session, actions: NDArray[np.float64], step: OneStep) -> tuple
 
 
 def roll_policy(session: Session, run: PolicyRun, step: OneStep) -> tuple[Session, PolicyRollout]:
-    """Take steps with the actions of a policy; either all steps are taken or none. ``step`` takes one step.
+    """Take steps of a session with the actions of a policy. ``step`` takes one step. If an error is raised, no step
+    counts. If ``run.until`` is given, stop as soon as each lane that it selects has ended an episode.
 
     Raises:
         InvalidInput: the policy's observation or action size differs from the session's, ``run.until`` does not have
@@ -62,7 +64,7 @@ def roll_policy(session: Session, run: PolicyRun, step: OneStep) -> tuple[Sessio
     _check_steps(run.steps, lanes)
     if lanes * max(run.policy.units) > MAX_ACTIVATIONS:
         raise TooLarge(
-            f"expected the widest layer of the policy to have at most {MAX_ACTIVATIONS} units times lanes, got "
+            f"expected units of the policy's widest layer times lanes to be at most {MAX_ACTIVATIONS}, got "
             f"{max(run.policy.units)} x {lanes}: open fewer lanes, or take a smaller policy"
         )
     actor = _actor(len(definition.observation_names), definition.action, run)
@@ -86,8 +88,8 @@ def roll_policy(session: Session, run: PolicyRun, step: OneStep) -> tuple[Sessio
 def _check_steps(steps: int, lanes: int) -> None:
     if steps * lanes > MAX_LANE_STEPS:
         raise TooLarge(
-            f"expected at most {MAX_LANE_STEPS} steps times lanes in one request, got {steps} x {lanes}: take fewer "
-            "steps"
+            f"expected steps times lanes in one request to be at most {MAX_LANE_STEPS}, got {steps} x {lanes}: take "
+            "fewer steps"
         )
 
 

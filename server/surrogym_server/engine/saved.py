@@ -23,7 +23,8 @@ from surrogym_shared.port import PolicyRollout, ResetResult, StepResult
 
 FORMAT = 2
 MALFORMED = (BadZipFile, zlib.error, EOFError, OSError, NotImplementedError, ValueError, LookupError, TypeError)
-RAGGED = ("final_lanes", "final_observation")  # fields of a step's result whose length differs from step to step
+# Fields of a step's result whose length differs from step to step, so that the steps of a rollout can't be stacked.
+RAGGED = ("final_lanes", "final_observation")
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -72,7 +73,7 @@ def session_from_bytes(definition: EnvironmentDefinition, data: bytes, surrogate
         return _read(definition, data, surrogate_id)
     except MALFORMED as error:
         raise Damaged(
-            f"expected a saved session, got {len(data)} bytes that can't be read as one: {error}; open a new session"
+            f"expected a saved session, got {len(data)} bytes that are damaged: {error}; open a new session"
         ) from error
 
 

@@ -28,8 +28,8 @@ ModelOf = Callable[[int], DynamicsModel]
 Seeds = int | Sequence[int] | None
 Outcome = ResetResult | tuple[StepResult, ...] | PolicyRollout
 
-RESULT_BYTES = 2_048  # memory of the array objects of one step's result, without their numbers
-LANE_BYTES = 48  # memory of one lane in a step's result, without observation and action
+RESULT_BYTES = 2_048  # estimated memory of the array objects in the result of one step, without the arrays' numbers
+LANE_BYTES = 48  # estimated memory of one lane's numbers in the result of one step, without observation and action
 
 
 class Fingerprint:
@@ -80,11 +80,12 @@ class Session:
     seed: int
     model: WantedVersion
     lanes: LaneState
-    versions: Versions  # (N,) model version of each lane's episode
+    versions: Versions  # (N,) version of the model that computes the current episode of each lane
     answer: Answer | None = None
     visited: Reservoir | None = None
-    opened_by: tuple[str, str] | None = None  # idempotency key and content hash of the request that opened the session
-    surrogate_id: int = 0  # id of the surrogate in storage; 0 without a storage
+    # Idempotency key and content hash of the request that opened the session; None if the request had no key.
+    opened_by: tuple[str, str] | None = None
+    surrogate_id: int = 0  # id of the session's surrogate in the database; 0 in a program without a database
 
     @property
     def nbytes(self) -> int:
@@ -104,7 +105,7 @@ class Session:
 
 
 def steps_of(outcome: Outcome) -> int:
-    """Number of steps in an outcome; a reset counts as one."""
+    """Return the number of steps that a request has taken, from its outcome; a reset counts as one step."""
     return 1 if isinstance(outcome, ResetResult) else len(outcome)
 
 
@@ -123,7 +124,7 @@ def replay(session: Session, seq: int | None, request: Fingerprint) -> Answer | 
         return answer
     repeated = " with another body" if answer is not None and seq == answer.seq else ""
     raise SeqConflict(
-        f"expected seq {session.seq + 1}, got {seq}{repeated}: number the requests of a session one by one",
+        f"expected seq {session.seq + 1}, got {seq}{repeated}: number the requests of a session 1, 2, 3, ...",
         expected=session.seq + 1,
     )
 
@@ -190,8 +191,8 @@ def _step_versions(
 
 
 def _join(parts: Sequence[tuple[NDArray[np.intp], LaneTransition]]) -> LaneTransition:
-    """Join the transitions of several sets of lanes to one transition of all lanes. Each part has the indices of its
-    lanes, and each lane is in one part."""
+    """Join the results of a step of several sets of lanes to one result for all lanes. Each part consists of the
+    indices of its lanes and their results, and each lane is in exactly one part."""
     order = np.argsort(np.concatenate([index for index, _ in parts]))
 
     def lanewise(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
@@ -252,7 +253,10 @@ def check_opening(session: Session, digest: str) -> Session:
         IdempotencyConflict: the session was opened with other settings under the same idempotency key.
     """
     if session.opened_by is None or session.opened_by[1] != digest:
-        raise IdempotencyConflict("this idempotency key has opened a session with other settings: use a new key")
+        raise IdempotencyConflict(
+            "idempotency key: expected a new one, got one with which a session with other settings was opened: use "
+            "another key"
+        )
     return session
 
 

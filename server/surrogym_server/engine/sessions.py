@@ -28,8 +28,8 @@ from surrogym_shared.port import PolicyRollout
 
 logger = logging.getLogger(__name__)
 
-# Requests with a shorter predicted duration run in the event loop, because a thread would add about 70 us, and several
-# times as much on a busy machine. A request of two milliseconds hardly delays other sessions.
+# If the predicted duration of a request is below this number of seconds, it runs in the event loop. A thread would add
+# about 70 us, and several times as much on a busy machine. So short a request hardly delays other sessions.
 INLINE_SECONDS = 2e-3
 MEBIBYTE = 2**20
 REMEMBERED_EXPIRED = 10_000
@@ -43,9 +43,9 @@ class _Live:
     session: Session
     last_use: float
     lock: asyncio.Lock = field(default_factory=asyncio.Lock)
-    reserved: int = 0  # expected size of the session in bytes, from when it was opened
-    seconds_per_step: float = float("inf")  # moving average of measurements; infinite before the first step
-    requests: int = 0  # requests of this session that run or wait
+    reserved: int = 0  # number of bytes that the session was expected to take when it was opened
+    seconds_per_step: float = float("inf")  # moving average of measured step durations; infinite before the first step
+    requests: int = 0  # number of this session's requests that run or wait
 
     @property
     def nbytes(self) -> int:
@@ -57,8 +57,10 @@ class Threads:
     """Pool of threads for long requests, with the predicted duration of each request in it."""
 
     executor: Executor
-    workers: int  # number of threads
-    queued: list[float] = field(default_factory=list)  # predicted seconds of each request that runs or waits
+    workers: int  # number of threads in the pool
+    queued: list[float] = field(
+        default_factory=list
+    )  # predicted duration in seconds of each running or waiting request
 
     @property
     def wait(self) -> float:
@@ -71,8 +73,8 @@ class Limits:
     """Limits on the number, the memory and the requests of all sessions of this process together."""
 
     sessions: int = 256
-    nbytes: int = 2048 * MEBIBYTE  # largest memory of all lanes and stored answers, in bytes
-    requests: int = 1_024  # largest number of requests that run or wait
+    nbytes: int = 2048 * MEBIBYTE  # largest memory in bytes of all sessions: their lanes and their stored last answers
+    requests: int = 1_024  # largest number of requests of all sessions that run or wait at the same time
 
 
 class LiveSessions:
@@ -124,7 +126,9 @@ class LiveSessions:
             Overloaded: the number of open sessions, or their memory, has reached its limit.
         """
         if len(self._live) >= self._limits.sessions:
-            raise Overloaded(f"expected fewer than {self._limits.sessions} open sessions: close some, or try later")
+            raise Overloaded(
+                f"expected at most {self._limits.sessions} open sessions, got one more: close a session, or try later"
+            )
         self._check_memory(nbytes)
 
     def add(self, session: Session, reserved: int = 0) -> Session:
@@ -154,8 +158,8 @@ class LiveSessions:
         return None
 
     def prompt(self, id: str, steps: int = 1) -> bool:
-        """Whether a request of ``steps`` steps can run at once: the session has no other request, and the steps are
-        short."""
+        """Return whether a request of ``steps`` steps can run at once in the event loop: the session has no other
+        request, and the predicted duration is short."""
         live = self._live.get(id)
         if live is None or live.requests or self._requests >= self._limits.requests:
             return False
@@ -198,7 +202,9 @@ class LiveSessions:
         """
         live = self._get(id)
         if self._requests >= self._limits.requests:
-            raise Overloaded(f"expected at most {self._limits.requests} requests of sessions at once: try again later")
+            raise Overloaded(
+                f"expected at most {self._limits.requests} requests of all sessions at once, got one more: try later"
+            )
         self._requests += 1
         live.requests += 1
         try:
@@ -271,8 +277,8 @@ class LiveSessions:
             )
         if total + nbytes > most:
             raise Overloaded(
-                f"expected all sessions to take at most {_mebibytes(most)}, got {_mebibytes(total)} "
-                f"and {_mebibytes(nbytes)} more: close some, or try later"
+                f"expected all sessions to take at most {_mebibytes(most)} of memory, got {_mebibytes(total)} and "
+                f"{_mebibytes(nbytes)} more: close some sessions, or try later"
             )
 
     def _keep(self, live: _Live, request: Fingerprint, result: tuple[Session, Outcome]) -> Answer:
@@ -300,7 +306,7 @@ class LiveSessions:
         self._check_deadline(deadline, threads.wait + expected)
 
         def in_time(session: Session) -> tuple[Session, Outcome]:
-            # The deadline is checked again, because the wait for a thread may have been longer than predicted.
+            # Check the deadline again, because the request may have waited longer for a thread than predicted.
             self._check_deadline(deadline, expected)
             return work(session)
 
@@ -321,9 +327,12 @@ class LiveSessions:
 def _with_measurement(
     live: _Live, result: tuple[Session, Outcome], seconds: float, steps: int
 ) -> tuple[Session, Outcome]:
-    """Update the session's predicted time per step by a measured duration, and return ``result`` unchanged."""
+    """Update the session's moving average of the time per step with a request of ``steps`` steps that took ``seconds``.
+    Return ``result`` unchanged."""
     outcome = result[1]
-    count = len(outcome) if isinstance(outcome, PolicyRollout) else steps  # a policy's rollout may end early
+    count = (
+        len(outcome) if isinstance(outcome, PolicyRollout) else steps
+    )  # a policy's rollout may stop after fewer steps
     each = seconds / count
     average = live.seconds_per_step if live.seconds_per_step < float("inf") else each
     live.seconds_per_step = (1 - FORGETTING) * average + FORGETTING * each

@@ -20,10 +20,11 @@ from surrogym_shared.port import PolicyRollout, ResetResult, StepResult
 
 Clock = Callable[[], float]
 
-RATE_SECONDS = 10.0  # time constant of the exponential average of steps per second
+RATE_SECONDS = 10.0  # time constant in seconds of the exponential moving average of a session's steps per second
 KEPT_EPISODES = 100
-FOLD_STEPS = 32  # results are collected up to this number of steps and then summed at once, so that a step stays fast
-FOLD_LANE_STEPS = 16_384  # results are summed earlier if their steps times lanes reach this number
+# Summing the rewards after each step would slow the steps. They are collected, and summed at once when there are
+# FOLD_STEPS steps, or FOLD_LANE_STEPS steps times lanes.
+FOLD_STEPS, FOLD_LANE_STEPS = 32, 16_384
 BUCKETS = (1e-4, 2.5e-4, 5e-4, 1e-3, 2.5e-3, 5e-3, 1e-2, 2.5e-2, 5e-2, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 60.0)
 
 
@@ -58,7 +59,8 @@ class Durations:
 
 @dataclass(frozen=True)
 class Episode:
-    """A finished virtual episode. ``reward`` is its return, from which ``penalty`` was subtracted for uncertainty."""
+    """A finished virtual episode. ``reward`` is the sum of its penalised rewards, and ``penalty`` is the sum of the
+    penalties for uncertainty that were subtracted from them."""
 
     reward: float
     penalty: float
@@ -69,11 +71,11 @@ class SessionActivity:
     """A session, with counts since this process opened or restored it."""
 
     session: SessionInfo
-    steps: int  # number of virtual steps, summed over the lanes
+    steps: int  # number of virtual steps of the session, summed over its lanes
     steps_per_second: float
     episodes: int
-    recent: tuple[Episode, ...]  # latest episodes, oldest first
-    idle_seconds: float  # seconds since the session's last step
+    recent: tuple[Episode, ...]  # latest finished episodes of the session, oldest first
+    idle_seconds: float  # seconds since the session's last step, or since it was opened if it has taken none
 
 
 class Tally:
@@ -85,8 +87,10 @@ class Tally:
         self._decayed = 0.0
         self._seq = 0
         self._pending: list[StepResult | PolicyRollout] = []
-        self._unfolded = 0  # number of steps in ``_pending``
-        self._sums: NDArray[np.float64] | None = None  # (2, N) sums of reward and of penalty in the running episodes
+        self._unfolded = 0  # number of steps in ``_pending``, whose rewards are not summed yet
+        self._sums: NDArray[np.float64] | None = (
+            None  # (2, N) sums of reward and penalty in each lane's running episode
+        )
         self._steps = 0
         self._episodes = 0
         self._recent: deque[Episode] = deque(maxlen=KEPT_EPISODES)
@@ -134,7 +138,7 @@ class Tally:
         ended = np.concatenate([np.atleast_2d(result.terminated | result.truncated) for result in self._pending])
         self._pending.clear()
         self._unfolded = 0
-        gains = np.stack([reward, penalty], 1)  # (T, 2, N) for T steps of N lanes
+        gains = np.stack([reward, penalty], 1)  # (T, 2, N) reward and penalty in each of T steps and N lanes
         sums = np.zeros(gains.shape[1:]) if self._sums is None else self._sums
         begin = 0
         for step in np.flatnonzero(ended.any(1)).tolist():
@@ -175,8 +179,8 @@ class Counts:
     """Counts of an engine: its open sessions and requests now, and totals since its start."""
 
     sessions: Mapping[str, int]  # number of open sessions, by the name of the surrogate
-    lanes: int  # lanes of all open sessions
-    requests: int  # requests that run or wait
-    steps: Durations  # durations of requests with steps, from arrival to reply
-    lane_steps: int  # number of virtual steps, summed over the lanes
+    lanes: int  # number of lanes of all open sessions together
+    requests: int  # number of requests that run or wait now
+    steps: Durations  # durations of all requests for steps, each from its arrival to the reply
+    lane_steps: int  # number of virtual steps since the engine's start, summed over all sessions and their lanes
     expired: int  # number of sessions that ended because they were idle for too long

@@ -11,7 +11,8 @@ from surrogym_server.environment.definition import ActionDefinition
 from surrogym_server.errors import InvalidInput
 
 Array = NDArray[np.float64]
-FLOAT32_SLACK = 1e-6  # accepted excess over a limit, as a share of the range, because policies compute in float32
+# An action may exceed its limit by this share of the action's range, because policies compute in float32.
+FLOAT32_SLACK = 1e-6
 
 
 def policy_actions(action: ActionDefinition, raw: NDArray[Any], num_envs: int) -> Array:
@@ -36,7 +37,8 @@ def policy_actions(action: ActionDefinition, raw: NDArray[Any], num_envs: int) -
 
 
 def model_actions(action: ActionDefinition, raw: NDArray[Any]) -> Array:
-    """Check actions of queries and samples, (n, F): continuous values, or the numbers of discrete actions.
+    """Check actions of queries and samples, and return them as float64, (n, F): continuous values, or the numbers of
+    discrete actions.
 
     Raises:
         InvalidInput: the array has a wrong shape, or an entry is not finite, not a whole number or out of bounds.
@@ -56,7 +58,7 @@ def decode_bins(action: ActionDefinition, rows: Array) -> Array:
 
 
 def _rows(raw: NDArray[Any], expected: tuple[int, int]) -> Array:
-    # A copy, because an array from a received message may be unaligned and read-only.
+    # The array is copied, because one that was received in a message may be unaligned and read-only.
     rows = np.array(raw, dtype=np.float64)
     if rows.ndim == 1 and expected[1] == 1:
         rows = rows[:, None]
@@ -78,16 +80,17 @@ def _require_counts(rows: Array, counts: tuple[int, ...]) -> None:
     if bad.any():
         row, entry = np.argwhere(bad)[0]
         raise InvalidInput(
-            f"action: expected entry {entry} in 0..{counts[entry] - 1}, got {rows[row, entry]:g} in row {row}"
+            f"action: expected entry {entry} to be from 0 to {counts[entry] - 1}, got {rows[row, entry]:g} in row {row}"
         )
 
 
 def _in_box(action: ActionDefinition, rows: Array) -> Array:
     low, high = action.limits
-    if ((rows >= low) & (rows <= high)).all():  # then all entries are finite too, because the limits are
+    if ((rows >= low) & (rows <= high)).all():  # no entry is NaN or infinite then, because both limits are finite
         return rows
     _require_finite(rows)
-    slack = FLOAT32_SLACK * (high - low)  # an action at a limit may be rounded beyond it in float32
+    # In float32, an action at its limit may be rounded to a value slightly beyond the limit.
+    slack = FLOAT32_SLACK * (high - low)
     bad = (rows < low - slack) | (rows > high + slack)
     if bad.any():
         row, entry = np.argwhere(bad)[0]

@@ -1,9 +1,8 @@
 """Unwrapping of angles that move by more than half a turn within one step.
 
-A fast joint with a slow clock looks like a slow one, with a jump wherever its increment crosses half a turn. No smooth
-function predicts such jumps. The true increment of an angle is close to linear in the speeds, so the missing turns are
-those that make it linear: linear regression on a circle (Fisher & Lee, Biometrics 48, 1992), in which wrong turns leave
-residuals all around the circle.
+If an angle moves by more than half a turn in a step, its wrapped increment is wrong by full turns, and jumps as a
+function of the speed. No smooth function predicts such jumps. The true increment is close to linear in the speeds, so
+the missing turns are those that make it linear: linear regression on a circle (Fisher & Lee, Biometrics 48, 1992).
 """
 
 from __future__ import annotations
@@ -14,16 +13,18 @@ from torch import Tensor
 from surrogym_server.environment.definition import EnvironmentDefinition, wrap
 from surrogym_server.environment.distributions import scaling
 
-POINTS_A_WEIGHT = 3  # least number of steps for each weight of the regression
-MAX_TURNS = 3  # greatest number of full turns of an angle within a step
-STARTS_A_TURN = 8  # number of start slopes of the search for each full turn
-ROUNDS = 10  # number of iterations of the search
-CLEARLY = 0.25  # full turns are added only if they reduce the sum of squared residuals to less than this share of it
+POINTS_A_WEIGHT = 3  # angles are unwrapped only if there are this many steps for each weight of the regression
+MAX_TURNS = 3  # the search for missing turns starts from slopes of up to this many full turns of an angle in one step
+STARTS_A_TURN = 8  # number of start slopes for each of these ``MAX_TURNS`` turns, on each side of zero
+ROUNDS = 10  # number of iterations of the search from each start slope
+# Full turns are added to an angle's increments only if the sum of squared residuals falls below this share of its value
+# without them.
+CLEARLY = 0.25
 
 
 def angle_increments(definition: EnvironmentDefinition, q: Tensor, q_next: Tensor) -> Tensor:
-    """Return the increments of the A angles in the steps from q (n, C) to q_next (n, C), (n, A) in radians. An
-    increment includes the full turns that the angle makes within the step."""
+    """Return the increments in radians, (n, A), of the A angles among the coordinates, in n steps from q (n, C) to
+    q_next (n, C). An increment includes the full turns that the angle makes within the step."""
     change = wrap((q_next - q)[:, definition.angles])
     moved_by = [i for i in definition.moving if definition.coordinates[i].kind == "linear"]
     if not moved_by or len(q) < POINTS_A_WEIGHT * (len(moved_by) + 1):

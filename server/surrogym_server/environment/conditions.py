@@ -28,10 +28,10 @@ class Conditions:
     """Compiled conditions: G groups with K inequalities in total. A group holds if all of its inequalities hold. Each
     inequality is stored as sign * term >= threshold, which is also exact for < and >."""
 
-    terms: TermSet  # the K terms
-    sign: Tensor  # (K,) 1 or -1
-    threshold: Tensor  # (K,) threshold for sign * term
-    membership: Tensor  # (K, G) 1 if the inequality belongs to the group, otherwise 0
+    terms: TermSet  # the left side of each of the K inequalities, a function of the coordinates
+    sign: Tensor  # (K,) 1 for an inequality with > or >=, -1 for one with < or <=
+    threshold: Tensor  # (K,) the inequality holds if sign * term is at least this number
+    membership: Tensor  # (K, G) 1 if the inequality of this row belongs to the group of this column, otherwise 0
 
     @classmethod
     def of(
@@ -50,6 +50,6 @@ class Conditions:
         return to_device(compiled, device)
 
     def __call__(self, q: Tensor) -> Tensor:
-        """Return which groups hold at q (..., C): (..., G) bool."""
+        """Return which of the G groups of inequalities hold at coordinates q (..., C), (..., G) bool."""
         holds = self.sign * self.terms(q) >= self.threshold
         return (~holds).to(self.membership.dtype) @ self.membership == 0

@@ -19,7 +19,7 @@ class QuantityDefinition:
     action u."""
 
     term: TermDefinition
-    action: tuple[float, ...]  # (F,) weight of each action entry
+    action: tuple[float, ...]  # (F,) weight of each action entry in the quantity
 
 
 @dataclass(frozen=True)
@@ -38,16 +38,17 @@ class DeclaredRewardDefinition:
     """Declared reward: the sum of its terms, which depend on the action and on the state before or after the step."""
 
     terms: tuple[RewardTermDefinition, ...]
-    after: bool  # whether the state is the one after the step
-    terminal: float  # added to the reward of a step that ends the episode
-    coordinates: int  # number of coordinates, C
-    device: torch.device = CPU  # device of its tensors
+    after: bool  # whether the reward depends on the state after the step instead of the one before
+    terminal: float  # reward that is added if the step reaches a terminal state
+    coordinates: int  # number of coordinates of a state, C
+    device: torch.device = CPU  # device on which the reward is computed
 
     def __call__(self, q: Tensor, u: Tensor) -> Tensor:
         """Return the reward (m,) of actions u (m, F) in states q (m, C), without the reward ``terminal`` of terminating
         steps. If ``after`` is true, q are the states after the step, otherwise those before it."""
         values, weights, conditions = self._compiled
-        x = values(q) + u @ weights if weights.numel() else values(q)  # without quantities, ``weights`` is empty
+        # ``weights`` is empty if the reward depends on no quantity.
+        x = values(q) + u @ weights if weights.numel() else values(q)
         holds = conditions(q)
         total = q.new_zeros(len(q))
         begin = 0
@@ -59,7 +60,8 @@ class DeclaredRewardDefinition:
 
     @cached
     def _compiled(self) -> tuple[TermSet, Tensor, Conditions]:
-        """Terms and action weights (F, X) of all X quantities, and the conditions of each term."""
+        """Compiled form of the reward: the functions of the coordinates in its X quantities, the action weights (F, X)
+        of these quantities, and the conditions of each reward term."""
         quantities = [quantity for term in self.terms for quantity in term.of]
         weights = torch.tensor([quantity.action for quantity in quantities], dtype=torch.float64)
         terms = compile_terms([quantity.term for quantity in quantities], self.coordinates)

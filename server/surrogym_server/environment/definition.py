@@ -30,8 +30,8 @@ from surrogym_shared.kinds import CoordinateKind, LagKind, RewardTiming
 from surrogym_shared.presets import InputProbability, Moves, Stopping, Tolerance
 
 REWARD = "reward"
-REACH = 1e6  # a coordinate without a bound is clipped this many widths of its sampling range beyond that range
-SCALING_POINTS = 4_096  # number of states from which the scale of the observation is computed
+REACH = 1e6  # a prediction without a bound is clipped at this many widths of the sampling range beyond that range
+SCALING_POINTS = 4_096  # mean and standard deviation of the observation are computed from this many sampled states
 Array = NDArray[np.float64]
 
 
@@ -40,7 +40,7 @@ class LagDefinition:
     """Past value that a coordinate repeats; ``spec.Lag`` explains the kinds."""
 
     kind: LagKind
-    source: int = 0  # index of the coordinate or action entry whose past value is repeated
+    source: int = 0  # index of the coordinate, or of the action entry, whose past value this coordinate repeats
 
 
 @dataclass(frozen=True)
@@ -49,11 +49,11 @@ class CoordinateDefinition:
 
     name: str
     kind: CoordinateKind
-    sampling: Distribution  # distribution from which queries are drawn
-    start: Distribution  # distribution of the first states of episodes
-    low: float = -np.inf  # lower saturation bound
-    high: float = np.inf  # upper saturation bound
-    stops: int | None = None  # index of the coordinate that becomes zero at a bound, such as the speed at a wall
+    sampling: Distribution  # distribution of the coordinate in queries (requested real steps)
+    start: Distribution  # distribution of the coordinate in the first state of an episode
+    low: float = -np.inf  # lower bound, at which the coordinate stays if the dynamics would move it further
+    high: float = np.inf  # upper bound, at which the coordinate stays if the dynamics would move it further
+    stops: int | None = None  # index of another coordinate, which becomes 0 at a bound of this one: speed at a wall
     lag: LagDefinition | None = None
 
     @property
@@ -159,16 +159,19 @@ class EnvironmentDefinition:
     tolerances: tuple[tuple[str, float], ...]
     learning: LearningDefinition
     design: DesignDefinition
-    # Whether termination is learned from samples; then ``termination_groups`` is empty.
+    # Whether a model learns from samples which states are terminal. Then ``termination_groups`` is empty.
     learns_termination: bool = False
     declared_reward: DeclaredRewardDefinition | None = None
-    # Greatest number of actions of a query; None if the environment can be set to any state.
+    # Largest number of actions in a query, which is then a rollout. None if the original environment can be set to any
+    # state, so that a query is a single step.
     max_rollout: int | None = None
     snapshots: bool = False  # whether a query may begin at a snapshot (a saved state) instead of a reset
     # States at which episodes start; if there are none, starts are drawn from the coordinates' distributions ``start``.
     starts: tuple[tuple[float, ...], ...] = ()
-    outside_reward: float | None = None  # reward for each step that an episode misses after it left the sampling range
-    limits: LimitsDefinition | None = None  # limits of the specification, or None
+    # A virtual episode that leaves the sampling range ends, and gets this reward for each step up to the time limit.
+    # None: leaving the range does not end an episode.
+    outside_reward: float | None = None
+    limits: LimitsDefinition | None = None  # declared limits within which the original environment has to stay
     device: torch.device = CPU  # device of the definition's tensors, and of states and actions that are passed to it
 
     def on(self, device: torch.device) -> EnvironmentDefinition:
@@ -182,7 +185,7 @@ class EnvironmentDefinition:
         return tuple(declared.get(name, value) for name, value in zip(self.outputs, defaults, strict=True))
 
     def with_tolerances(self, tolerances: Mapping[str, float]) -> EnvironmentDefinition:
-        """Return the same definition with these tolerances, by name of the output; others stay as declared."""
+        """Return the same definition with ``tolerances``, by output name, set; those of other outputs are kept."""
         return replace(self, tolerances=tuple((dict(self.tolerances) | dict(tolerances)).items()))
 
     @property

@@ -1,6 +1,7 @@
 """One-dimensional distributions of coordinates, represented by their inverse distribution functions.
 
-Every random value is first drawn as a uniform number, so that Latin hypercubes and counter-based noise share one path.
+Every random value is computed from a uniform number, whether this number comes from a Latin hypercube or from the
+random generator of an episode.
 """
 
 from __future__ import annotations

@@ -17,21 +17,21 @@ from surrogym_server.environment.points import Points
 from surrogym_server.tensors import bend
 
 State = Literal["cos_sin", "wrapped", "both", "observation", "none"]
-Encoding = Literal["value", "one_hot", "none"]  # encodings of actions; one_hot is for discrete actions
+Encoding = Literal["value", "one_hot", "none"]  # how an action is encoded as inputs; one_hot only for a discrete one
 Parity = Literal["", "odd", "even"]
-# For each angle, weights (C,) of the coordinates that predict the angle's increment.
+# For each angle, C weights: the sum of the C coordinates times these weights predicts the angle's change in one step.
 Drift = tuple[tuple[float, ...], ...]
 
 
 @dataclass(frozen=True)
 class FeatureMap:
-    """Encoding of coordinates q and action u as inputs of one output's process.
+    """Encoding of coordinates q and action u as the inputs of the Gaussian process of one output.
 
     Attributes:
         state: how angles are encoded: as cos and sin, as the wrapped angle, or both. Or ``observation``: the
-            observation replaces the coordinates, standardised except in preset paper. Or ``none``: no coordinates and
-            no action, only the lead.
-        action: how discrete actions are encoded: as evenly spaced values or one-hot; or no action at all.
+            observation replaces the coordinates, standardised except in preset paper. Or ``none``: neither coordinates
+            nor action are inputs, only the lead.
+        action: how discrete actions are encoded: ``value`` as evenly spaced values, ``one_hot``, or ``none``.
         lead: whether the lead is an input too: the predicted next value of each leading coordinate (see ``leading``),
             clipped to its limits. With it, an output that depends on a limited speed, such as an angle, has no kink
             where the speed reaches its limit.
@@ -41,8 +41,8 @@ class FeatureMap:
         parity: how the output changes if every coordinate and the action change their sign: it changes its sign too
             (odd), it stays (even), or there is no rule (empty).
         history: only lags that look back at most this many steps are inputs; None: all lags.
-        rates: (d,) rate of each feature that is not dropped. Along a feature with a rate above 0, the output changes
-            faster the larger the feature is (see ``gp.growth``). Empty if no feature has a rate.
+        rates: (d,) rate of each feature that is not dropped. With a rate above 0, the output changes the faster the
+            larger the feature is (see ``gp.growth``). Empty if no feature has a rate.
         dropped: indices of the features that the output does not read, among all features of the map, ascending.
     """
 
@@ -64,10 +64,10 @@ class FeatureMap:
 
 
 def leading(definition: EnvironmentDefinition) -> tuple[int, ...]:
-    """Return the indices of the coordinates that have two finite limits at which no other coordinate is stopped, such
-    as a limited speed.
+    """Return the indices of the leading coordinates: those with two finite bounds at which no other coordinate becomes
+    0, such as a limited speed.
 
-    They are predicted first, because their next value can be an input of other outputs.
+    Models predict leading coordinates first, because their next value can be an input of other outputs.
     """
     return tuple(
         i
@@ -77,21 +77,24 @@ def leading(definition: EnvironmentDefinition) -> tuple[int, ...]:
 
 
 class Feature(NamedTuple):
-    """One input of a process: a function of one entry of coordinates and action [q, u], of one leading coordinate's
-    next value, or of a weighted sum of coordinates; or an observation entry."""
+    """One input of a Gaussian process: ``function`` of one entry of coordinates and action [q, u], of the next value of
+    one leading coordinate (see ``leading``), or of a weighted sum of coordinates; or one observation entry."""
 
     function: Literal[
         "affine", "cos", "sin", "turned_cos", "turned_sin", "wrapped", "equal", "observed", "lead", "grown"
     ]
     entry: int
-    centre: float = 0.0  # for "equal": the value with which the entry is compared
+    centre: float = 0.0  # subtracted from the entry; for function "equal", the value with which the entry is compared
     scale: float = 1.0
-    weights: tuple[float, ...] = ()  # (C,) for "turned_cos" and "turned_sin"
-    rate: float = 0.0  # for "grown"
+    weights: tuple[
+        float, ...
+    ] = ()  # (C,) weights of coordinates in an angle after the step: "turned_cos", "turned_sin"
+    rate: float = 0.0  # for function "grown", the rate of the exponential transformation ``bend``
 
 
 def feature_names(definition: EnvironmentDefinition, feature_map: FeatureMap) -> list[str]:
-    """Return the name of the quantity that each feature of a map is a function of, in the map's order, for display."""
+    """Return a name for each feature of a feature map, in order, for display: the name of a coordinate, action entry or
+    observation entry, if needed with its function."""
     entries = (*definition.coordinate_names, *(f"action {place}" for place in range(definition.action.size)))
     names = []
     for function, entry, centre, *_ in features(definition, feature_map):
@@ -109,7 +112,7 @@ def feature_names(definition: EnvironmentDefinition, feature_map: FeatureMap) ->
 
 
 def features(definition: EnvironmentDefinition, feature_map: FeatureMap) -> tuple[Feature, ...]:
-    """Return the features of a map, in order."""
+    """Return the features that a feature map describes, in order: coordinates, action, lead; without dropped ones."""
     result = [] if feature_map.state == "none" else _of_point(definition, feature_map)
     if feature_map.lead:
         result += [
@@ -124,7 +127,8 @@ def features(definition: EnvironmentDefinition, feature_map: FeatureMap) -> tupl
 
 
 def distances(definition: EnvironmentDefinition, a: Points, b: Points) -> Tensor:
-    """Return the distances of m points a and n points b, in standard deviations of the sampling range, (m, n)."""
+    """Return the Euclidean distances (m, n) of m points ``a`` and n points ``b``, with each coordinate and action entry
+    divided by its standard deviation over the sampling range."""
     plain = FeatureMap()
     return torch.cdist(encode(definition, plain, a.q, a.u), encode(definition, plain, b.q, b.u))
 
@@ -132,9 +136,9 @@ def distances(definition: EnvironmentDefinition, a: Points, b: Points) -> Tensor
 def encode(
     definition: EnvironmentDefinition, feature_map: FeatureMap, q: Tensor, u: Tensor, lead: Tensor | None = None
 ) -> Tensor:
-    """Return the features (..., d) of coordinates q (..., C) and actions u (..., F).
+    """Return the d features of a feature map, (..., d), for coordinates q (..., C) and actions u (..., F).
 
-    ``lead`` (..., L) is the next value of the leading coordinates, needed if the map reads it.
+    ``lead`` (..., L) are the next values of the L leading coordinates (see ``leading``), needed if the map reads them.
     """
     encoder = Encoder.of(definition, (feature_map,))
     x = encoder(q, u)
@@ -150,8 +154,8 @@ class Encoder:
     contain only once, and all features with the same function, such as cos, together."""
 
     definition: EnvironmentDefinition
-    # Features grouped by function: name of the function, then entries (or weights), centres, scales and rates of the
-    # features.
+    # One tuple for all features with the same function, such as cos: the function's name, the indices of the entries
+    # that these features read (or weights of coordinates), then their centres, scales and rates.
     groups: tuple[tuple[str, slice | Tensor, Tensor, Tensor, Tensor], ...]
     columns: Mapping[Feature, int]
 
@@ -168,7 +172,7 @@ class Encoder:
         return cls(definition, groups, {feature: column for column, feature in enumerate(ordered)})
 
     def inputs(self, feature_map: FeatureMap) -> tuple[int, ...]:
-        """Return the columns of a map's features in the encoder's result, in the map's order."""
+        """Return in which columns of the encoder's result the features of one feature map are, in the map's order."""
         return tuple(self.columns[feature] for feature in features(self.definition, feature_map))
 
     def width(self, lead: bool) -> int:
@@ -217,7 +221,8 @@ class Encoder:
 
 
 def _of_point(definition: EnvironmentDefinition, feature_map: FeatureMap) -> list[Feature]:
-    """Return the features of coordinates and action that a map reads, without those of the lead."""
+    """Return the features of coordinates and action in a feature map, without those of the lead (next values of leading
+    coordinates), and before any is dropped."""
     result: list[Feature] = []
     if feature_map.state == "observation":
         result += _of_observation(definition)
@@ -233,7 +238,8 @@ def _of_point(definition: EnvironmentDefinition, feature_map: FeatureMap) -> lis
 
 
 def _read(definition: EnvironmentDefinition, feature_map: FeatureMap) -> Iterator[int]:
-    """Yield the indices of the coordinates that a map reads."""
+    """Yield the indices of the coordinates that are inputs in a feature map: not the counter of steps, and no lag that
+    looks back further than the map's ``history``."""
     for index, age in enumerate(definition.ages):
         if index != definition.counter and (feature_map.history is None or age <= feature_map.history):
             yield index
@@ -266,8 +272,8 @@ def _of_action(definition: EnvironmentDefinition, feature_map: FeatureMap, entry
 
 
 def _group(same: tuple[Feature, ...], device: torch.device) -> tuple[slice | Tensor, Tensor, Tensor, Tensor]:
-    """Return the parameters of features that all have the same function, such as cos: the entries that they read (a
-    slice if these are neighbours) or weights (C, k); then centres, scales and rates."""
+    """Return the parameters of k features with the same function, such as cos: the indices of the entries that they
+    read (a slice if the indices are consecutive) or weights (C, k); then centres, scales and rates, (k,) each."""
     numbers = torch.tensor([(f.centre, f.scale, f.rate) for f in same], dtype=torch.float64, device=device)
     centre, scale, rate = numbers.T
     if same[0].weights:

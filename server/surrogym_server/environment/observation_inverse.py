@@ -1,7 +1,7 @@
 """Inverse of the observation: coordinates read back from it, for models whose outputs move the observation.
 
-An angle needs both its cosine and its sine among the entries. Their mean leaves the circle, but the angle is still
-defined. A linear coordinate needs an entry that is the coordinate itself.
+An angle needs both its cosine and its sine among the entries. A predicted pair need not lie on the unit circle, but it
+still has an angle. A linear coordinate needs an entry that is the coordinate itself.
 """
 
 from __future__ import annotations
@@ -20,17 +20,18 @@ from surrogym_server.errors import InvalidSpec
 class ObservationInverse:
     """Where each moving coordinate is found in an observation: the indices (value,) or (cos, sin) of its entries."""
 
-    sources: tuple[tuple[int, tuple[int, ...]], ...]  # pairs: index of the coordinate, indices of its entries
+    # For each moving coordinate: its index, and the indices of the observation entries from which it is computed.
+    sources: tuple[tuple[int, tuple[int, ...]], ...]
 
     @classmethod
     def of(cls, definition: EnvironmentDefinition) -> ObservationInverse:
-        """Find the entries of each moving coordinate. Raises ``InvalidSpec`` if the observation does not determine a
-        moving coordinate."""
+        """Find the observation entries from which each moving coordinate can be computed. Raises ``InvalidSpec`` if
+        there are none for a moving coordinate."""
         return cls(tuple((i, _source(definition, i)) for i in definition.moving))
 
     def __call__(self, o: Tensor, q: Tensor) -> Tensor:
-        """Return the coordinates (m, C) of observations o (m, D). Coordinates that don't move are taken from q (m,
-        C)."""
+        """Return the coordinates (m, C) of m states, computed from their observations o (m, D). Coordinates that the
+        dynamics don't move are copied from q (m, C)."""
         recovered = q.clone()
         for index, entries in self.sources:
             if len(entries) == 2:
@@ -50,14 +51,15 @@ def _source(definition: EnvironmentDefinition, index: int) -> tuple[int, ...]:
     if coordinate.kind == "angle" and cosine is not None and sine is not None:
         return (cosine, sine)
     raise InvalidSpec(
-        f"preset 'paper' moves the observation, and coordinate {coordinate.name!r} can't be read back from it: "
-        "expected an entry that is the coordinate, or for an angle both its cos and its sin; use preset 'default'"
+        f"preset 'paper' predicts observations, but coordinate {coordinate.name!r} can't be computed from one: "
+        "expected an observation entry that is the coordinate, or for an angle entries that are its cos and its sin; "
+        "add them, or use preset 'default'"
     )
 
 
 def _entry(definition: EnvironmentDefinition, part: PartDefinition, low: float, high: float) -> int | None:
-    """Return the index of the observation entry that consists of this part alone and is not clipped within [low, high];
-    None if there is no such entry."""
+    """Return the index of the observation entry that equals ``part`` alone and is not clipped within [low, high]; None
+    if there is no such entry."""
     for position, term in enumerate(definition.observation_terms):
         if term.parts == (part,) and term.low <= low and term.high >= high:
             return position

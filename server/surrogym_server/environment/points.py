@@ -16,8 +16,8 @@ from surrogym_shared.nouns import Query
 class Points:
     """m states, each with an action."""
 
-    q: Tensor  # (m, C) coordinates
-    u: Tensor  # (m, F) actions
+    q: Tensor  # (m, C) coordinates of m states
+    u: Tensor  # (m, F) the action in each of m states
 
     def __len__(self) -> int:
         return len(self.q)

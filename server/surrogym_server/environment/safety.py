@@ -14,8 +14,8 @@ from surrogym_server.tensors import CPU, to_device
 
 @dataclass(frozen=True)
 class LimitDefinition:
-    """Declared limit: the range [low, high] in which a term has to stay. At a distance below ``margin`` from an end,
-    the declared fallback action takes over."""
+    """Declared limit: the range [low, high] in which a term, a function of the coordinates, has to stay. If the term is
+    closer than ``margin`` to an end, the declared fallback action takes over."""
 
     term: TermDefinition
     low: float
@@ -36,9 +36,9 @@ class Limits:
     """L limits, compiled to tensors that evaluate them for many states at once."""
 
     terms: TermSet
-    low: Tensor  # (L,) lower end of each limit
-    high: Tensor  # (L,) upper end of each limit
-    margin: Tensor  # (L,) margin of each limit, in the unit of its term
+    low: Tensor  # (L,) lower end of the range in which each of L terms has to stay
+    high: Tensor  # (L,) upper end of the range in which each of L terms has to stay
+    margin: Tensor  # (L,) a declared fallback action takes over if a term is closer than this to an end of its range
 
     @classmethod
     def of(cls, declared: LimitsDefinition, coordinates: int, device: torch.device = CPU) -> Limits:

@@ -18,11 +18,11 @@ from surrogym_shared.nouns import RealSteps
 class Samples:
     """n steps of the original environment, as float64 tensors."""
 
-    q: Tensor  # (n, C) coordinates before the step
-    u: Tensor  # (n, F) actions
-    q_next: Tensor  # (n, C) coordinates after the step
-    reward: Tensor  # (n,) reward of the step
-    terminated: Tensor  # (n,) bool: whether the step ended the episode
+    q: Tensor  # (n, C) coordinates before each of n steps
+    u: Tensor  # (n, F) action of each of n steps
+    q_next: Tensor  # (n, C) coordinates after each of n steps
+    reward: Tensor  # (n,) reward of each step
+    terminated: Tensor  # (n,) bool: whether the step reached a terminal state
 
     def __len__(self) -> int:
         return len(self.q)
@@ -39,7 +39,7 @@ class Samples:
 
     @property
     def digest(self) -> str:
-        """Hash of the data, byte for byte. Two models with equal digests were learned from the same samples."""
+        """SHA-256 hash of all arrays. Equal digests mean that the samples are equal, byte for byte."""
         sha = hashlib.sha256()
         for tensor in (self.q, self.u, self.q_next, self.reward, self.terminated):
             sha.update(tensor.cpu().contiguous().numpy().tobytes())
@@ -47,9 +47,8 @@ class Samples:
 
 
 def increments(definition: EnvironmentDefinition, samples: Samples) -> Tensor:
-    """Return the targets of the transition outputs, (n, M). They are the changes of the moving coordinates, with the
-    full turns of angles. If the definition says that the model moves the observation, they are the changes of the
-    observation."""
+    """Return the changes in n steps that a model learns to predict: those of the M moving coordinates, (n, M), with the
+    full turns of angles. If the model predicts observations (preset ``paper``), those of the D entries, (n, D)."""
     if definition.moves_observation:
         return definition.observe(samples.q_next) - definition.observe(samples.q)
     change = samples.q_next - samples.q
@@ -58,10 +57,10 @@ def increments(definition: EnvironmentDefinition, samples: Samples) -> Tensor:
 
 
 def preceding(definition: EnvironmentDefinition, samples: Samples) -> Tensor:
-    """Return for each sample the row of the sample that is the step before it, (n,); -1 if there is none.
+    """Return for each of n samples the row of the sample that is the step before it, (n,); -1 if there is none.
 
-    That is the previous row, if it did not end an episode and if its next coordinates equal the coordinates of the
-    sample.
+    This is the previous row, if its step did not terminate and the sample begins at the moving coordinates at which
+    the step ended.
     """
     columns = list(definition.moving)
     follows = torch.full((len(samples),), -1)
@@ -71,14 +70,14 @@ def preceding(definition: EnvironmentDefinition, samples: Samples) -> Tensor:
 
 
 def saturated(definition: EnvironmentDefinition, q_next: Tensor) -> Tensor:
-    """Return which samples that ended at q_next (n, C) reached a declared bound of any coordinate, (n,) bool. A bound
-    cuts the increments off."""
+    """Return which of n steps, which ended at q_next (n, C), reached a declared bound of any coordinate, (n,) bool. The
+    change in such a step is shorter than the dynamics alone would give."""
     return (limit_sides(definition, q_next) != 0).any(-1)
 
 
 def limit_sides(definition: EnvironmentDefinition, q_next: Tensor) -> Tensor:
-    """Return 1 where a coordinate of q_next (n, C) is at its upper bound, -1 at its lower bound, otherwise 0: (n,
-    C)."""
+    """Return for each coordinate of n states q_next (n, C) 1 at its upper bound, -1 at its lower bound, otherwise 0,
+    (n, C)."""
     low, high = definition.bounds
     slack = 1e-9 * torch.where(torch.isfinite(high - low), high - low, 1.0)
     return (q_next >= high - slack).to(q_next.dtype) - (q_next <= low + slack).to(q_next.dtype)

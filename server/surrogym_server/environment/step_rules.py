@@ -15,14 +15,15 @@ def paid(terminal_reward: float, reward: Tensor, terminated: Tensor) -> Tensor:
 
 
 def clip(definition: EnvironmentDefinition, q: Tensor) -> Tensor:
-    """Clip coordinates q (..., C) to their saturation bounds, or to the definition's ``reach`` where there is none."""
+    """Return coordinates q (..., C), clipped to their declared bounds, or to ``EnvironmentDefinition.reach`` on a side
+    without a bound."""
     low, high = definition.reach
     return torch.clamp(q, low, high)
 
 
 def settle(definition: EnvironmentDefinition, q: Tensor) -> Tensor:
-    """Apply the rules of the environment to coordinates q (..., C): clip them to bounds, set a speed that points into a
-    wall to 0, wrap angles."""
+    """Return coordinates q (..., C) with the rules of the environment applied: they are clipped to bounds, a speed that
+    points into a wall becomes 0, and angles are wrapped."""
     inside = clip(definition, q)
     for index, coordinate in enumerate(definition.coordinates):
         if coordinate.stops is not None:
@@ -61,8 +62,8 @@ def moved(
 
 
 def with_lags(definition: EnvironmentDefinition, q: Tensor, u: Tensor, q_next: Tensor) -> Tensor:
-    """Set the lags among the next coordinates q_next (m, C) of a step from q (m, C) under u (m, F). A lag is a
-    coordinate that repeats a past value."""
+    """Return the next coordinates q_next (m, C) of m steps from q (m, C) under actions u (m, F), with lags set. A lag
+    is a coordinate that repeats a past value."""
     if not definition.lags:
         return q_next
     repeated = [_repeated(definition, index, q, u, q_next) for index in definition.lags]
@@ -70,8 +71,7 @@ def with_lags(definition: EnvironmentDefinition, q: Tensor, u: Tensor, q_next: T
 
 
 def _repeated(definition: EnvironmentDefinition, index: int, q: Tensor, u: Tensor, q_next: Tensor) -> Tensor:
-    """Return the value (m,) after the step of the lag (a coordinate that repeats a past value) with coordinate index
-    ``index``."""
+    """Return the value of the coordinate ``index``, which is a lag (it repeats a past value), after m steps, (m,)."""
     lag = definition.coordinates[index].lag
     assert lag is not None
     match lag.kind:

@@ -35,11 +35,11 @@ class TermDefinition:
 class TermSet:
     """T compiled terms over q (..., C): value = constant + [q, sin(q W), cos(q W)] A, clipped."""
 
-    constant: Tensor  # (T,) constant of each term
-    frequencies: Tensor  # W (C, P), weights of the coordinates in each sine and cosine
-    coefficients: Tensor  # A^T (T, C + 2 P), coefficients of coordinates, sines and cosines
-    low: Tensor | None  # (T,) lower limits; None if no term is clipped
-    high: Tensor | None  # (T,) upper limits
+    constant: Tensor  # (T,) constant part of each of the T terms
+    frequencies: Tensor  # W (C, P): weights of the C coordinates in the argument of each of P sines and P cosines
+    coefficients: Tensor  # A^T (T, C + 2 P): coefficients of the C coordinates, P sines and P cosines in each term
+    low: Tensor | None  # (T,) each term is raised to this value if it is below; None if no term is clipped
+    high: Tensor | None  # (T,) each term is lowered to this value if it is above; None if no term is clipped
 
     def __call__(self, q: Tensor) -> Tensor:
         """Return the values of all terms at q (..., C), shape (..., T)."""
@@ -52,7 +52,8 @@ class TermSet:
 
 
 def compile_terms(terms: Sequence[TermDefinition], coordinates: int) -> TermSet:
-    """Compile terms over C coordinates. Each distinct frequency is computed once."""
+    """Compile terms, functions of C coordinates, to a ``TermSet``. If several sines and cosines have the same argument,
+    the argument is computed once."""
     frequencies = sorted({p.weights for t in terms for p in t.parts if p.function in ("sin", "cos")})
     first = {"sin": coordinates, "cos": coordinates + len(frequencies)}
     constant = torch.zeros(len(terms), dtype=torch.float64)

@@ -112,7 +112,9 @@ def check_points(definition: EnvironmentDefinition, q: Array, u: Array) -> tuple
     """
     q = check_coordinates(definition, "coordinates", q)
     if len(q) != len(u):
-        raise InvalidInput(f"expected as many actions as coordinates, got {len(u)} actions and {len(q)} coordinates")
+        raise InvalidInput(
+            f"expected one action for each row of coordinates, got {len(u)} actions and {len(q)} rows of coordinates"
+        )
     return q, model_actions(definition.action, u)
 
 

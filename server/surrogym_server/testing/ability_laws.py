@@ -25,7 +25,8 @@ DRAWS = 400
 
 
 def _draws(case: ModelCase) -> list[FunctionDraws]:
-    """Return the model's samplers of functions: with optimal hyperparameters, and with sampled ones, if it has them."""
+    """Return the objects that sample functions from the model's posterior: one with optimal and one with sampled
+    hyperparameters. Each is left out if the model family lacks this ability."""
     plain, uncertain = offers(case.model, FunctionDraws), offers(case.model, UncertainHyperparameters)
     found = [] if plain is None else [plain]
     return found if uncertain is None else [*found, uncertain.uncertain_functions]
@@ -56,8 +57,8 @@ def drawn_functions_scatter_as_the_stds_say(case: ModelCase) -> None:
 
 
 def a_drawn_function_may_have_columns_beyond_its_own(case: ModelCase) -> None:
-    """Check that additional columns of a function's weights are ignored. A session has them if its lanes follow models
-    of different sizes."""
+    """Check that columns beyond ``path_size`` are ignored in the weights of a sampled function. A session has such
+    columns if its lanes follow models of different sizes."""
     for able in _draws(case):
         paths = able.draw(case.noise(2, able.path_size))
         wider = torch.cat([paths, torch.zeros(2, 3, dtype=torch.float64)], 1)
@@ -141,7 +142,7 @@ def doubts_about_edges_are_probabilities_of_error(case: ModelCase) -> None:
 
 
 def _paths(case: ModelCase, points: Points) -> PredictedSteps:
-    """Return three predicted paths of four steps each, from twelve points."""
+    """Return three paths of four steps each, made from twelve points and the model's predictions at them."""
     q_next = case.model.transition(points.q, points.u).q_next
     return PredictedSteps(*(tensor.reshape(3, 4, -1) for tensor in (points.q, points.u, q_next)))
 

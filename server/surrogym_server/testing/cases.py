@@ -67,7 +67,7 @@ class ModelCase:
 
     name: str
     definition: EnvironmentDefinition
-    count: int = SAMPLES  # number of samples to learn from
+    count: int = SAMPLES  # number of real steps from which the model learns
 
     def __str__(self) -> str:
         return self.name
@@ -99,14 +99,15 @@ class ModelCase:
         return Points(self.unseen.q, self.unseen.u)
 
     def noise(self, *shape: int) -> torch.Tensor:
-        """Return standard normal random numbers of this shape, the same at each call."""
+        """Return standard normal random numbers of the given shape. Each call with the same shape returns the same."""
         return torch.randn(*shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
 
 
 def model_cases(
     family: str, settings: Mapping[str, float | bool | str] | None = None, samples: int = SAMPLES
 ) -> tuple[ModelCase, ...]:
-    """Return test cases for a model family with these settings: one environment each, with ``samples`` real steps."""
+    """Return test cases for a model family with these settings: one for each of several environments, in each of which
+    the model learns from ``samples`` real steps."""
     design = {"model": {"name": family, "settings": dict(settings or {})}, "monte_carlo": 64, "initial": SAMPLES}
     return tuple(
         ModelCase(
@@ -122,8 +123,8 @@ def close(one: torch.Tensor, other: torch.Tensor) -> bool:
 
 
 def _real_steps(case: ModelCase, count: int, seed: int) -> Samples:
-    """Return steps of a pendulum from random states and actions. The action pushes the pendulum, and the reward depends
-    on its angle and the push."""
+    """Return ``count`` steps of a pendulum from random states under random actions, which push the pendulum. The reward
+    is the declared one, or else depends on the angle and the push."""
     q, u = random_points(case.definition, count, np.random.default_rng(seed))
     angle, speed = q[:, 0], q[:, 1]
     push = u[:, 0] - 1 if case.definition.action.nvec else u[:, 0]

@@ -26,15 +26,15 @@ class ComputeCase:
     """A test case of a ``Compute``.
 
     ``make`` creates the ``Compute`` from the function that computes a job; child processes import this function by its
-    name. ``job`` is a job of a real design.
+    name. ``job`` is the input of one round of a design, with enough samples to fit a model.
     """
 
     make: Callable[[Function], Compute]
     job: DesignJob
-    folder: Path  # an empty folder to which jobs can write
+    folder: Path  # an empty folder in which test jobs can create files
 
     def asked(self, **state: Any) -> DesignJob:
-        """Return a job with this state, for the functions of this file, which read nothing else of a job."""
+        """Return the case's job with ``state`` as its design state. Test functions read their arguments from there."""
         return replace(self.job, state=state)
 
 
@@ -128,7 +128,7 @@ async def _gone(process: int) -> None:
 
 
 def _where(job: DesignJob) -> DesignResult:
-    """Return a result without computing anything. Its data hash is the number of the process."""
+    """Return an empty result at once, with the number of the process that ran the job in place of a hash of samples."""
     del job
     return DesignResult(b"", {}, {"samples": 0}, str(os.getpid()), {}, "ready", 0.0)
 
@@ -149,7 +149,7 @@ def _meet(job: DesignJob) -> DesignResult:
     deadline = time.monotonic() + MEETING_SECONDS
     while not Path(job.state["other"]).exists():
         if time.monotonic() > deadline:
-            raise TimeoutError("the other job did not come")
+            raise TimeoutError(f"expected another job to run at the same time within {MEETING_SECONDS} s, none did")
         time.sleep(0.01)
     return _where(job)
 

@@ -46,13 +46,13 @@ class EngineCase:
     def asked(
         self, *, key: str | None = None, seed: int | None = SEED, occupancy: bool = False, **settings: Any
     ) -> Open:
-        """Return a request to open a session of the surrogate with these settings."""
+        """Return a request to open a session of the surrogate. ``settings`` are fields of ``VirtualSettings``."""
         chosen: dict[str, Any] = {"num_envs": LANES, "autoreset_mode": "same_step", "time_limit": 5} | settings
         opening = Opening(VirtualSettings(**chosen), None, seed, "latest", occupancy, key)
         return Open(self.surrogate, self.surrogate_id, self.definition, opening)
 
     async def opened(self, **options: Any) -> str:
-        """Open a session, reset it, and return its id."""
+        """Open a session with the ``options`` of ``asked``, reset it, and return its id."""
         session = (await self.engine.open(self.asked(**options))).id
         await self.engine.advance(Reset(session, 1))
         return session

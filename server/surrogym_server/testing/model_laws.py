@@ -27,7 +27,9 @@ from surrogym_server.testing.cases import ModelCase, close
 from surrogym_server.virtual import VirtualSettings, create, reset, step
 from surrogym_shared.kinds import Variant
 
-GUESS = 0.5  # largest error of a model that has learned, as a share of the targets' standard deviation
+# A model passes as learned if its root mean square error is below this share of the standard deviation of the changes
+# that it predicts.
+GUESS = 0.5
 RESERVED = "samples."
 NONSENSE: tuple[Any, ...] = ("nonsense", [], None, math.inf)
 
@@ -174,8 +176,8 @@ def stored_arrays_are_float64_and_keep_off_reserved_names(case: ModelCase) -> No
 
 
 def a_damaged_file_is_refused_in_words(case: ModelCase) -> None:
-    """Check that a damaged model file raises ``InvalidInput``. The checksum is removed, so that the codec has to detect
-    the damage."""
+    """Check that a damaged model file raises ``InvalidInput``. The checksum is removed from the file, so that the code
+    of the model family that reads it has to detect the damage."""
     data = to_bytes(case.model)
     header = json.loads(json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])["__metadata__"][METADATA])
     del header["checksum"]

@@ -16,21 +16,24 @@ from surrogym_server.models.guard import require_shapes
 from surrogym_server.models.port import DynamicsModel, Transition
 from surrogym_shared.kinds import Weighting
 
-# Share of the reward's variance over the samples that is added to a particle's, so that weights stay finite.
+# Particles are weighted by 1 / (variance of the particle's reward). This share of the reward's variance over the
+# samples is added to each variance, so that no weight is infinite.
 WEIGHT_FLOOR = 1e-12
-LEAST_VARIANCE = 1e-290  # lower limit of a particle's reward variance, which may otherwise be 0
+LEAST_VARIANCE = (
+    1e-290  # a particle's reward variance is raised to this value if it is below, since weights divide by it
+)
 
 
 @dataclass(frozen=True)
 class Moved:
     """Prediction of one step of N lanes (parallel environments)."""
 
-    q: Tensor  # (N, C) state after the step
-    particles: Tensor  # (N, P, C) particles after the step; P is 0 except in variant probabilistic
-    reward_mean: Tensor  # (N,) reward without the penalty for uncertainty
-    reward: Tensor  # (N,) penalised reward, eq. 14
-    terminated: Tensor  # (N,) bool: whether the step ends the episode
-    std: Tensor | None  # (N, O) standard deviation of each output, if needed
+    q: Tensor  # (N, C) coordinates of each lane after the step
+    particles: Tensor  # (N, P, C) coordinates of each lane's P particles after the step; P is 0 in variants without any
+    reward_mean: Tensor  # (N,) reward of each lane, without the penalty for uncertainty
+    reward: Tensor  # (N,) reward of each lane, less the penalty for uncertainty (eq. 14)
+    terminated: Tensor  # (N,) bool: whether the step reached a terminal state
+    std: Tensor | None  # (N, O) predicted standard deviation of each of the O outputs; None if no caller needs it
 
 
 def move_mean(
@@ -133,7 +136,8 @@ def _compiled_transition(
     stds: bool,
     reward_std: bool,
 ) -> Transition:
-    """Predict as ``DynamicsModel.transition`` does, in compiled code."""
+    """Predict one step with a model's compiled code, with the arguments and the result of
+    ``DynamicsModel.transition``."""
     shaken, shaped = (None if n is None else n.contiguous().numpy() for n in (noise, process))
     moved = steps(
         q.contiguous().numpy(),
@@ -150,7 +154,7 @@ def _compiled_transition(
 
 def penalised(reward: Tensor, penalty: float, std: Tensor) -> Tensor:
     """Return rewards (m,) less ``penalty`` times their standard deviations (m,), eq. 14."""
-    return reward - penalty * std  # eq. 14
+    return reward - penalty * std
 
 
 def mean_state(definition: EnvironmentDefinition, particles: Tensor) -> Tensor:
@@ -164,10 +168,11 @@ def mean_state(definition: EnvironmentDefinition, particles: Tensor) -> Tensor:
 
 
 def _weights(spread: Tensor, scale: Tensor, weighting: Weighting) -> Tensor:
-    """Return weights (N, P) of particles whose rewards have the standard deviations ``spread`` (N, P). The weights of a
-    lane add up to 1.
+    """Return weights (N, P) of the P particles of each of N lanes: equal ones for ``uniform``, else proportional to
+    1 / ``spread`` ** 2. The weights of a lane add up to 1.
 
-    ``scale`` is the standard deviation of the reward over the samples.
+    ``spread`` (N, P) has the standard deviation of each particle's reward, and ``scale`` is that of the reward over
+    the samples.
     """
     if weighting == "uniform":
         return torch.full_like(spread, 1 / spread.shape[1])

@@ -37,26 +37,27 @@ class VirtualSettings:
     variant: Variant = "deterministic"
     autoreset_mode: AutoresetMode = "next_step"
     time_limit: int | None = None
-    # Number of standard deviations of the reward that are subtracted from each reward, k of eq. 14.
+    # Each reward is reduced by this multiple of its predicted standard deviation (k of eq. 14).
     penalty: float = 0.0
-    start_box: float = 0.0  # share of episodes that start anywhere in the sampling range
-    start_visited: float = 0.0  # share of episodes that start at one of the states ``visited``
+    start_box: float = 0.0  # share of the episodes that start at a random state of the sampling range
+    start_visited: float = 0.0  # share of the episodes that start at a state of a real step, see ``visited``
     particles: int = 1_000
     propagation: Propagation = "sample"
     weighting: Weighting = "inverse_variance"
-    spread: float = 0.01  # initial standard deviation of particles, as a share of each coordinate's range
-    # Number of sampled functions that the lanes of variant pathwise share; None: one for each episode of a lane.
+    spread: float = 0.01  # standard deviation of the particles at the start, as a share of each coordinate's range
+    # In variant pathwise, episodes follow functions sampled from the posterior. This is the number of functions that
+    # the lanes share. If it is None, each episode follows a function of its own.
     functions: int | None = None
-    residual: Residual | None = None  # systematic errors of the model that are added to each prediction; None for none
-    process_noise: bool = False  # whether the learned noise (w of eq. 2) changes the state
-    sensor_noise: SensorNoise = ()  # measurement noise of observed coordinates, which does not change the state
-    reward_limits: tuple[float, float] | None = None  # limits of mean rewards, or None for none
-    # An episode is truncated if an output's predicted standard deviation exceeds this multiple of that over the
-    # samples.
+    residual: Residual | None = None  # systematic errors that are added to each prediction; None adds nothing
+    process_noise: bool = False  # whether random noise of the learned size (w of eq. 2) is added to each next state
+    sensor_noise: SensorNoise = ()  # measurement noise added to observed coordinates; it does not change the state
+    reward_limits: tuple[float, float] | None = None  # lowest and highest mean reward of a step; None: no limits
+    # An episode is truncated if the predicted standard deviation of any output exceeds this multiple of the output's
+    # standard deviation over the samples. None: no episode is truncated for this reason.
     trust: float | None = None
-    caution: float = 0.0  # factor of the doubt about a step that is subtracted from its reward, see ``_doubted``
+    caution: float = 0.0  # each reward is reduced by this multiple of the doubt about the step, see ``_doubted``
     compiled: bool = False  # whether steps use the model's compiled code; decided when the session opens
-    # (k, C) states of real steps, at which episodes can start.
+    # (k, C) the coordinates of k real steps; the share ``start_visited`` of the episodes starts at one of these states.
     visited: Tensor | None = field(default=None, compare=False, repr=False)
 
     @property
@@ -70,25 +71,28 @@ class LaneTransition:
     """Results of one step of N lanes (parallel environments), as NumPy arrays. Lanes that are not stepped have reward
     0, and all their flags are false."""
 
-    observation: Floats  # (N, D) float32; in lanes that were reset, the first observation of the new episode
+    observation: Floats  # (N, D) float32, observation of each lane; if the lane was reset, that of the new episode
     reward: Floats  # (N,) reward less the penalties for uncertainty
     terminated: Bools  # (N,) lanes whose episode ended in a terminal state
-    truncated: Bools  # (N,) lanes whose episode ended by the time limit or by leaving the trusted range
-    # (K,) indices of the lanes whose episode ended and that were reset in the same step (autoreset mode same_step
-    # only).
+    truncated: Bools  # (N,) lanes whose episode ended by the time limit, or because the model is too uncertain there
+    # (K,) indices of the K lanes whose episode ended and that were reset in the same step. K is 0 except in autoreset
+    # mode same_step.
     final_lanes: Ints
-    final_observation: Floats  # (K, D) float32, last observations of these lanes' episodes
+    final_observation: Floats  # (K, D) float32, last observation of the ended episode of each lane in ``final_lanes``
     reset_lanes: Bools  # (N,) lanes in which a new episode began
     reward_mean: Floats  # (N,) reward without the penalties for uncertainty
-    std: Floats | None  # (N, O) standard deviation of each output, if requested
-    # (N,) lanes that were truncated because they left the trusted range; None if ``trust`` is None.
+    std: Floats | None  # (N, O) predicted standard deviation of each of the O outputs; None if not requested
+    # (N,) lanes that were truncated because a predicted standard deviation exceeded the limit ``trust``; None if
+    # ``trust`` is None.
     untrusted: Bools | None
-    left: Bools | None = None  # (N,) lanes whose episode ended with the outside reward; None if no episode can end so
+    # (N,) lanes whose episode ended early with the outside reward; None if neither an outside reward nor limits are
+    # declared.
+    left: Bools | None = None
 
 
 def expected_bytes(definition: EnvironmentDefinition, settings: VirtualSettings, path_size: int) -> int:
-    """Return the approximate memory that a session's lanes need, in bytes: for coordinates, for particles, and for the
-    ``path_size`` weights of the sampled function that each lane follows."""
+    """Return the approximate memory in bytes that the lanes of a session need: for coordinates, for particles (variant
+    probabilistic), and for sampled functions of ``path_size`` weights, one for each lane (variant pathwise)."""
     particles = settings.particles if settings.variant == "probabilistic" else 0
     path = path_size if settings.variant == "pathwise" else 0
     return 8 * settings.num_envs * (len(definition.coordinates) * (1 + particles) + path)
@@ -135,7 +139,7 @@ def reset(
     return lanes, _observe(definition, settings, lanes)
 
 
-@torch.inference_mode()  # without records for gradients a step takes a sixth less time
+@torch.inference_mode()  # autograd records nothing, which makes a step a sixth faster
 def step(
     model: DynamicsModel,
     settings: VirtualSettings,
@@ -273,8 +277,8 @@ def _doubted(model: DynamicsModel, settings: VirtualSettings, moved: Moved) -> M
 
 
 def _untrusted(model: DynamicsModel, settings: VirtualSettings, moved: Moved) -> Tensor | None:
-    """Return which lanes left the trusted range, (N,) bool. A lane has left it if the predicted standard deviation of
-    any output is above ``trust`` times the output's standard deviation over the samples. None if ``trust`` is None."""
+    """Return in which of N lanes the model is too uncertain, (N,) bool: the predicted standard deviation of any output
+    is above ``trust`` times the output's standard deviation over the samples. Return None if ``trust`` is None."""
     if settings.trust is None:
         return None
     assert moved.std is not None
@@ -282,9 +286,12 @@ def _untrusted(model: DynamicsModel, settings: VirtualSettings, moved: Moved) ->
 
 
 def _left(definition: EnvironmentDefinition, q: Tensor, moved: Moved, untrusted: Tensor | None) -> Tensor | None:
-    """Return the lanes that end early after a step from q (N, C), (N,) bool. With a declared outside reward, a lane
-    ends if it left the sampling range or the trusted range; with limits, also if their fallback action would take over.
-    None without either."""
+    """Return which of N lanes end early after a step from q (N, C), (N,) bool.
+
+    If an outside reward is declared, a lane ends early if its next state lies outside the sampling range or if it is in
+    ``untrusted`` (N,). If limits are declared, it ends early if their fallback action would take over. Return None if
+    neither is declared.
+    """
     if definition.outside_reward is None and definition.limits is None:
         return None
     left = definition.falls_back(q, moved.q)
@@ -296,8 +303,8 @@ def _left(definition: EnvironmentDefinition, q: Tensor, moved: Moved, untrusted:
 
 def paid_outside(definition: EnvironmentDefinition, settings: VirtualSettings) -> float:
     """Return the reward for each step that an episode misses because it ended early, outside the sampling range or at a
-    limit. It is the declared outside reward. Without one it is the lower limit of virtual rewards, or 0 without such a
-    limit."""
+    limit. This is the declared outside reward; if none is declared, the lowest mean reward of a step
+    (``reward_limits``); if that is None, 0."""
     if definition.outside_reward is not None:
         return definition.outside_reward
     return 0.0 if settings.reward_limits is None else settings.reward_limits[0]
@@ -308,8 +315,8 @@ def _paid_outside(
 ) -> Moved:
     """Terminate the lanes that the mask ``left`` (N,) selects, and replace their rewards by the outside reward.
 
-    A lane gets it for this step and for each further step up to the time limit. Without a time limit it gets it for
-    this step only.
+    The outside reward is paid once for this step and once for each further step up to the time limit. Without a time
+    limit it is paid for this step only.
     """
     lacking = torch.ones_like(moved.reward)
     if settings.time_limit is not None:
@@ -323,12 +330,14 @@ def _paid_outside(
 def _advanced(
     settings: VirtualSettings, before: LaneState, moved: Moved, untrusted: Tensor | None
 ) -> tuple[LaneState, Tensor]:
-    """Return the state of the lanes after their step, and which lanes were truncated, by the time limit or because they
-    left the trusted range. As in Gymnasium, a step may both terminate and truncate."""
+    """Return the state of N lanes after their step, and a mask (N,) of the lanes that are truncated: by the time limit,
+    or because they are in ``untrusted``. As in Gymnasium, a step may both terminate and truncate."""
     elapsed = before.elapsed + 1
     cut = torch.zeros_like(moved.terminated) if settings.time_limit is None else elapsed >= settings.time_limit
     cut = cut if untrusted is None else cut | untrusted
-    phase = (moved.terminated | cut).to(torch.int8).add_(RUNNING)  # RUNNING, or ENDED = RUNNING + 1
+    phase = (
+        (moved.terminated | cut).to(torch.int8).add_(RUNNING)
+    )  # where the episode ended: RUNNING + 1, equal to ENDED
     return replace(before, elapsed=elapsed, phase=phase, q=moved.q, particles=moved.particles), cut
 
 
@@ -354,7 +363,7 @@ def _seeded(lanes: LaneState, seed: int | Sequence[int], chosen: Chosen) -> Lane
     else:
         if len(seed) != len(lanes):
             raise InvalidInput(
-                f"seed: expected a whole number, or {len(lanes)} of them, one for each lane, got {len(seed)}"
+                f"seed: expected a whole number, or {len(lanes)} of them, one for each lane, got a list of {len(seed)}"
             )
         seeds, numbers = torch.tensor(list(seed), device=lanes.seed.device), torch.zeros_like(lanes.lane)
     replaced = torch.ones_like(lanes.seed, dtype=torch.bool) if isinstance(chosen, slice) else chosen
@@ -387,8 +396,8 @@ def chosen_lanes(mask: Bools | None, lanes: LaneState) -> Chosen:
 
 
 def _scatter(chosen: Chosen, values: Tensor) -> Tensor:
-    """Return a tensor with a row for each of N lanes: the rows of ``values`` for the chosen lanes, and 0 for the
-    others."""
+    """Return a tensor of N rows, one for each lane: the rows of ``values``, in order, in the ``chosen`` lanes, and
+    zeros in all others."""
     if isinstance(chosen, slice):
         return values
     full = values.new_zeros(len(chosen), *values.shape[1:])

@@ -21,9 +21,10 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class ImaginedEpisode:
-    # (t + 1, C) states, the start included; t is the number of actions, or less if the episode terminated.
+    # (t + 1, C) coordinates of the start and after each of t steps. There is a step for each action, or fewer if the
+    # episode terminated before.
     coordinates: Array
-    reward: NDArray[np.floating[Any]]  # (t,) reward of each of t steps
+    reward: NDArray[np.floating[Any]]  # (t,) reward of each of the episode's t steps
     terminated: bool
 
 
@@ -40,7 +41,7 @@ def imagine(model: DynamicsModel, q: Array, u: Array, *, draws: int, seed: int) 
     Args:
         model: the model.
         q, u: first state, and actions in the form in which the model takes them.
-        draws: number of episodes along sampled functions.
+        draws: number of episodes along functions sampled from the posterior, K.
         seed: seed with which the functions are sampled.
     """
     mean = _episodes(model, VirtualSettings(1, autoreset_mode="disabled"), q, u, seed)[0]

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import pad
 
-NEW, RUNNING, ENDED = 0, 1, 2  # phases of a lane
-EVERY = slice(None)  # stands for a mask of all lanes, so that no array is copied
+NEW, RUNNING, ENDED = 0, 1, 2  # phases of a lane: never reset; in an episode; episode ended, reset pending
+EVERY = slice(None)  # selects all lanes; indexing by a slice instead of a mask copies no array
 Chosen = Tensor | slice  # selection of lanes: a mask (N,), or EVERY
 
 
@@ -26,27 +26,28 @@ class LaneState:
     the padding.
     """
 
-    seed: Tensor  # (N,) int64, part of the key that determines the lane's random numbers
-    lane: Tensor  # (N,) int64, part of the key that determines the lane's random numbers
-    episode: Tensor  # (N,) int64, number of the episode; -1 before the first
-    elapsed: Tensor  # (N,) int64, number of steps in this episode
-    phase: Tensor  # (N,) int8: NEW, RUNNING, or ENDED and waiting for a reset
-    q: Tensor  # (N, C) state, which determines observation and termination
-    particles: Tensor  # (N, P, C) state of each particle
-    path: Tensor  # (N, W) weights of the function that the episode follows; sampled in its first step
+    seed: Tensor  # (N,) int64, seed of each lane, from which its random numbers are computed
+    lane: Tensor  # (N,) int64, a number that gives lanes with the same seed different random numbers
+    episode: Tensor  # (N,) int64, number of each lane's current episode: 0, 1, ...; -1 before the first reset
+    elapsed: Tensor  # (N,) int64, number of steps that each lane's current episode has taken
+    phase: Tensor  # (N,) int8, phase of each lane: NEW, RUNNING, or ENDED and waiting for a reset
+    q: Tensor  # (N, C) coordinates of each lane's state; observation and termination are computed from them
+    particles: Tensor  # (N, P, C) coordinates of each lane's P particles
+    path: Tensor  # (N, W) weights of the sampled function that the lane's episode follows; drawn in its first step
 
     def __len__(self) -> int:
         return len(self.seed)
 
     def take(self, index: NDArray[Any] | Chosen) -> LaneState:
-        """Return the state of the lanes that an index array or a mask selects, in the order of the array."""
+        """Return the state of only those lanes that ``index``, an index array or a mask, selects, in its order."""
         if isinstance(index, slice):
             return self
         at = torch.as_tensor(index, device=self.seed.device)
         return LaneState(*(getattr(self, f.name)[at] for f in fields(self)))
 
     def put(self, index: NDArray[Any] | Chosen, other: LaneState) -> LaneState:
-        """Return the state with those lanes replaced by ``other`` that an index array or a mask selects."""
+        """Return a copy of this state in which the lanes that ``index``, an index array or a mask, selects are replaced
+        by the lanes of ``other``, in order."""
         if isinstance(index, slice):
             return other
         at = torch.as_tensor(index, device=self.seed.device)
@@ -76,5 +77,5 @@ class LaneState:
 
 
 def _widened(path: Tensor, width: int) -> Tensor:
-    """Pad weights (n, W) with zeros to ``width`` columns."""
+    """Append columns of zeros to ``path`` (n, W), the weights of n sampled functions, up to ``width`` columns."""
     return path if path.shape[1] == width else pad(path, (0, width - path.shape[1]))

@@ -14,10 +14,10 @@ Limits = tuple[float, float]
 
 
 def reward_limits(low: float, high: float) -> Limits:
-    """Return the limits of virtual rewards, given the smallest and the largest reward of all samples.
+    """Return the lower and upper limit of the mean rewards of virtual steps: ``low - w`` and ``high + w``.
 
-    The limits lie beyond the smallest and the largest reward, by the difference of these two or by the larger of their
-    absolute values, whichever is greater. So the range between the limits always includes 0.
+    ``low`` and ``high`` are the smallest and largest reward of all samples, and w is the largest of ``high - low``,
+    ``|low|`` and ``|high|``. So the range between the limits always includes 0.
     """
     room = max(high - low, abs(low), abs(high))
     return low - room, high + room
@@ -27,7 +27,7 @@ def within(limits: Limits | None, transition: LaneTransition) -> LaneTransition:
     """Return the transition with its mean rewards clipped to the limits. Penalties are subtracted from the clipped
     rewards.
 
-    The outside reward, which an episode gets that ended early, is not clipped, because the model does not predict it.
+    The outside reward of an episode that ended early is not clipped, because it is declared, not predicted.
     """
     if limits is None:
         return transition

@@ -1,4 +1,5 @@
-"""Noise of a lane: a pure function of (seed, lane, episode, step, purpose, particle, output)."""
+"""Random numbers of lanes (parallel environments). Each is a pure function of seed, lane, episode, step, purpose, and
+its position among the numbers that are drawn for these."""
 
 from __future__ import annotations
 
@@ -13,7 +14,9 @@ from surrogym_server.virtual.lanes import LaneState
 from surrogym_server.virtual.philox import MASK, normals, philox, uniforms
 from surrogym_shared import compiled
 
-STEP_BITS = 24  # number of bits of the counter's third word that contain the step; the other eight contain the purpose
+# The third 32-bit word of the generator's counter has the number of the episode's step in its lowest bits, this many of
+# them, and the purpose of the random number in the other eight.
+STEP_BITS = 24
 
 
 class Purpose(IntEnum):
@@ -42,8 +45,8 @@ def normal_noise(lanes: LaneState, purpose: Purpose, particles: int, size: int) 
 
 
 def _words(lanes: LaneState, purpose: Purpose, particles: int, size: int) -> Tensor:
-    """Return random 32-bit words, at least ``size`` for each particle of each of N lanes, (N, particles, ceil(size /
-    4), 4). Each value of the generator's counter gives four words."""
+    """Return random 32-bit words for N lanes, (N, particles, ceil(size / 4), 4): at least ``size`` words for each
+    particle. The last axis is 4 because each value of the generator's counter gives four words."""
     blocks = -(-size // 4)
     third = lanes.elapsed | (int(purpose) << STEP_BITS)
     if lanes.seed.device == CPU and compiled.available():

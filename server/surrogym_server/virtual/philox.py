@@ -11,15 +11,15 @@ import math
 import torch
 from torch import Tensor
 
-MASK = 0xFFFFFFFF  # lower 32 bits
-MULTIPLIERS = (0xD2511F53, 0xCD9E8D57)  # constants M_0 and M_1 of the reference
-WEYL = (0x9E3779B9, 0xBB67AE85)  # numbers that are added to the key in each round
+MASK = 0xFFFFFFFF  # a bitwise "and" with this number keeps the lower 32 bits
+MULTIPLIERS = (0xD2511F53, 0xCD9E8D57)  # constants of the generator Philox4x32, M_0 and M_1 in its paper
+WEYL = (0x9E3779B9, 0xBB67AE85)  # constants of the generator Philox4x32, added to the key's two words in each round
 ROUNDS = 10
 
 
 def philox(counter: tuple[Tensor, Tensor, Tensor, Tensor], key: tuple[Tensor, Tensor]) -> Tensor:
-    """Return four random 32-bit words for each pair of counter and key. Tensors broadcast; the result (..., 4) is
-    int64, in [0, 2^32)."""
+    """Return four random 32-bit words for each counter (four words) and key (two words), (..., 4) int64 in [0, 2^32).
+    The six tensors of words broadcast."""
     c0, c1, c2, c3 = counter
     k0, k1 = key
     for _ in range(ROUNDS):

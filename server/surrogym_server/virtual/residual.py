@@ -19,7 +19,7 @@ from surrogym_server.models.port import DynamicsModel
 from surrogym_server.virtual.dynamics import Moved
 from surrogym_server.virtual.lanes import LaneState
 
-FARTHEST = 3.0  # standardised inputs are clipped to this absolute value
+FARTHEST = 3.0  # standardised inputs of a residual are clipped to this absolute value
 
 
 @dataclass(frozen=True)
@@ -29,9 +29,9 @@ class Residual:
     There are K such sets of functions. Lane i (of N parallel environments) uses set i modulo K.
     """
 
-    centre: tuple[float, ...]  # (P,) mean of each input
-    scale: tuple[float, ...]  # (P,) standard deviation of each input
-    weights: tuple[tuple[tuple[float, ...], ...], ...]  # (K, O, 1 + P) constant and slopes
+    centre: tuple[float, ...]  # (P,) mean of each of the P inputs, which is subtracted to standardise the input
+    scale: tuple[float, ...]  # (P,) standard deviation of each of the P inputs, by which the centred input is divided
+    weights: tuple[tuple[tuple[float, ...], ...], ...]  # (K, O, 1 + P) constant and P slopes of each set and output
 
     @classmethod
     def from_saved(cls, saved: Mapping[str, Any]) -> Self:
@@ -52,9 +52,9 @@ class Residual:
         shapes = {len(self.centre), len(self.scale), *(len(row) - 1 for rows in self.weights for row in rows)}
         if shapes != {size} or {len(rows) for rows in self.weights} != {outputs}:
             raise InvalidInput(
-                f"residual: expected centre and scale with {size} numbers each, one for each input of the model, and "
-                f"weights with {size + 1} numbers for each of {outputs} outputs; got arrays of other sizes: fit the "
-                "residual to this surrogate"
+                f"residual: expected centre and scale with {size} numbers each, one for each coordinate and action "
+                f"entry (two for an angle), and weights with {size + 1} numbers for each of {outputs} outputs; got "
+                "arrays of other sizes: fit the residual to this surrogate"
             )
         if min(self.scale) <= 0:
             raise InvalidInput(f"residual: expected each entry of scale above 0, got {min(self.scale)}")
@@ -79,8 +79,8 @@ def inputs(definition: EnvironmentDefinition, q: Tensor, u: Tensor) -> Tensor:
 
 
 def with_residual(model: DynamicsModel, residual: Residual, lanes: LaneState, u: Tensor, moved: Moved) -> Moved:
-    """Return the predicted step ``moved`` of N lanes under u (N, F) with the errors of ``residual`` added. The
-    environment's rules, such as limits, are applied again."""
+    """Return the predicted step ``moved`` of N lanes under actions u (N, F) with the errors of ``residual`` added.
+    Then clip coordinates to their bounds, wrap angles and determine termination again."""
     definition = model.definition
     errors = residual.of(definition, lanes, u)
     q = settle(definition, moved.q + placed(definition, errors[:, :-1]))

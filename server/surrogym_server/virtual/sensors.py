@@ -1,4 +1,4 @@
-"""Sensor noise: observations show the state with an error, which does not move the state."""
+"""Sensor noise: a measurement error is added to the observed coordinates, and the state itself stays as it is."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from surrogym_server.models.port import DynamicsModel
 from surrogym_server.virtual.lanes import LaneState
 from surrogym_server.virtual.noise import Purpose, normal_noise
 
-SensorNoise = tuple[tuple[str, float], ...]  # pairs: name of a coordinate, standard deviation of one measurement
-# Number of measurement errors that the learned noise of a step contains: one at its start, one at its end.
+SensorNoise = tuple[tuple[str, float], ...]  # pairs: coordinate's name, standard deviation of its measurement error
+# A model learns noise from differences of two measured states, so the learned variance contains the variance of this
+# many measurement errors.
 MEASURED = 2.0
 
 
 def sensed(definition: EnvironmentDefinition, noise: SensorNoise, lanes: LaneState) -> Tensor:
-    """Return the states of N lanes with the sensors' measurement errors, (N, C). The errors are drawn anew in each
-    step."""
+    """Return the states of N lanes with measurement errors added, (N, C). New errors are drawn in each step."""
     if not noise:
         return lanes.q
     drawn = normal_noise(lanes, Purpose.SENSOR, 1, len(definition.coordinates))[:, 0]
@@ -27,8 +27,8 @@ def sensed(definition: EnvironmentDefinition, noise: SensorNoise, lanes: LaneSta
 
 
 def driving(model: DynamicsModel, noise: SensorNoise, process: Tensor) -> Tensor:
-    """Return the standard normal numbers ``process`` (N, ..., M), scaled down. Multiplied by the learned noise of each
-    output, they then give only that part of the noise that sensors don't cause."""
+    """Return the standard normal numbers ``process`` (N, ..., M) multiplied by a factor of at most 1 for each of the M
+    moving coordinates. The factor removes the part of the learned noise that measurement errors explain."""
     able = offers(model, LearnedNoise)
     if not noise or able is None or model.definition.moves_observation:
         return process

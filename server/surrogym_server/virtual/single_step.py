@@ -18,15 +18,15 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class PointPrediction:
-    next_coordinates: Array  # (n, C) after the step
-    next_observation: Array  # (n, D) after the step
-    reward: Array  # (n,) mean, without the penalty
-    reward_std: Array  # (n,) standard deviation of the reward
+    next_coordinates: Array  # (n, C) predicted coordinates after the step from each of n states
+    next_observation: Array  # (n, D) observation after the step from each of n states
+    reward: Array  # (n,) predicted mean reward of each step, without a penalty for uncertainty
+    reward_std: Array  # (n,) predicted standard deviation of each step's reward
     terminated: NDArray[Any]  # (n,) bool: whether the step ends the episode
 
 
 def predict_points(model: DynamicsModel, q: Array, u: Array) -> PointPrediction:
-    """Predict one step, with mean results, from each of n states q (n, C) under actions u (n, F)."""
+    """Predict one step from each of n states q (n, C) under actions u (n, F), by the means of the model's outputs."""
     at, action = torch.from_numpy(q), torch.from_numpy(u)
     predicted = model.transition(at, action, reward_std=True)
     require_shapes(model, predicted, at)

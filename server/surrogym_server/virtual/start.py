@@ -46,8 +46,8 @@ def start_coordinates(
 
 
 def _one_of(states: Tensor, p: Tensor) -> Tensor:
-    """Return one of the k ``states`` (k, C) for each of N numbers p (N,), (N, C). A number in [0, 1) selects one of k
-    equal intervals."""
+    """Return rows of ``states`` (k, C), one for each of N numbers p (N,) in [0, 1), (N, C). A number p selects the row
+    with the index floor(k p)."""
     return states[(p * len(states)).long().clamp_(max=len(states) - 1)]
 
 

@@ -16,10 +16,10 @@ logger = logging.getLogger(__name__)
 
 
 def in_fastest_form(settings: VirtualSettings, model: DynamicsModel) -> VirtualSettings:
-    """Return the settings of a new session. ``compiled`` is set if compiled steps of the model work on this machine and
-    are faster.
+    """Return the settings of a new session, with ``compiled`` set to True if the model's compiled steps work on this
+    machine and are faster than torch.
 
-    It is not set with a residual, which compiled steps don't support.
+    With a residual, ``compiled`` stays False, because compiled steps don't support a residual.
     """
     stds = settings.variant == "probabilistic" or settings.penalty > 0 or settings.doubts
     able = None if settings.residual is not None else offers(model, CompiledSteps)
@@ -27,7 +27,7 @@ def in_fastest_form(settings: VirtualSettings, model: DynamicsModel) -> VirtualS
         return settings
     try:
         return replace(settings, compiled=_array_steps(model, replace(settings, compiled=True)) is not None)
-    except Exception:  # numba or its compiler may fail in any way on an unsupported platform
+    except Exception:  # on an unsupported platform, numba may raise any error; torch then computes the steps
         logger.warning("steps can't be compiled on this machine, so torch computes them", exc_info=True)
         return settings
 

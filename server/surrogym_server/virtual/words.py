@@ -1,4 +1,4 @@
-"""Random words of lanes in compiled code: the same integers as ``virtual.philox``, the reference."""
+"""The random generator Philox in compiled code. It returns the same integers as the reference, ``virtual.philox``."""
 
 from __future__ import annotations
 

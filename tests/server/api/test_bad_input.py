@@ -224,7 +224,7 @@ def test_reusing_an_idempotency_key_with_another_sample_is_refused(client: httpx
         ({"coordinates": [[0, 0], [0]], "action": [[0], [0]]}, "coordinates: expected rows of one length"),
         (
             {"coordinates": [[0, 0]], "action": [[0], [0]]},
-            "actions as coordinates, got 2 actions and 1 coordinates",
+            "one action for each row of coordinates, got 2 actions and 1 rows of coordinates",
         ),
         ({"coordinates": [], "action": []}, "expected 1 or more entries"),
     ],
@@ -297,7 +297,7 @@ def test_an_invalid_step_is_refused_and_the_session_continues(client: httpx.Clie
 @pytest.mark.parametrize(
     ("body", "said"),
     [
-        ({"seed": [1]}, "seed: expected a whole number, or 2 of them, one for each lane, got 1"),
+        ({"seed": [1]}, "seed: expected a whole number, or 2 of them, one for each lane, got a list of 1"),
         ({"seed": -1}, "greater than or equal to 0, got -1"),
         ({"seed": 1.5}, "whole number"),
         ({"mask": [True]}, "mask: expected 2 entries, one for each lane, got 1"),

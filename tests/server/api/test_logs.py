@@ -73,7 +73,7 @@ def test_a_specification_drafted_over_http_equals_that_of_the_command(client: ht
 @pytest.mark.parametrize(
     ("body", "status", "expected"),
     [
-        ({"text": "theta\n"}, 422, "rows below the heading"),
+        ({"text": "theta\n"}, 422, "row below the heading"),
         ({"text": log(3), "mapping": {"state": {"theta": "x"}, "action": ["y"]}}, 422, "names the column 'x'"),
         ({"text": log(3), "mapping": {"state": {}, "run": "os.system"}}, 422, "mapping"),
         ({"text": log(3), "file": "/etc/passwd"}, 422, "file"),

@@ -18,12 +18,13 @@ from surrogym_shared.compiled.jit import compiled
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-# Matrices of an encoder: one row (function, entry, centre, scale, rate) for each feature; and the coordinates' weights.
+# An encoder has two matrices in the tables, at these offsets from the first. ROWS: for each feature, the code of its
+# function, the entry that it reads, centre, scale and rate. WEIGHTS: for each feature, a weight for each coordinate.
 ROWS, WEIGHTS = range(2)
 FUNCTIONS = ("affine", "cos", "sin", "turned_cos", "turned_sin", "wrapped", "equal", "observed", "grown")
 CODES = {function: code for code, function in enumerate(FUNCTIONS)}
 AFFINE, COS, SIN, TURNED_COS, TURNED_SIN, WRAPPED, EQUAL, OBSERVED, GROWN = CODES.values()
-UNIT_ANGLE = math.sqrt(3) / math.pi  # factor that gives uniformly distributed angles the standard deviation 1
+UNIT_ANGLE = math.sqrt(3) / math.pi  # uniformly distributed angles times this factor have standard deviation 1
 
 
 def add_features(tables: TablesBuilder, definition: EnvironmentDefinition, encoder: Encoder) -> int:
@@ -47,7 +48,7 @@ def add_features(tables: TablesBuilder, definition: EnvironmentDefinition, encod
 def encode(
     numbers: Floats, places: Ints, at: int, observe: int, raw: Floats, size: int, x: Floats, begin: int, end: int
 ) -> None:
-    """Compute features ``begin`` to ``end``, and write them to the same rows of x (d, B).
+    """Compute features ``begin`` to ``end - 1``, by index, for B lanes, and write each to its row of x (d, B).
 
     Args:
         numbers, places: tables of matrices, see ``compiled.tables``.
@@ -55,8 +56,8 @@ def encode(
         observe: index, in the tables, of the terms that compute the observation.
         raw: coordinates, action and lead (next values of the L leading coordinates), (C + F + L, B).
         size: number of coordinates, C.
-        x: array for the features.
-        begin, end: range of the features.
+        x: array of d rows, one for each feature.
+        begin, end: first index, and last index plus 1.
     """
     rows, weights = matrix(numbers, places, at + ROWS), matrix(numbers, places, at + WEIGHTS)
     lanes = raw.shape[1]

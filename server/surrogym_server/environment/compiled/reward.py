@@ -16,13 +16,14 @@ Ints = NDArray[np.int64]
 
 SHAPES = {"one": 0, "linear": 1, "absolute": 2, "square": 3, "bump": 4, "ball": 5}
 ONE, LINEAR, ABSOLUTE, SQUARE, BUMP, BALL = SHAPES.values()
-# Matrices of a declared reward: indices of its terms and conditions; weights of the action (F, X); and one row (weight,
-# shape, number of quantities) for each term.
+# A declared reward has three matrices in the tables, at these offsets from the first. HEAD: the indices of its
+# quantities' terms and of its conditions. WEIGHTS: weights (F, X) of F action entries in X quantities. TERMS: a row
+# (weight, code of the shape, number of quantities) for each reward term.
 HEAD, WEIGHTS, TERMS = range(3)
 
 
 def add_reward(tables: TablesBuilder, reward: DeclaredRewardDefinition) -> int:
-    """Add a declared reward to the tables, and return the index of its first matrix."""
+    """Append the matrices of a declared reward to the tables, and return the index of the first one."""
     values, weights, conditions = reward._compiled
     head = [add_terms(tables, values), add_conditions(tables, conditions)]
     terms = [(term.weight, SHAPES[term.shape], len(term.of)) for term in reward.terms]
@@ -31,8 +32,8 @@ def add_reward(tables: TablesBuilder, reward: DeclaredRewardDefinition) -> int:
 
 @inlined
 def add_declared(numbers: Floats, places: Ints, at: int, q: Floats, u: Floats, total: Floats) -> None:
-    """Add the declared reward of states q (C, B) and actions u (F, B) to ``total`` (B,). ``at`` is the index of the
-    reward's first matrix in the tables."""
+    """Add to ``total`` (B,) the declared reward of B lanes with states q (C, B) and actions u (F, B). ``at`` is the
+    index of the reward's first matrix in the tables ``numbers`` and ``places``."""
     head, weights = matrix(numbers, places, at + HEAD), matrix(numbers, places, at + WEIGHTS)
     terms = matrix(numbers, places, at + TERMS)
     lanes = q.shape[1]

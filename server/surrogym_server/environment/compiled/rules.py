@@ -16,18 +16,18 @@ from surrogym_shared.compiled.jit import compiled, inlined
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-# Columns of the rules, one row for each coordinate: lower and upper limit of predictions; lower and upper bound; index
-# of the coordinate that becomes 0 at a bound, or -1; whether the coordinate is an angle. Two columns are for lags,
-# which repeat a past value, and -1 for other coordinates: how the lag is computed, and the index of its source in
-# [coordinates, action].
+# Columns of the matrix of rules, which has a row for each coordinate. REACH_LOW, REACH_HIGH: predictions are clipped to
+# these limits. LOW, HIGH: declared bounds. STOPS: index of the coordinate that becomes 0 at a bound, or -1. ANGLE: 1
+# for an angle. For a coordinate that repeats a past value (a lag), LAG is how it is computed and SOURCE the index of
+# the value in [coordinates, action]; for other coordinates, both are -1.
 REACH_LOW, REACH_HIGH, LOW, HIGH, STOPS, ANGLE, LAG, SOURCE = range(8)
-# How a lag is computed from its source: change in the step, change of an angle, value before the step, or this value
-# plus 1.
+# How a lag, a coordinate that repeats a past value, follows from another coordinate or an action entry: CHANGE is its
+# change in the step, TURN the change of an angle, REPEAT its value before the step, COUNT that value plus 1.
 CHANGE, TURN, REPEAT, COUNT = range(4)
 
 
 def add_rules(tables: TablesBuilder, definition: EnvironmentDefinition) -> int:
-    """Add to the tables the matrix of rules, which ``settle`` and ``repeat`` read, and return its index."""
+    """Add to the tables a matrix of limits, bounds, angles and lags, one row for each coordinate. Return its index."""
     low, high = (end.tolist() for end in definition.reach)
     return tables.add(
         [
@@ -53,9 +53,9 @@ def _lag(definition: EnvironmentDefinition, index: int, lag: LagDefinition) -> t
 
 
 def add_inverse(tables: TablesBuilder, inverse: ObservationInverse | None) -> int:
-    """Add a matrix that says from which entries of an observation each moving coordinate is computed, and return its
-    index. Its rows are (coordinate, entry, -1), or for an angle (coordinate, cosine, sine). It is empty without an
-    inverse."""
+    """Add to the tables a matrix that says from which entries of an observation each moving coordinate is computed, and
+    return its index. A row has three indices: (coordinate, entry, -1), or for an angle (coordinate, entry of its
+    cosine, entry of its sine). If ``inverse`` is None, the matrix has no rows."""
     sources = () if inverse is None else inverse.sources
     rows = [(index, *entries, *[-1] * (2 - len(entries))) for index, entries in sources]
     return tables.add(np.array(rows).reshape(-1, 3))
@@ -63,15 +63,15 @@ def add_inverse(tables: TablesBuilder, inverse: ObservationInverse | None) -> in
 
 @compiled
 def clipped(rules: Floats, c: int, value: float) -> float:
-    """Return a value of coordinate c, clipped to the coordinate's limits (see ``EnvironmentDefinition.reach``)."""
+    """Return ``value``, clipped to the limits of the coordinate with index c (see ``EnvironmentDefinition.reach``)."""
     low, high = rules[c, REACH_LOW], rules[c, REACH_HIGH]
     return low if value < low else (high if value > high else value)
 
 
 @inlined
 def settle(rules: Floats, q: Floats) -> None:
-    """Apply the rules of the environment to coordinates q (C, B) in place: clip them to limits, set a speed that points
-    into a wall to 0, wrap angles."""
+    """Apply the rules of the environment to the coordinates q (C, B) of B lanes in place: clip them to limits, set a
+    speed that points into a wall to 0, wrap angles."""
     size, lanes = q.shape
     for c in range(size):
         for b in range(lanes):
@@ -90,8 +90,8 @@ def settle(rules: Floats, q: Floats) -> None:
 
 @inlined
 def repeat(rules: Floats, raw: Floats, q: Floats) -> None:
-    """Set the lags among the next coordinates q (C, B). A lag is a coordinate that repeats a past value; it is computed
-    from ``raw`` (C + F, B), the coordinates and action before the step."""
+    """Set the lags among the coordinates q (C, B) of B lanes after a step. A lag is a coordinate that repeats a past
+    value; it is computed from ``raw`` (C + F, B), the coordinates before the step and the action."""
     size, lanes = q.shape
     for c in range(size):
         lag, source = int(rules[c, LAG]), int(rules[c, SOURCE])
@@ -108,8 +108,8 @@ def repeat(rules: Floats, raw: Floats, q: Floats) -> None:
 
 @inlined
 def recover(numbers: Floats, places: Ints, at: int, o: Floats, q: Floats) -> None:
-    """Compute the moving coordinates from observations o (D, B), and write them to q (C, B). ``at`` is the index of the
-    matrix from ``add_inverse``."""
+    """Compute the moving coordinates of B lanes from observations o (D, B), and write them to q (C, B). ``at`` is the
+    index, in the tables ``numbers`` and ``places``, of the matrix that ``add_inverse`` added."""
     sources = matrix(numbers, places, at)
     for s in range(len(sources)):
         c, first, second = int(sources[s, 0]), int(sources[s, 1]), int(sources[s, 2])

@@ -14,28 +14,29 @@ from surrogym_shared.compiled.jit import compiled
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-CONSTANT, FREQUENCIES, COEFFICIENTS, LIMITS = range(4)  # matrices of a term set, in this order
-# Matrices of conditions: index of their term set, and number of groups; one row (sign, threshold, group) for each
-# inequality.
+CONSTANT, FREQUENCIES, COEFFICIENTS, LIMITS = range(4)  # offsets of a ``TermSet``'s matrices from its first one
+# Conditions have two matrices in the tables, at these offsets from the first. TERMS: the index of their term set, and
+# the number of groups. RULES: a row (sign, threshold, group) for each inequality.
 TERMS, RULES = range(2)
 
 
 def add_terms(tables: TablesBuilder, terms: TermSet) -> int:
-    """Add a term set to the tables, and return the index of its first matrix."""
+    """Append the four matrices of a term set to the tables, and return the index of the first one."""
     unlimited = np.full((2, len(terms.constant)), np.inf) * [[-1], [1]]
     limits = unlimited if terms.low is None or terms.high is None else [terms.low.numpy(), terms.high.numpy()]
     return tables.add(terms.constant, terms.frequencies.T, terms.coefficients, limits)
 
 
 def tables_of(terms: TermSet) -> Tables:
-    """Return tables that contain a single term set. Its index is 0."""
+    """Return tables that contain only this term set, with its first matrix at index 0."""
     tables = TablesBuilder()
     add_terms(tables, terms)
     return tables.build()
 
 
 def add_conditions(tables: TablesBuilder, conditions: Conditions) -> int:
-    """Add conditions to the tables, and return the index of their first matrix."""
+    """Append the matrices of the conditions to the tables, after those of their terms. Return the index of the
+    conditions' first matrix."""
     terms = add_terms(tables, conditions.terms)
     group = conditions.membership.numpy().argmax(1) if conditions.membership.numel() else np.zeros(0)
     rules = np.stack([conditions.sign, conditions.threshold, group], 1)
@@ -44,7 +45,8 @@ def add_conditions(tables: TablesBuilder, conditions: Conditions) -> int:
 
 @compiled
 def evaluate(numbers: Floats, places: Ints, at: int, q: Floats) -> Floats:
-    """Return the values of the terms at index ``at`` for coordinates q (C, B), shape (T, B)."""
+    """Return the values (T, B) of T terms for the coordinates q (C, B) of B lanes. ``at`` is the index, in the tables
+    ``numbers`` and ``places``, of the first matrix of the terms."""
     constant, frequencies = matrix(numbers, places, at + CONSTANT), matrix(numbers, places, at + FREQUENCIES)
     coefficients, limits = matrix(numbers, places, at + COEFFICIENTS), matrix(numbers, places, at + LIMITS)
     size, lanes = q.shape
@@ -77,7 +79,8 @@ def evaluate(numbers: Floats, places: Ints, at: int, q: Floats) -> Floats:
 
 @compiled
 def holding(numbers: Floats, places: Ints, at: int, q: Floats) -> NDArray[np.bool_]:
-    """Return which groups of the conditions at index ``at`` hold for coordinates q (C, B), (G, B) bool."""
+    """Return which of G groups of inequalities hold for the coordinates q (C, B) of B lanes, (G, B) bool. ``at`` is the
+    index, in the tables ``numbers`` and ``places``, of the first matrix of the conditions."""
     head, rules = matrix(numbers, places, at + TERMS), matrix(numbers, places, at + RULES)
     values = evaluate(numbers, places, int(head[0, 0]), q)
     holds = np.ones((int(head[0, 1]), q.shape[1]), dtype=np.bool_)

@@ -16,13 +16,15 @@ Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 Phases = NDArray[np.int8]
 
-BLOCK = 64  # number of lanes computed at once
+BLOCK = 64  # number of lanes (parallel environments) whose observations are computed at once
 
 
 @entry(types.float64[::1], types.int64[:, ::1], types.float64[:, ::1], types.float32[:, ::1])
 def observe(numbers: Floats, places: Ints, q: Floats, observation: Singles) -> None:
-    """Write the observations of coordinates q (N, C) to ``observation`` (N, D). ``numbers`` and ``places`` are the
-    tables of the terms that compute the observation."""
+    """Write the observations of N states, given by their coordinates q (N, C), to ``observation`` (N, D).
+
+    ``numbers`` and ``places`` are the tables (see ``compiled.tables``) of the terms that compute the D entries.
+    """
     size = q.shape[1]
     for begin in range(0, len(q), BLOCK):
         lanes = min(BLOCK, len(q) - begin)
@@ -46,8 +48,8 @@ def _exceeds(std: Floats, trust: float, scales: Floats) -> bool:
 
 @inlined
 def _doubt(std: Floats, scales: Floats) -> float:
-    """Return the doubt about a step, in the unit of the reward. It is the largest ratio of an output's standard
-    deviation ``std`` (O,) to its standard deviation over the samples, ``scales`` (O,), times the latter of the reward.
+    """Return the doubt about a step: the largest of the O ratios ``std / scales``, times the reward's entry of
+    ``scales``. ``std`` (O,) are predicted standard deviations of the outputs, ``scales`` (O,) those over the samples.
     """
     most = 0.0
     for o in range(len(std)):
@@ -58,8 +60,8 @@ def _doubt(std: Floats, scales: Floats) -> float:
 @inlined
 def _penalised(mean: float, std: Floats, penalty: float, caution: float, scales: Floats) -> float:
     """Return a mean reward less two penalties: ``penalty`` times the reward's standard deviation, and ``caution`` times
-    the doubt about the step (see ``_doubt``). ``std`` (O,) are the standard deviations of the outputs, the reward's
-    last.
+    the doubt about the step (see ``_doubt``). ``std`` (O,) are the predicted standard deviations of the O outputs, the
+    reward's last.
 
     ``std`` is not read where ``penalty`` and ``caution`` are 0.
     """

@@ -31,10 +31,10 @@ Singles = NDArray[np.float32]
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
 
-MODELS = 64  # number of models whose tables for observations are cached
-ANYWHERE = np.zeros((0, 0))  # passed as the ends of the sampling range where these are not needed
+MODELS = 64  # number of models whose tables of observation terms stay in a cache
+ANYWHERE = np.zeros((0, 0))  # passed as the sampling range if leaving this range does not end an episode
 NO_LANES = np.zeros(0, dtype=np.int64)
-NO_FALLBACK = np.zeros(0, dtype=np.bool_)  # passed if there are no limits
+NO_FALLBACK = np.zeros(0, dtype=np.bool_)  # passed if the environment declares no limits and so no fallback action
 
 
 @dataclass(frozen=True)
@@ -42,12 +42,14 @@ class _Changed:
     """Arrays of one step of N lanes (parallel environments): copies of the parts of the lanes' state that the step
     changes in place, and the arrays of its results."""
 
-    q: Floats  # (N, C) states
-    episode: Ints  # (N,) numbers of the episodes
-    elapsed: Ints  # (N,) numbers of steps in the episodes
-    phase: NDArray[np.int8]  # (N,) phases of the lanes
-    rewards: Floats  # (2, N) penalised rewards, and mean rewards
-    ends: Bools  # (5, N) terminated, truncated, untrusted, terminated or truncated, left
+    q: Floats  # (N, C) coordinates of each lane's state
+    episode: Ints  # (N,) number of each lane's current episode: 0, 1, ...
+    elapsed: Ints  # (N,) number of steps that each lane's episode has taken
+    phase: NDArray[np.int8]  # (N,) phase of each lane: NEW, RUNNING or ENDED
+    rewards: Floats  # (2, N) rewards less the penalties for uncertainty, and rewards without them
+    # (5, N) five flags of each lane: the episode terminated; was truncated; was truncated because the model is too
+    # uncertain; terminated or was truncated; ended early with the outside reward.
+    ends: Bools
 
     @classmethod
     def of(cls, lanes: LaneState) -> _Changed:
@@ -127,7 +129,8 @@ def _moved(
     moving: Chosen,
     stds: bool,
 ) -> ArrayTransition:
-    """Predict the step of the lanes that move. The result has a row for each of them, in their order."""
+    """Predict one step of the lanes (parallel environments) that ``moving`` selects, under actions u (N, F). The result
+    has one row for each selected lane, in order."""
     wanted, process = stds or settings.doubts, None
     if settings.process_noise:
         drawn = normal_noise(lanes, Purpose.PROCESS, 1, len(model.definition.outputs) - 1)[:, 0]
@@ -148,8 +151,8 @@ def _rows(moving: Chosen, values: NDArray[Any]) -> NDArray[Any]:
 
 
 def _fallen(definition: EnvironmentDefinition, moving: Chosen, lanes: LaneState, moved: ArrayTransition) -> Bools:
-    """Return in which of the K lanes that move the fallback action of the limits would take over after the step, (K,)
-    bool; (0,) if there are no limits."""
+    """Return for each of the K lanes that ``moving`` selects whether the fallback action of the declared limits would
+    take over after the step, (K,) bool. Without limits, return an empty array."""
     if definition.limits is None:
         return NO_FALLBACK
     fallen: Bools = definition.falls_back(lanes.take(moving).q, torch.from_numpy(moved.q_next)).numpy()
@@ -164,8 +167,8 @@ def _concluded(
     changed: _Changed,
     fallen: Bools,
 ) -> int:
-    """Complete the step of the lanes that move, write the results to ``changed``, and return the number of lanes whose
-    episode ended."""
+    """Complete a step from the predictions ``moved``: write states, rewards and ends of episodes of the lanes that the
+    mask ``moving`` (N,) selects to ``changed``. Return the number of lanes whose episode ended."""
     trust, limit, outside = settings.trust, settings.time_limit, model.definition.outside_reward
     scales = model.scales.numpy() if settings.doubts else np.zeros(0)
     return conclude(
@@ -212,7 +215,8 @@ def _shown(
     changed: _Changed,
     chosen: Ints | None = None,
 ) -> Floats:
-    """Return the states of all lanes, or of the ``chosen`` ones, with the sensors' measurement errors, (n, C)."""
+    """Return the states (n, C) of the n lanes whose indices are ``chosen``, or of all lanes, as sensors show them: with
+    the measurement errors of the setting ``sensor_noise``."""
     if not settings.sensor_noise or (chosen is not None and not len(chosen)):
         return changed.q if chosen is None else changed.q[chosen]
     lanes = changed.lanes(before)
@@ -234,8 +238,8 @@ def _observation_tables(steps: ArraySteps) -> Tables:
 
 
 def _scattered(moving: Bools, values: Floats) -> Floats:
-    """Return an array with a row for each of N lanes: the rows of ``values`` for the lanes that move, and 0 for the
-    others."""
+    """Return an array of N rows, one for each lane: the rows of ``values``, in order, in the lanes that the mask
+    ``moving`` (N,) selects, and zeros in all others."""
     if len(values) == len(moving):
         return values
     full: Floats = np.zeros((len(moving), *values.shape[1:]))
