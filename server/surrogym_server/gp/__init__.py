@@ -1,4 +1,4 @@
-"""Gaussian processes, exact, float64: one output, well done. Notation: docs/glossary.md.
+"""Gaussian process regression of one output at a time, in float64. All symbols: docs/glossary.md.
 
 ========  ======================  =========================================================
 paper     code                    meaning
@@ -8,9 +8,9 @@ Lambda    ``lengthscale`` (d,)    Lambda = diag(lengthscale ** -2)
 sigma_f^2 ``signal_variance``     variance of the squared-exponential part
 --        ``linear_variance``     variance of the linear part, 0 without one
 --        ``quadratic_variance``  variance of the quadratic part, 0 without one
-sigma_n^2 ``noise_variance``      noise, added once to the diagonal
-K         ``covariance(x, x)``    latent covariance, without noise
-s, p      ``Reflection``          signs and parity of functions with f(s x) = p f(x), if any
+sigma_n^2 ``noise_variance``      variance of the noise, added to the diagonal of K
+K         ``covariance(x, x)``    covariance of the function values, without noise
+s, p      ``Reflection``          signs and parity, if all functions have f(s x) = p f(x)
 beta      ``weights`` (n,)        (K + sigma_n^2 I)^-1 y
 ========  ======================  =========================================================
 """

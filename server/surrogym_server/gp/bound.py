@@ -1,6 +1,7 @@
 """Variational lower bound of the evidence of many points, through m inducing ones, and its gradient.
 
-With K_uu of the inducing points Z, K_uf of Z and the n points X, Q = K_uf^T K_uu^-1 K_uf, and K_ff of the points,
+K_uu is the covariance matrix of the m inducing points Z, K_uf that of Z with the n points X, and K_ff that of X. With
+Q = K_uf^T K_uu^-1 K_uf,
 
     F = log N(y | 0, Q + sigma_n^2 I) - tr(K_ff - Q) / (2 sigma_n^2) <= log p(y).
 
@@ -8,14 +9,14 @@ The trace counts what the inducing points leave unexplained. So hyperparameters 
 noise: sigma_n^2 grows by it. With all points as inducing ones F is the evidence. At the optimum of the variational
 distribution predictions are those of the projected process, see ``gp.sparse``.
 
-With L L^T = K_uu, V = L^-1 K_uf, S = V V^T + sigma_n^2 I, a = S^-1 V y and alpha = (y - V^T a) / sigma_n^2, all is
-computed in O(n m^2), and
+With L L^T = K_uu, V = L^-1 K_uf, S = V V^T + sigma_n^2 I, a = S^-1 V y and alpha = (y - V^T a) / sigma_n^2, F and its
+gradient take O(n m^2), and
 
     dF/dK_uf = L^-T (a alpha^T + (I - sigma_n^2 S^-1) V / sigma_n^2),
     dF/dK_uu = -1/2 L^-T (a a^T + S / sigma_n^2 - 2 I + sigma_n^2 S^-1) L^-1.
 
-Z are some of the X, and do not change during a search. Those that the others explain least are a good choice
-(``gp.sparse``), because F is at most tr(K_ff - Q) |y|^2 / (2 sigma_n^4) below the evidence.
+Z are some of the points X, and do not change during a search. Points that the other inducing points explain least are
+a good choice (``gp.sparse``), because log p(y) - F is at most tr(K_ff - Q) (1 + |y|^2 / sigma_n^2) / (2 sigma_n^2).
 
 References: Titsias, "Variational learning of inducing variables in sparse Gaussian processes", AISTATS 2009; Burt,
 Rasmussen, van der Wilk, "Convergence of sparse variational inference in Gaussian processes regression", JMLR 21 (2020).
@@ -28,7 +29,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy  # SciPy loads its parts on first use, so a server that needs none starts sooner
+import scipy  # SciPy imports its submodules on first use, so a server that needs none of them starts sooner
 import torch
 from torch import Tensor
 
@@ -40,11 +41,12 @@ from surrogym_server.gp.search import blas, minimum
 from surrogym_server.gp.sparse import condition_sparse, pivots
 from surrogym_server.gp.subsets import SOME, spread
 
-# Searches, one after the other: greatest number of points (None: all), and of iterations.
+# Hyperparameters are searched for in two stages. Each is (greatest number of points, greatest number of iterations),
+# and None stands for all points.
 SEARCHES = ((2_000, 40), (None, 15))
-# If the noise variance is above this share of the output's variance, it hides the errors of inducing points.
+# If the noise variance is above this share of the output's variance, errors that inducing points cause are negligible.
 NOISY = 1e-4
-PRECISE = 1e-4  # leave-one-out errors below this, in standard deviations of the output, count as exact
+PRECISE = 1e-4  # leave-one-out errors up to this share of the output's standard deviation count as precise
 HARDLY = 0.3  # an input may be left out if its effect on the mean is below this share of the noise's standard deviation
 TRIES = 6  # greatest number of searches for inputs that can be left out
 JITTER = 1e-9  # added to the diagonal of K_uu, as a share of the points' mean prior variance
@@ -53,13 +55,13 @@ JITTER = 1e-9  # added to the diagonal of K_uu, as a share of the points' mean p
 def fit_bound(
     x: Tensor, y: Tensor, options: FitOptions, theta: Array, inducing: int, reflection: Reflection | None = None
 ) -> Posterior:
-    """Fit a sparse process to x (n, d) and y (n,), both standardised, by maximising the variational bound. Runs on the
-    CPU.
+    """Fit a process with inducing points to x (n, d) and y (n,), both standardised, by maximising the variational
+    bound. Runs on the CPU.
 
     Args:
-        theta: free parameters that were fitted to some of the points. One search starts at these, another at shorter
-            length scales. Both use some of the points first, and then all. Each search chooses its own inducing points.
-        inducing: greatest number of inducing points.
+        theta: logarithms of hyperparameters, fitted to some of the points. One search starts at them, another at
+            shorter length scales, both on at most 2,000 points. From the better result, a last search uses all points.
+        inducing: greatest number of inducing points. If there are no more points than this, the posterior is exact.
 
     Raises:
         NumericalFailure: no jitter makes the covariance of the points positive definite.
@@ -83,12 +85,12 @@ def fit_bound(
 def fit_through_few(
     x: Tensor, y: Tensor, options: FitOptions, theta: Array, reflection: Reflection | None = None
 ) -> Posterior | None:
-    """Fit a process to points x (n, d), y (n,), both standardised, through fewer than ``SOME`` of them as inducing
-    points. Runs on the CPU.
+    """Fit a process to points x (n, d), y (n,), both standardised, through fewer than ``SOME`` (400) of them as
+    inducing points. Runs on the CPU.
 
     Args:
-        theta: free parameters that were fitted to some of the points. If their noise is large enough to hide the errors
-            of inducing points, a search that starts at these also maximises the bound of all points.
+        theta: logarithms of hyperparameters, fitted to some of the points. If their noise is much larger than the
+            errors that inducing points cause, a search that starts at theta also maximises the bound of all points.
 
     Returns:
         The posterior; None if inducing points would lose accuracy (see ``loses_nothing``), or if there are at most
@@ -111,8 +113,9 @@ def fit_through_few(
 def loses_nothing(posterior: Posterior) -> bool:
     """Return whether a posterior is as accurate as one that uses all points without inducing points.
 
-    An exact posterior always is. With inducing points, a posterior counts as such if there are fewer than ``SOME`` of
-    them, and if either the noise hides their errors or each point is predicted precisely from the others.
+    A posterior without inducing points always is. One with inducing points counts as equally accurate if there are
+    fewer than ``SOME`` (400) of them, and if either the noise is much larger than the errors that they cause or each
+    point is predicted precisely from the other points.
     """
     if posterior.sparse is None:
         return True
@@ -127,7 +130,7 @@ def is_noisy(hyper: Hyperparameters) -> bool:
 
 @dataclass(frozen=True)
 class Fewer:
-    """A process that reads only some of the inputs."""
+    """Result of ``fewer_inputs``: a process that uses only some of the inputs."""
 
     mask: Tensor  # (d,) bool, true for the inputs that the process reads
     posterior: Posterior
@@ -137,18 +140,18 @@ def fewer_inputs(
     x: Tensor, y: Tensor, posterior: Posterior, options: FitOptions, inducing: int, may: Tensor, odds: float
 ) -> Fewer | None:
     """Leave out inputs that hardly change the mean of a process, if this increases the variational bound of the log
-    evidence, with the priors of hyperparameters and of leaving out inputs. Runs on the CPU.
+    evidence plus the log prior of the hyperparameters and of leaving out inputs. Runs on the CPU.
 
-    The first of at most ``TRIES`` searches tries to leave out all such inputs at once. If a set of inputs can't be left
-    out, each half of it is tried, in addition to the inputs that are left out already.
+    The first of at most ``TRIES`` searches leaves out all inputs that hardly change the mean. If the bound does not
+    increase without a set of inputs, each half of this set is tried, in addition to the inputs already left out.
 
     Args:
         x: inputs (n, d).
         y: targets (n,).
         posterior: the process with all inputs.
         inducing: greatest number of inducing points.
-        may: (d,) bool, the inputs that may be left out. At least one input is kept.
-        odds: prior log odds of leaving out one input more.
+        may: (d,) bool, true for each input that may be left out. At least one input is kept.
+        odds: by how much the log prior increases with each input that is left out.
 
     Returns:
         The process with fewer inputs, or None if all are kept.
@@ -179,8 +182,8 @@ class _Inputs:
         self.mask = torch.ones(x.shape[1], dtype=torch.bool)
 
     def without(self, out: Sequence[int], odds: float) -> bool:
-        """Leave out the inputs ``out`` as well if the negative bound without them is below the present one plus
-        ``odds`` for each input, the prior log odds of leaving out an input. Return whether they were left out."""
+        """Leave out the inputs with the indices ``out`` as well, if the bound then decreases by less than ``odds`` for
+        each of them. Return whether they were left out."""
         mask = self.mask.index_fill(0, torch.tensor(out), value=False)
         mirror = self._reflection(mask)
         if mirror is not None and mirror.parity < 0 and bool((mirror.signs > 0).all()):
@@ -217,8 +220,8 @@ def _effects(posterior: Posterior, x: Tensor) -> Tensor:
 def _searched(
     x: Tensor, y: Tensor, options: FitOptions, start: Array, inducing: int, reflection: Reflection | None
 ) -> tuple[float, Array]:
-    """Minimise the negative bound over theta, from the theta ``start``, with inducing points chosen for this theta.
-    Return the least value and the theta that has it."""
+    """Minimise the negative bound over theta, the logarithms of hyperparameters, from ``start``, with inducing points
+    that are chosen for ``start``. Return the least value and its theta."""
     parameters = Parameters(x.shape[1], options, reflection)
     clipped = np.clip(start, parameters.lower, parameters.upper)
     inducing_rows = pivots(parameters.hyper(clipped), x, inducing)
@@ -226,10 +229,12 @@ def _searched(
 
 
 class Bound(Parameters):
-    """Negative lower bound of the log evidence, with the priors of theta, as a function of theta; and its gradient."""
+    """Negative lower bound of the log evidence plus the log prior, and its gradient, as functions of theta, the
+    logarithms of the hyperparameters."""
 
     def __init__(self, x: Tensor, y: Tensor, rows: Tensor, options: FitOptions, reflection: Reflection | None) -> None:
-        """Prepare the bound of x (n, d) and y (n,); ``rows`` (m,) are the indices of the inducing points."""
+        """Prepare the bound for inputs x (n, d) and targets y (n,); ``rows`` (m,) are the row indices in x of the m
+        inducing points."""
         super().__init__(x.shape[1], options, reflection)
         self.x, self.y, self.inducing_rows = x.numpy(), y.numpy(), rows.numpy()
         self.z = self.x[self.inducing_rows]
@@ -242,7 +247,7 @@ class Bound(Parameters):
     def __call__(self, theta: Array) -> tuple[float, Array]:
         """Return the negative bound with priors at theta, and its gradient.
 
-        If a matrix has no Cholesky factor in float64, the value is very large, so that a line search turns back.
+        If a matrix has no Cholesky factor in float64, the value is 1e10, so that the line search tries a shorter step.
         """
         covariances = self._covariances(theta)
         k, noise = covariances.k, self.values(theta)[-1]
@@ -272,7 +277,9 @@ class Bound(Parameters):
         within = np.outer(weights, weights) + s / noise - 2 * np.eye(m) + noise * inverse
         within = -0.5 * back @ within @ back.T
         outer[:, self.inducing_rows] += within
-        each = -0.5 / noise + JITTER * float(within.trace()) / n  # gradient over each entry of the diagonal of K_ff
+        each = (
+            -0.5 / noise + JITTER * float(within.trace()) / n
+        )  # derivative with respect to each diagonal entry of K_ff
         gradient = self._gradient(theta, covariances, outer, each)
         freedom = n - m + noise * float(inverse.trace())
         gradient[-1] = 0.5 * (noise * float(alpha @ alpha) - freedom + left / noise)
@@ -336,10 +343,10 @@ class Bound(Parameters):
 @dataclass(frozen=True)
 class _Covariances:
     k: Array  # (m, n) covariances of the inducing points with all points
-    # The squared exponentials in k; with a reflection also those with the mirror images of the points.
+    # Squared-exponential part of k, (m, n); with a reflection also the part that comes from mirror images of points.
     smooth: list[Array]
     diagonal: Array  # (n,) prior variance of each point
-    # (n,) part of each diagonal entry that the point's own mirror image causes; empty without a reflection.
+    # (n,) part of each prior variance that comes from the point's own mirror image; empty without a reflection.
     mirrored: Array
 
 

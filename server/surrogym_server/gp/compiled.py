@@ -1,7 +1,7 @@
-"""One process in compiled code: mean and latent standard deviation of a block of inputs (d, B), one input a column.
+"""Compiled code that predicts one Gaussian process: mean and standard deviation (without noise) at B inputs.
 
-Exponents are computed from differences of inputs. In ``gp.serving``, the reference implementation, they come from
-matrix products, which would be no faster here.
+Exponents of the kernel are computed from differences of inputs. In ``gp.serving``, the reference implementation, they
+come from matrix products, which would be no faster here.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from surrogym_shared.compiled.jit import inlined
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-# Indices of a process's matrices in the tables:
-# HEAD: the scalars that are numbered below.
-# INPUTS (2, d): columns of x that the process reads, and inverse length scales.
-# POINTS (S, d): points divided by the length scales, then their mirror images if there is a reflection.
-# WEIGHTS (1, S): weights of the points in the mean.
+# A process with d inputs and n training points is stored as eight matrices. Their indices, counted from its first one:
+# HEAD (1, 11): scalars; SCALE to TURNS_ALL are their columns.
+# INPUTS (2, d): which of the model's inputs the process reads, and inverse length scales.
+# POINTS (S, d): training points divided by the length scales, then their mirror images if there is a reflection.
+# WEIGHTS (1, S): weights of these S points in the mean.
 # POLYNOMIALS (5 + 2 n, d): coefficients of x and x^2 in the mean, of x^2 and x^4 in the prior variance, of the mirror
 #   image's exponent, and of the polynomial covariances with the n points (first linear, then quadratic).
 # FACTOR (n, n): Cholesky factor L.
@@ -35,19 +35,21 @@ HEAD, INPUTS, POINTS, WEIGHTS, POLYNOMIALS, FACTOR, KEPT, TURNED = range(8)
 # (0 without one), signal variance, constant of the polynomial covariance, whether there is a polynomial part, number of
 # points, whether there is a linear part, whether there is a quadratic part, whether a reflection turns every input.
 SCALE, CENTRE, PRIOR, PARITY, SIGNAL, CONSTANT, POLYNOMIAL, COUNT, LINES, SQUARES, TURNS_ALL = range(11)
-# First rows of the groups in POLYNOMIALS: mean, prior variance, exponent of the mirror image, covariances with points.
+# The rows of the matrix POLYNOMIALS form four groups, of which these are the first rows: coefficients of the mean, of
+# the prior variance, of the mirror image's exponent, and of the covariances with the training points.
 OF_MEAN, OF_PRIOR, OF_MIRROR, OF_POINTS = 0, 2, 4, 5
 
 
 def add_process(
     tables: TablesBuilder, posterior: Posterior, inputs: tuple[int, ...], centre: float, scale: float
 ) -> int:
-    """Add one output's process to the tables, and return the index of its first matrix there.
+    """Add the matrices of one output's process to the tables that compiled code reads. Return the index of the first
+    of these matrices.
 
     Args:
         tables: tables under construction.
         posterior: the process.
-        inputs: columns of x that the process reads.
+        inputs: indices of the model's inputs that the process reads.
         centre, scale: the output is centre + scale * process.
     """
     hyper, x, polynomial = posterior.hyper, posterior.x, posterior.hyper.polynomial
@@ -127,7 +129,7 @@ def _smooth(own: Floats, inverse: Floats, points: Floats) -> Floats:
 
 @inlined
 def _covariances(head: Floats, rows: Floats, own: Floats, smooth: Floats) -> Floats:
-    """Return the prior covariances of the inputs ``own`` (d, B) with the n points, (n, B).
+    """Return the prior covariances of the inputs ``own`` (d, B) with the n training points, (n, B).
 
     Args:
         head: matrix HEAD of the process.
@@ -223,7 +225,8 @@ def _add_residuals(
             and of those whose sign it changes.
         own: inputs of the process, (d, B).
         k: covariances of the inputs with the n points, (n, B).
-        paths: weights of the posterior samples, (B, W), of which the first columns belong to this process.
+        paths: weights of the posterior samples, one row for each input, (B, W); the first columns belong to this
+            process.
         mean: means in the output's unit, changed in place.
     """
     (size, count), parity, scale = kept.shape, head[0, PARITY], head[0, SCALE]
@@ -274,9 +277,10 @@ def predict(
     Args:
         numbers, places: tables of matrices, see ``compiled.tables``.
         at: index of the process's first matrix in the tables.
-        x: all inputs of the model.
+        x: all d inputs of the model, of which the process reads some.
         wanted: whether to write standard deviations (without noise) to ``std``.
-        paths: (B, W) weights of one posterior sample for each input, whose value then replaces the mean; or (0, W).
+        paths: if it has no rows, ``mean`` gets the posterior means. If it has B rows of W weights, each is a posterior
+            sample, and ``mean`` gets its value at the input with this index.
         mean, std: arrays for the results, in the output's unit.
     """
     head, inputs = matrix(numbers, places, at + HEAD), matrix(numbers, places, at + INPUTS)

@@ -20,12 +20,13 @@ from surrogym_server.gp.sparse import hardest
 from surrogym_server.gp.subsets import FEW, SOME, spread
 
 NOISY = 1e-2  # noise variance at which the search of ``noisy_explanation`` starts, as a share of the output's variance
-MANY_POINTS = 24  # a warm fit to more points tries the default start in one of four fits only
-# Refining searches, one after the other: greatest number of points, and of iterations. Each starts near the optimum, so
-# few iterations suffice.
+# A fit to more points that starts at an earlier result also tries the default start, but in one of four fits only.
+MANY_POINTS = 24
+# Stages of ``refine``: each is (greatest number of points, greatest number of iterations). Each stage starts near the
+# optimum, so few iterations suffice.
 REFINEMENTS = ((1_000, 20), (2_000, 10))
-HARD, HARD_ITERATIONS = 1_000, 20  # numbers of points and iterations of a search on the points predicted worst
-SHORTER = 0.5  # a fit's second start has length scales shorter by this much in the logarithm
+HARD, HARD_ITERATIONS = 1_000, 20  # ``refine_where_hard`` uses this many points and at most this many iterations
+SHORTER = 0.5  # the logarithms of length scales are smaller by this much at the second start of a fit
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,8 @@ def fit(
     """Fit a process to inputs x (n, d) and targets y (n,), both standardised. Runs on the CPU.
 
     Args:
-        warm: theta of an earlier fit, at which a search starts too; None for the default start only.
+        warm: logarithms of hyperparameters from an earlier fit, at which a search starts too; None for the default
+            start only.
         reflection: symmetry of the functions to fit, or None.
 
     Raises:
@@ -59,8 +61,8 @@ def fit(
 
 
 def fit_some(x: Tensor, y: Tensor, options: FitOptions, theta: Array, reflection: Reflection | None = None) -> Array:
-    """Fit hyperparameters to at most ``SOME`` of the points x (n, d), y (n,), and return their theta. The argument
-    ``theta`` was fitted to fewer points.
+    """Fit hyperparameters to at most ``SOME`` (400) of the points x (n, d), y (n,), and return their logarithms. The
+    argument ``theta`` contains logarithms of hyperparameters that were fitted to fewer points.
 
     The optimum changes with more points: they show structure that looks like noise with fewer points. So the search has
     two starts: ``theta``, and one with shorter length scales and little noise.
@@ -102,8 +104,8 @@ def refine(
 def refine_where_hard(posterior: Posterior, x: Tensor, y: Tensor, options: FitOptions) -> Hyperparameters:
     """Refine the hyperparameters of a process of many points x (n, d), y (n,) on the points that it predicts worst.
 
-    Evenly drawn points hardly constrain a small region where the function is steep, because few of them lie there. The
-    search starts with a noise variance equal to the mean squared error at the hard points.
+    A random subset of the points hardly constrains a small region where the function is steep, because few of its
+    points lie there. The search starts with a noise variance equal to the mean squared error at the points used.
     """
     rows = hardest(posterior, x, y, HARD)
     error = float((y[rows] - posterior.mean(x[rows])).square().mean())
@@ -119,8 +121,8 @@ def noisy_explanation(posterior: Posterior, options: FitOptions) -> float:
     are at least as likely with it as with the posterior's own hyperparameters, otherwise the posterior's own noise
     variance.
 
-    This finds noise that a warm fit missed because it stayed at an optimum without noise. At most ``FEW`` of the points
-    are used.
+    This finds noise that a fit missed because it started at an earlier result and stayed at an optimum without noise.
+    At most ``FEW`` (150) of the points are used.
     """
     rows = spread(len(posterior.y), FEW)
     objective = Evidence(posterior.x[rows], posterior.y[rows], options, posterior.hyper.reflection)
@@ -133,10 +135,11 @@ def noisy_explanation(posterior: Posterior, options: FitOptions) -> float:
 
 
 def _starts(default: Array, warm: Array | None, points: int) -> Sequence[Array]:
-    """Return the thetas at which a fit starts to search: the default one, and the warm one if there is one.
+    """Return the thetas (logarithms of hyperparameters) at which a fit to ``points`` points starts to search.
 
-    With at most ``MANY_POINTS`` points there are many optima and a fit is fast, so both are used. With more points a
-    fit with a warm start uses the default start only if ``points`` is a multiple of 4.
+    Without ``warm``, the result of an earlier fit, this is ``default``. With at most ``MANY_POINTS`` points there are
+    many optima and a fit is fast, so both are used. With more, ``default`` is used beside ``warm`` only if ``points``
+    is a multiple of 4.
     """
     if warm is None:
         return (default,)

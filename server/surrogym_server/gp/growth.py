@@ -1,16 +1,17 @@
-"""Functions that change the faster the further along an input, such as rates of reaction over the temperature.
+"""Functions that change faster the larger an input is, such as rates of reaction over the temperature.
 
     F(z) = a(z) G(w(z)),  w_j(z) = (e^(g_j z_j) - 1) / g_j,  a(z) = prod_j e^(g_j z_j) = prod_j (1 + g_j w_j(z))
 
 z are standardised inputs, G is an ordinary process, and g (d,) are the rates: at g = 0, F is G. A stationary process
 has one length scale and one amplitude for all places, so a function that is steep in one place seems rough everywhere.
-F is as rough as its place. An exponential is the simplest such law, and near a temperature it is the law of Arrhenius.
+F may be steep in one place and smooth in another. An exponential is the simplest such law, and near a temperature it is
+the law of Arrhenius.
 
 Since a is known once g is, fitting F to targets t at z is fitting G to y = t / a(z) at w(z), and
 
     log p(t) = log p(y) - sum_i log a(z_i).
 
-The noise of F is that of G times a(z). All samples lie within ``EDGE``. Beyond it w is a line on the steep side and
+The noise of F is that of G times a(z). All samples have |z_j| <= ``EDGE``. Beyond, w is a line on the steep side and
 constant on the flat side (``tensors.bend``), because an exponential would overflow far away. References: P. Sampson,
 P. Guttorp (1992), JASA 87 (stationary after a deformation of the inputs); C. Paciorek, M. Schervish (2006),
 Environmetrics 17 (non-stationary covariances).
@@ -43,8 +44,8 @@ class Growing:
     """Result of fitting F, a function that changes faster the larger an input is (see the module): an ordinary process
     G, and the rate of each input."""
 
-    fitted: Fitted  # fit of the process G (see the module); `score` is that of F, and `theta` ends with the rates
-    rates: tuple[float, ...]  # (d,) g_j of each input in the module's formula; 0: F does not change faster along it
+    fitted: Fitted  # fit of the process G; its `score` is the log evidence of F, and its `theta` ends with the rates
+    rates: tuple[float, ...]  # (d,) rate g_j of each input; 0 if F does not change faster the larger the input is
 
 
 def fit_growing(z: Tensor, t: Tensor, may: Tensor, options: FitOptions, starts: Sequence[Array]) -> Growing:
@@ -52,9 +53,11 @@ def fit_growing(z: Tensor, t: Tensor, may: Tensor, options: FitOptions, starts: 
     (n,), both standardised. Runs on the CPU.
 
     Args:
-        may: (d,) bool, the inputs that may have a rate. The absolute values of these inputs are at most ``EDGE``.
+        may: (d,) bool, true for each input that may have a rate. The absolute values of these inputs are at most
+            ``EDGE``.
         options: options of the fit without rates; they must have no quadratic part.
-        starts: thetas of fits without rates, or of earlier fits with rates.
+        starts: logarithms of hyperparameters at which searches start, from fits without rates, or followed by the
+            rates, from earlier fits with rates.
 
     Raises:
         NumericalFailure: no jitter makes the covariance of the points positive definite.
@@ -62,8 +65,8 @@ def fit_growing(z: Tensor, t: Tensor, may: Tensor, options: FitOptions, starts: 
     """
     if bool((z[:, may].abs() > EDGE).any()):
         raise ValueError(
-            f"expected each input that may have a rate to be within {EDGE}, "
-            f"got {float(z[:, may].abs().max()):g}; set `may` to false for such inputs"
+            f"expected absolute values of at most {EDGE} in each input whose entry of `may` is true, "
+            f"got {float(z[:, may].abs().max()):g}; set `may` to false for inputs with larger values"
         )
     objective = _GrowingObjective(z, t, may, options)
     padded = [np.concatenate([start, np.zeros(objective.size - len(start))]) for start in starts]
@@ -82,7 +85,7 @@ class _GrowingObjective:
 
     def __init__(self, z: Tensor, t: Tensor, may: Tensor, options: FitOptions) -> None:
         if options.quadratic:
-            raise ValueError("expected fit options with quadratic=False, got quadratic=True: rates exclude that part")
+            raise ValueError("expected fit options with quadratic=False, as growth rates need it, got quadratic=True")
         self.options, self._z, self._t, self._may = options, z.numpy(), t.numpy(), may.numpy()
         plain = Evidence(z, t, options, None)
         self.inner, count = len(plain.default_start), int(self._may.sum())
@@ -97,8 +100,8 @@ class _GrowingObjective:
         return rates
 
     def plain(self, theta: Array) -> tuple[Evidence, Array]:
-        """Return the objective of the process G at the rates in theta, and the derivatives of its inputs w with respect
-        to the rates, (n, d)."""
+        """Return the negative log evidence of the process G as a function, for the rates in theta, and the derivatives
+        of each input w_j of G with respect to its rate, (n, d)."""
         rates, z = self.rates(theta), self._z
         small = np.abs(rates) < FLAT
         safe = np.where(small, 1.0, rates)

@@ -18,8 +18,10 @@ from surrogym_server.gp.parameters import MOST_NOISE, NOISE_FLOOR, FitOptions
 from surrogym_server.gp.posterior import Posterior
 from surrogym_server.gp.search import Evidence, blas, minimum
 
-BURN_IN, THINNING = 30, 10  # number of updates before the first sample, and between two samples
-SHORTER = (0.0, 1.0, 2.0)  # each start has length scales shorter by this much in the logarithm than the fitted ones
+BURN_IN, THINNING = 30, 10  # the first 30 updates of the chain are discarded, then every tenth is a sample
+# If less noise is allowed than was fitted, one search starts at each of these: the logarithms of the fitted length
+# scales less this number.
+SHORTER = (0.0, 1.0, 2.0)
 # An update leaves theta unchanged if its interval of rotation angles becomes narrower than this, in radians.
 NARROWEST = 1e-6
 
@@ -59,8 +61,8 @@ def hyperparameter_samples(
 
 
 def _with_less_noise(evidence: Evidence, theta: Array) -> Array:
-    """Return the likeliest theta within the bounds of ``evidence``, which allow less noise than before. The searches
-    start at several shorter length scales, because the function now has to explain what was noise before."""
+    """Return the likeliest theta within the bounds of ``evidence``, which allow less noise than ``theta`` has. The
+    searches start at several shorter length scales, because the function has to explain what was noise in ``theta``."""
     starts = [theta.copy() for _ in SHORTER]
     for start, shorter in zip(starts, SHORTER, strict=True):
         start[: evidence.d] -= shorter

@@ -4,7 +4,7 @@ Observing x_i shrinks every covariance by a product of rank one and needs no val
 
     k'(x_a, x_b) = k(x_a, x_b) - r_a r_b,  r_a = k(x_a, x_i) / sqrt(k(x_i, x_i) + sigma_n^2),
 
-k the posterior covariance; r is the next row of L^-1 k(X, x). One more observation costs O(n m): nothing is refitted.
+with k the posterior covariance; r is the next row of L^-1 k(X, x). An observation costs O(n m): nothing is refitted.
 Reference: Rasmussen and Williams (2006), section 2.2; Krause, Singh, Guestrin (JMLR 2008), algorithm 1.
 """
 
@@ -32,7 +32,7 @@ class Joint:
 
     @classmethod
     def of(cls, posterior: Posterior, x: Tensor) -> Joint:
-        """Return the joint posterior at points x (m, d), given the points of the process alone."""
+        """Return the joint posterior at points x (m, d), given only the samples on which the process is conditioned."""
         k = covariance(posterior.hyper, posterior.x, x)
         whitened = torch.linalg.solve_triangular(posterior.factor, k, upper=False)
         latent = (variance(posterior.hyper, x) - whitened.square().sum(0)).clamp_min(0)

@@ -1,7 +1,7 @@
 """Covariance: squared exponential with automatic relevance determination (eq. 5), plus optional polynomial parts.
 
 k(x, x') = sigma_f^2 exp(-1/2 (x - x')^T Lambda (x - x')) + sigma_l^2 (1 + x^T x') + sigma_q^2 sum_j x_j^2 x'_j^2,
-and the noise is never inside it. The last part has no cross terms: it is a quadratic cost with diagonal weights.
+and the noise is never part of it. The last part has no cross terms: it suits a quadratic cost with diagonal weights.
 
 With a reflection s the process has only functions with f(s x) = p f(x), s x elementwise. Its squared exponential is
 sigma_f^2 (e(x, x') + p e(x, s x')), the covariance of (f(x) + p f(s x)) / sqrt(2). Its polynomial parts keep only the

@@ -1,9 +1,10 @@
 """Pooling: outputs that are the same function of different inputs learn from each other's samples.
 
-Masses in a row, tanks in series and rooms side by side obey the same law with inputs of their own. If their samples are
-far more likely as those of one function, all of them learn from all samples. Evidence is that of the targets in their
-own unit, priors of hyperparameters included. The function comes from the process that is known best and reads few
-inputs; for each other process, a search finds which of its inputs correspond to that function's arguments.
+Masses in a row, tanks in series and rooms side by side obey the same law with inputs of their own. If the samples of
+several outputs are more likely as those of one function, each of these outputs learns from the samples of all. Evidence
+is that of the targets in their own unit, priors of hyperparameters included. The function is first that of the output
+that depends on few inputs and is predicted best; for each other output, a search finds which of its inputs correspond
+to this function's arguments.
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ from surrogym_server.gp.search import Evidence, blas, minimum
 from surrogym_server.gp.subsets import FEW, spread
 
 Inputs = tuple[int, ...]
-# Number of starts of a search for corresponding inputs, and greatest number of steps from each start.
+# The search for the inputs of one output that correspond to those of another has this many starts, and at most this
+# many steps from each start.
 STARTS, SWEEPS = 3, 4
 
 
@@ -36,7 +38,7 @@ class Part:
         x: inputs (n, D).
         y: standardised targets (n,); in the output's unit they are centre + scale y.
         hyper: hyperparameters of the process of all inputs, for standardised targets.
-        centre, scale: mean and scale with which the targets were standardised, see ``y``.
+        centre, scale: mean and standard deviation with which the targets were standardised, see ``y``.
         options: options with which the process was fitted.
         reads: indices of the inputs that the output probably depends on, ascending.
         fewer: hyperparameters of the process that reads only the inputs ``reads``.
@@ -130,8 +132,8 @@ def pools(parts: Sequence[Part], most: int) -> list[Pool]:
     """Group outputs (parts) into pools: outputs whose samples are more likely under one common function than under
     separate functions. Runs on the CPU.
 
-    A part that probably depends on at most ``most`` inputs starts a pool, in the order of the leave-one-out errors, the
-    smallest first. Each part that is not in a pool yet may join it.
+    Each part that probably depends on at most ``most`` inputs may start a pool, in ascending order of the parts'
+    leave-one-out errors. Each part that is in no earlier pool may join.
 
     Raises:
         NumericalFailure: no jitter makes the covariance of a part's points positive definite.
@@ -157,8 +159,8 @@ def _inputs_alike(part: Part, other: Part) -> Inputs | None:
     """Return the inputs of ``other`` that correspond to the inputs ``reads`` of ``part``; None if the two parts are
     more likely separate functions.
 
-    All assignments of inputs have the same prior probability. Both alternatives are compared without fitting
-    hyperparameters again.
+    All assignments of inputs have the same prior probability. One function and two functions are compared without
+    fitting hyperparameters again.
     """
     if part.options != other.options:
         return None
@@ -192,8 +194,8 @@ def _played(process: Posterior, x: Tensor, y: Tensor, may: Tensor) -> Inputs | N
     """Find the inputs of x (n, D) with which a process predicts targets y (n,) best; None if no choice is allowed.
 
     The search starts at the inputs that correlate most with the targets. As long as this reduces the mean squared
-    error, it replaces one input by another, which may be one of the chosen; the two then change places. ``may`` (d, D)
-    says which of the D inputs of x may be used as each of the d inputs of the process.
+    error, it replaces a chosen input by another input, or lets two chosen inputs change places. ``may`` (d, D) is true
+    where one of the D inputs of x may be used as one of the d inputs of the process.
     """
     d, size = may.shape
     if size < d or not bool(may.any(1).all()):
@@ -236,8 +238,8 @@ def _may_read(may: Tensor, inputs: Inputs) -> bool:
 
 
 def _errors(process: Posterior, x: Tensor, y: Tensor, choices: Sequence[Inputs]) -> Tensor:
-    """Return, for each of t choices of inputs, the mean squared error with which the process predicts targets y (n,)
-    from these columns of x, (t,)."""
+    """Return, for each of t choices of d columns of x (n, D), the mean squared error with which the process predicts
+    targets y (n,) from these columns, (t,)."""
     points = torch.cat([x[:, list(inputs)] for inputs in choices])
     return (process.mean(points).view(len(choices), len(y)) - y).square().mean(1)
 

@@ -1,7 +1,7 @@
-"""Exact posterior (eq. 6 and 7, with the inverses that the paper omits).
+"""Exact posterior of a Gaussian process (eq. 6 and 7 of the AUR paper, with the inverses that the paper omits).
 
 mean(x) = k(x, X) (K + sigma_n^2 I)^-1 y,  var(x) = k(x, x) - |L^-1 k(X, x)|^2 with L L^T = K + sigma_n^2 I.
-The variance is the latent one, without noise; it is taken by a triangular solve, never through an inverse.
+The variance is that of the function, without noise; it is computed by a triangular solve, never through an inverse.
 Reference: Rasmussen and Williams (2006), algorithm 2.1.
 """
 
@@ -25,9 +25,9 @@ class LeftOut:
     """Accuracy of leave-one-out predictions: each point of a process is predicted from all other points."""
 
     error: float  # root mean square error, in units of y
-    within_one: float  # share of the points within one predictive standard deviation
-    within_two: float  # share of the points within two predictive standard deviations
-    log_density: float  # mean log predictive density
+    within_one: float  # share of the points whose error is at most one predictive standard deviation
+    within_two: float  # share of the points whose error is at most two predictive standard deviations
+    log_density: float  # mean over the points of the log predictive density of the target
 
     @classmethod
     def of(cls, error: Tensor, variance: Tensor) -> LeftOut:
@@ -44,15 +44,16 @@ class Sparse:
     """Summary of the many points to which a process with inducing points was fitted."""
 
     points: int  # number of points that the process was fitted to
-    # Root mean square standard deviation that the inducing points leave unexplained, as a share of the prior's.
+    # Standard deviation of the points given the inducing points, as a share of their prior standard deviation; both are
+    # root mean squares over all points.
     unexplained: float
     left_out: LeftOut  # accuracy at the points that the process was fitted to
 
 
 @dataclass(frozen=True)
 class Posterior:
-    """A process conditioned on n points. It contains everything that predictions need, so that nothing is computed
-    again after loading it."""
+    """A Gaussian process conditioned on n points. It contains everything that predictions need, so that nothing is
+    computed again after loading a model from a file."""
 
     hyper: Hyperparameters
     x: Tensor  # (n, d) inputs of the points
@@ -60,7 +61,7 @@ class Posterior:
     factor: Tensor  # (n, n) lower Cholesky factor of K + (sigma_n^2 + jitter) I
     weights: Tensor  # (n,) beta, the weights of the points in the mean
     jitter: float  # added to the diagonal before factoring, usually 0
-    sparse: Sparse | None = None  # None if the n points are all the data; see ``gp.sparse``
+    sparse: Sparse | None = None  # None if the n points are all samples; otherwise they are inducing points
 
     def mean(self, x: Tensor) -> Tensor:
         """Return the posterior mean at x (m, d), (m,)."""
@@ -168,8 +169,8 @@ def factorise(k: Tensor) -> tuple[Tensor, float]:
             return factor.contiguous(), relative * scale
         relative *= 10
     raise NumericalFailure(
-        f"the covariance of {len(k)} points is singular, even with {MAX_JITTER:g} of its mean added to the diagonal; "
-        "look for far outlying values in the samples"
+        f"the covariance matrix of {len(k)} samples is not positive definite, even with {MAX_JITTER:g} of its mean "
+        "diagonal entry added to the diagonal; look for extreme outliers in the samples"
     )
 
 

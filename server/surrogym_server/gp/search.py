@@ -11,7 +11,7 @@ from functools import cache
 from typing import Protocol
 
 import numpy as np
-import scipy  # SciPy loads its parts on first use, so a server that fits nothing starts sooner
+import scipy  # SciPy imports its submodules on first use, so a server that fits no model starts sooner
 from threadpoolctl import ThreadpoolController
 from torch import Tensor
 
@@ -59,8 +59,8 @@ class Evaluated:
     """Negative log evidence and its gradient at one theta, with intermediate results."""
 
     value: float
-    slopes: Array  # gradient over theta
-    half: Array  # (P,) entries of 1/2 (beta beta^T - K^-1) with i >= j; those off the diagonal are doubled
+    slopes: Array  # gradient of ``value`` with respect to theta
+    half: Array  # (P,) entries (i, j) of 1/2 (beta beta^T - K^-1) with i >= j; those off the diagonal are doubled
     weighted: Array  # (1, P), or (2, P) with a reflection: product of ``half`` and the squared exponential
     weights: Array  # (n,) beta = K^-1 y
 
@@ -78,8 +78,8 @@ class Evidence(Parameters):
         n = len(x)
         self.n, self.x, self.y = n, x.numpy(), y.numpy()
         self.rows, self.columns = np.tril_indices(n)
-        self.places = self.rows * n + self.columns  # index of each pair in the flattened (n, n) matrix
-        # How often an entry with i >= j occurs in the symmetric matrix.
+        self.places = self.rows * n + self.columns  # index of each entry (i, j), i >= j, in the flattened (n, n) matrix
+        # How often the value of each entry (i, j) with i >= j occurs in a symmetric matrix.
         self.twice = np.where(self.rows == self.columns, 1.0, 2.0)
         mirrored = [] if reflection is None else [x * reflection.signs]
         differences = [other.numpy()[self.columns] - x.numpy()[self.rows] for other in (x, *mirrored)]
@@ -113,13 +113,14 @@ class Evidence(Parameters):
         return (1e10, np.zeros_like(theta)) if terms is None else (terms.value, terms.slopes)
 
     def evaluated(self, theta: Array) -> Evaluated | None:
-        """Return value and gradient at theta, or None if the covariance matrix has no Cholesky factor in float64."""
+        """Return the negative log evidence and its gradient at theta; None if the covariance matrix has no Cholesky
+        factor in float64."""
         lengthscale, signal, linear, quadratic, noise = self.values(theta)
         precision = lengthscale**-2
         smooth = (-0.5 * precision) @ self.squared
         np.exp(smooth, out=smooth)
         smooth *= signal
-        # One row for pairs of points, and with a reflection another for pairs with a mirror image.
+        # The first row is for pairs of points; with a reflection, a second is for pairs of a point and a mirror image.
         smooth = smooth.reshape(-1, len(self.rows))
         k = smooth[0] + linear * self.linear + quadratic * self.quadratic
         if self.parity:
@@ -144,8 +145,8 @@ class Evidence(Parameters):
         return Evaluated(float(value), gradient, half, weighted, weights)
 
     def over_inputs(self, theta: Array, terms: Evaluated) -> Array:
-        """Return the gradient of the value at theta with respect to the inputs x, (n, d). ``terms`` is the result of
-        ``evaluated``.
+        """Return the gradient of the negative log evidence at theta with respect to the inputs x, (n, d). ``terms`` is
+        the result of ``evaluated`` at theta.
 
         Valid only without a reflection and without a quadratic part.
         """
@@ -161,7 +162,7 @@ class Evidence(Parameters):
         """Return K^-1 (only its lower half is valid), K^-1 y, and 1/2 log det K; None if K has no Cholesky factor.
 
         Args:
-            matrix: the covariance matrix K (n, n). Only its lower half is read, and it is overwritten.
+            matrix: the covariance matrix K (n, n), noise included. Only its lower half is read, and it is overwritten.
         """
         lapack = scipy.linalg.lapack
         upper, info = lapack.dpotrf(matrix.T, lower=0, overwrite_a=1)  # the transpose has LAPACK's column order

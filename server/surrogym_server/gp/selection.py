@@ -1,9 +1,9 @@
-"""Inputs that a process leaves out, because it is at least as likely without them.
+"""Selection of inputs: a process leaves out inputs if its samples are about as likely without them, or likelier.
 
 A long length scale takes an input out of the squared exponential, but not out of the linear part, whose variance all
-inputs share, and each length scale is one number more that few points have to determine. So inputs are eliminated one
-after the other, as long as the process wins by it: each time the one without which the log evidence, priors of
-hyperparameters included, is greatest. Reference: Rasmussen and Williams (2006), section 5.1.
+inputs share, and few points have to determine each further length scale. So inputs are eliminated one after the other:
+each time the input without which the log evidence, priors of hyperparameters included, is greatest. This ends when the
+log evidence decreases too much. Reference: Rasmussen and Williams (2006), section 5.1.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ class Selection:
 
 
 def select_inputs(posterior: Posterior, options: FitOptions, may: Tensor, odds: float) -> Selection:
-    """Leave out inputs of an exact process, one after the other, as long as the process without the input is likely
-    enough. Runs on the CPU.
+    """Leave out inputs of an exact process, one after the other, as long as the log evidence does not decrease by more
+    than ``odds`` for an input. Runs on the CPU.
 
     Args:
         posterior: the process with all inputs, and its points.
         options: options with which the process was fitted.
-        may: (d,) bool, the inputs that may be left out. At least one input is kept.
+        may: (d,) bool, true for each input that may be left out. At least one input is kept.
         odds: prior log odds of leaving out one more input. An input is left out if the log evidence decreases by at
             most this number; if it is negative, the log evidence has to increase by that much.
     """
@@ -71,8 +71,8 @@ class _Search:
         return Evidence(self._posterior.x[:, mask], self._posterior.y, self._options, part)
 
     def whole(self) -> _Subset:
-        """Return the subset of all inputs. Its hyperparameters are fitted, starting at those of the process, which may
-        have been fitted to other points."""
+        """Return the subset of all inputs with its fitted hyperparameters. The fit starts at those of the process,
+        which may have been fitted to other points."""
         mask = torch.ones_like(self._may)
         theta = self.objective(mask).theta(self._posterior.hyper)
         return self.fitted(_Subset(mask, theta, 0.0))
@@ -83,7 +83,8 @@ class _Search:
         return replace(subset, theta=theta, cost=cost)
 
     def without_one(self, subset: _Subset, most: float) -> _Subset | None:
-        """Return the subset with one input less that has the lowest cost, or None if this cost is above ``most``.
+        """Return the subset with one input less that has the lowest cost (negative log evidence), or None if this cost
+        is above ``most``.
 
         Its hyperparameters are fitted again only if the cost with the hyperparameters of ``subset`` is above ``most``.
         """

@@ -1,17 +1,17 @@
-"""Prediction of all outputs that read one set of inputs, in a few matrix products.
+"""Prediction of all outputs of a model at the same inputs, by a few matrix products.
 
 The exponent of the squared exponential is linear in z(x) = [x, x^2, 1] (elementwise square):
 
     -1/2 sum_j (x_j - X_ij)^2 / l_j^2 = sum_j x_j X_ij / l_j^2 - 1/2 sum_j x_j^2 / l_j^2 - 1/2 sum_j X_ij^2 / l_j^2,
 
-so exp(z A) holds the smooth covariances of all outputs with all their points. The polynomial parts are linear in z as
-well, z R, so their share of the mean collapses into z Q, Q = R beta, and all means are exp(z A) W + z Q.
+so exp(z A) are the squared exponentials of x with the points X_i of all outputs. The polynomial covariances z R are
+linear in z as well, so their part of the mean is z Q with Q = R beta, and all means are exp(z A) W + z Q.
 The variance, k(x, x) - |L^-1 k(X, x)|^2, takes a triangular solve and is computed for the requested outputs only.
 A process with a reflection has the columns of its points and then those of their mirror images.
 
-The products lose digits that differences keep: |error of the exponent| <= (2 d + 2) eps (|x| + |X_i|)^2 / 2, inputs in
-length scales. ``of`` bounds what that does to the mean and the variance (see ``_error_bounds``), and where a bound is
-too large the exponent is taken by differences.
+The products lose digits that differences keep: |error of the exponent| <= (2 d + 2) eps (|x| + |X_i|)^2 / 2, for inputs
+divided by the length scales. ``_error_bounds`` bounds the errors of mean and variance that result. If a bound is too
+large, the exponent is computed from differences.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from surrogym_server.gp.kernel import Hyperparameters, to_mirror
 from surrogym_server.gp.posterior import Posterior
 from surrogym_server.tensors import CPU, in_blocks
 
-BLOCK = 262_144  # number of covariances computed at once, so that they fit into the cache and memory is bounded
-MIN_ROWS = 64  # least number of rows predicted at once
+BLOCK = 262_144  # greatest number of covariances computed at once, so that they fit into the processor's cache
+MIN_ROWS = 64  # inputs are predicted in blocks of at least this many rows, even if their covariances exceed ``BLOCK``
 MEAN_TOLERANCE = 1e-8  # accepted rounding error of the mean, in prior standard deviations
 VARIANCE_TOLERANCE = 5e-10  # accepted rounding error of the variance, in prior variances
 
@@ -54,14 +54,14 @@ class _Process:
     has D entries."""
 
     span: slice  # columns of ``Serving.exponents`` that belong to the output
-    inputs: Tensor  # columns of x that the process reads
+    inputs: Tensor  # (d,) indices of the model's inputs that the process reads
     inverse_lengthscale: Tensor  # (d,) 1 / lengthscale
     scaled: Tensor  # (n, d) points divided by length scales; with a reflection also their mirror images, (2 n, d)
     factor: Tensor  # (n, n) lower Cholesky factor L, divided by sigma_f^2
     polynomial: Tensor | None  # (D, n) coefficients R of the polynomial covariances, divided by sigma_f^2
-    prior: Tensor  # (D,) coefficients of z^2 in the prior variance, without the mirror image's term
+    prior: Tensor  # (D,) coefficients of z^2 in the prior variance, without the part that comes from the mirror image
     signal_variance: float
-    parity: int  # 1 or -1; 0 without a reflection
+    parity: int  # 1 for even functions, -1 for odd functions, 0 without a reflection
     # (D,) coefficients of z in the exponent of the squared exponential between x and its mirror image.
     mirror: Tensor | None
     scale: float
@@ -104,17 +104,17 @@ class _Process:
 
 @dataclass(frozen=True)
 class Serving:
-    """Outputs of a model, compiled so that few matrix products predict all of them at inputs x (m, width). A prediction
-    has O columns."""
+    """Outputs of a model, arranged so that few matrix products predict all of them at inputs x (m, width), each of the
+    m points with the ``width`` inputs of the model. A prediction (m, O) has a column for each of the O outputs."""
 
-    exponents: Tensor  # A (D, S), coefficients of the exponents; S points of all processes
+    exponents: Tensor  # A (D, S), coefficients of the exponents for the S points of all processes
     weights: Tensor  # W (S, O), weights of the points in the means, multiplied by the outputs' scales
     polynomials: Tensor  # Q (D, O), coefficients of the polynomial parts of the means, in the outputs' units
     processes: dict[int, _Process]  # process of each output column; constant outputs have none
 
     @classmethod
     def of(cls, outputs: Sequence[Output], columns: int, width: int, device: torch.device = CPU) -> Serving:
-        """Compile outputs for prediction on one device.
+        """Arrange outputs for prediction on one device.
 
         Args:
             outputs: the outputs, each with its column.
@@ -141,7 +141,7 @@ class Serving:
 
     @property
     def rows(self) -> int:
-        """Number of rows that are predicted at once."""
+        """Number of rows of x that are predicted at once."""
         return max(MIN_ROWS, BLOCK // max(1, self.exponents.shape[1]))
 
     def mean(self, x: Tensor) -> Tensor:
@@ -269,10 +269,10 @@ def _error_bounds(posterior: Posterior) -> tuple[float, float]:
     """Return bounds on the rounding errors of mean and variance if exponents are computed by matrix products. They hold
     for inputs up to twice as far from the origin as the farthest point.
 
-    With delta the largest error of an exponent, the error of the mean is at most sigma_f^2 delta |beta|_1, in prior
-    standard deviations. The error of the variance is 2 |L^-1 k| |L^-1 dk| <= 2 s sigma_f^2 delta sqrt(n) / sigma_n, in
-    prior variances; s^2 = sigma_f^2 + sigma_l^2 is the smallest prior variance. Mirror images double both. For an odd
-    process s^2 = sigma_f^2, because its variance is 0 on the mirror, where its value is known.
+    With delta the largest error of an exponent and s^2 = k(x, x), the error of the mean is at most sigma_f^2 delta
+    |beta|_1, and that of the variance 2 |L^-1 k| |L^-1 dk| <= 2 s sigma_f^2 delta sqrt(n) / sigma_n. They are returned
+    as shares of s and s^2, with sigma_f^2 + sigma_l^2 as the smallest s^2, or sigma_f^2 for an odd process, whose
+    variance is 0 on the mirror, where its value is known. Mirror images double both errors.
     """
     hyper, (n, d) = posterior.hyper, posterior.x.shape
     reach = float((posterior.x / hyper.lengthscale).square().sum(1).max())

@@ -1,19 +1,20 @@
 """Processes with many points: a few inducing points represent them all, with the same interface as an exact process.
 
-m of the n points are chosen, Z, by pivoted Cholesky: each is the one that the others explain least. With V = L^-1 k(Z,
-X), L L^T = k(Z, Z), and C = V V^T, the projected process (R&W (2006), section 8.3.4) predicts
+m of the n points X are chosen as inducing points Z, by pivoted Cholesky: each is the point that those chosen before
+explain least. With V = L^-1 k(Z, X), L L^T = k(Z, Z), and C = V V^T, the projected process (R&W (2006), section 8.3.4)
+predicts
 
     mean(x) = k(x, Z) L^-T (C + sigma_n^2 I)^-1 V y,
     var(x) = k(x, x) - k(x, Z) (F F^T)^-1 k(Z, x),  F = L chol(I + sigma_n^2 C^-1).
 
-So it is an exact process of the m points with the factor F, the values y_Z = F F^T weights, and the noise sigma_n^2 L
-C^-1 L^T, which is the noise that remains if m points represent n. It is served, stored, extended and sampled like any
-other process. Far from Z its variance returns to the prior's.
+So it is an exact process of the m points with the factor F, the values y_Z = F F^T weights, and the noise covariance
+sigma_n^2 L C^-1 L^T, which is the noise that remains if m points represent n. It is served, stored, extended and
+sampled like any other process. Far from Z its variance returns to the prior's.
 
-Its m values are not data, because each represents many points. So leave-one-out errors are those of the n points, with
-h_i = (V^T (C + sigma_n^2 I)^-1 V)_ii:
+Its m values y_Z are not measured, because each represents many points. So leave-one-out errors are those of the n
+points, with h_i = (V^T (C + sigma_n^2 I)^-1 V)_ii and the variance v_i of point i given the values at Z:
 
-    y_i - mean_{-i} = (y_i - mean(x_i)) / (1 - h_i),  var_{-i} = sigma_n^2 / (1 - h_i) + what Z leaves of k(x_i, x_i).
+    y_i - mean_{-i} = (y_i - mean(x_i)) / (1 - h_i),  var_{-i} = sigma_n^2 / (1 - h_i) + v_i.
 
 References: Fine and Scheinberg (2001) for the choice of Z; Seeger, Williams, Lawrence (2003) for the projected process.
 """
@@ -30,9 +31,9 @@ from surrogym_server.gp.kernel import Hyperparameters, covariance, variance
 from surrogym_server.gp.posterior import BLOCK, LeftOut, Posterior, Sparse, condition, factorise
 
 MAX_EXACT = 2_000  # a process with more points uses inducing points
-INDUCING = 1_000  # greatest number of inducing points, unless the caller gives another
-NOISES = (1.0, 1e2)  # noise variances to try, as multiples of the fitted one
-SHARE = 1e-12  # lower limit of the weight that all other points have in the prediction at a point
+INDUCING = 1_000  # greatest number of inducing points, unless the caller gives another number
+NOISES = (1.0, 1e2)  # noise variances that ``condition_many`` tries, as multiples of the fitted noise variance
+SHARE = 1e-12  # lower limit of 1 - h_i in the leave-one-out formulas, against a division by 0
 # No further inducing point is chosen if the unexplained variance of all points is below the first share of the prior
 # variance, or below the second share of the noise variance.
 EXPLAINED, BELOW_NOISE = 1e-10, 1e-3
@@ -68,11 +69,11 @@ def condition_many(
 ) -> Posterior:
     """Condition a process on x (n, d) and y (n,); with more than ``MAX_EXACT`` points through inducing points.
 
-    Up to ``MAX_EXACT`` points the result is exact, with the last hyperparameters. With more, one of the candidates is
-    selected by its predictions of all points, each from the others, and of the ``censored`` points, because a fit to a
-    subset may miss rare points. First the density of these predictions selects the noise of each candidate, because
-    inducing points cause errors that the fitted noise does not include. Then the mean squared error selects the
-    candidate. Rasmussen and Williams (2006), section 5.4.2.
+    Up to ``MAX_EXACT`` points the result is exact, with the last hyperparameters. With more, candidates are compared by
+    their predictions of each point from all others and of the ``censored`` points, because a fit to a subset may miss
+    rare points. First, the noise of each candidate is chosen by the density of its predictions, because inducing points
+    cause errors that the fitted noise does not include. Then the candidate with the least squared errors is chosen.
+    Rasmussen and Williams (2006), section 5.4.2.
 
     Args:
         hypers: candidate hyperparameters. The last one was fitted to the most points.
@@ -97,8 +98,8 @@ def condition_many(
 
 
 def condition_sparse(hyper: Hyperparameters, x: Tensor, y: Tensor, most: int | None = None) -> Posterior:
-    """Condition a process on x (n, d) and y (n,) through at most ``most`` inducing points, by default ``INDUCING``, in
-    O(n m^2).
+    """Condition a process on x (n, d) and y (n,) through m inducing points, at most ``most`` or by default
+    ``INDUCING``, in O(n m^2) time.
 
     Raises:
         NumericalFailure: no jitter makes a covariance positive definite.
@@ -107,8 +108,8 @@ def condition_sparse(hyper: Hyperparameters, x: Tensor, y: Tensor, most: int | N
 
 
 def pivots(hyper: Hyperparameters, x: Tensor, most: int) -> Tensor:
-    """Return indices (m,) of at most ``most`` of the points x (n, d), in the order in which they are chosen: each is
-    the point whose variance given the earlier ones is greatest."""
+    """Choose at most ``most`` of the points x (n, d): each is the point whose prior variance, given the function's
+    values at the points chosen before, is greatest. Return their indices (m,) in this order."""
     return _pivots(hyper, x, most)[0]
 
 
@@ -116,8 +117,8 @@ def hardest(posterior: Posterior, x: Tensor, y: Tensor, most: int) -> Tensor:
     """Return the indices of at most ``most`` of the points x (n, d), y (n,): those that the posterior, which was fitted
     to all of them, predicts worst.
 
-    The first half is chosen by pivoted Cholesky: each is the point whose variance given the earlier ones is greatest.
-    The second half are the points with the largest residuals.
+    The first half is chosen by pivoted Cholesky: each is the point whose prior variance, given the function's values at
+    the points chosen before, is greatest. The second half are the points with the largest residuals.
     """
     apart, _, _ = _pivots(posterior.hyper, x, most // 2)
     off = (y - posterior.mean(x)).abs().index_fill(0, apart, -1.0)

@@ -11,7 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-FEW, SOME = 150, 400  # numbers of points to which a process is fitted: to compare alternatives, and for the chosen one
+# A process is fitted to at most ``FEW`` points to compare alternatives, and to at most ``SOME`` for the one chosen.
+FEW, SOME = 150, 400
 SEED = 0
 
 
@@ -19,8 +20,8 @@ def spread(points: int, most: int) -> Tensor:
     """Select at most ``most`` of the points, as ascending indices (m,).
 
     If there are no more than ``most`` points, all are selected. Otherwise the sequence of points is cut into ``most``
-    equal parts, and one random point of each part is selected, always with the same seed. Points at equal distances
-    could all lie at one phase of a periodic sequence.
+    equal parts, and one random point of each part is selected, always with the same seed. They are random, because
+    points at equal distances could all lie at one phase of a periodic sequence.
     """
     if points <= most:
         return torch.arange(points)

@@ -1,1 +1,1 @@
-"""The design of queries: Latin hypercube, confidence index, occupancy, acquisition, and the rounds of Algorithm 1."""
+"""The design: it chooses the real steps to request (queries), and decides when the model is good enough."""

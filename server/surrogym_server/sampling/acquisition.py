@@ -1,13 +1,14 @@
-"""Acquisitions: criteria that value a query (eq. 12 and 13). One class for each criterion; packages may add their own.
+"""Acquisitions: criteria that rate real steps that may be requested (eq. 12 and 13). Packages may add their own.
 
-An acquisition rates candidates, or predicted paths, with respect to one output of the model. Its laws:
+An acquisition rates candidate steps, or predicted paths, with respect to one output of the model. Its rules:
 
 - it is a pure function of its arguments and its settings: no state, no random numbers of its own;
-- it returns one value for each candidate (m,), or for the first t steps of each path (b, T); only their order counts;
+- it returns one value for each of m candidates (m,), or one for the first 1, 2, ... T steps of each of b paths (b, T);
 - larger values are better, and every value is finite;
 - it does not change its arguments.
 
-``value_of`` and ``path_value_of`` call the acquisition, and raise if its values break these laws.
+``value_of`` and ``path_value_of`` call the acquisition, and raise an error if its values have a wrong shape or are not
+finite.
 
 Its settings are the fields of a frozen dataclass: numbers, booleans and strings, as the specification holds them.
 """
@@ -35,13 +36,14 @@ GROUP = "surrogym.acquisitions"
 
 @dataclass(frozen=True)
 class CandidateView:
-    """Properties of m candidates for queries from which an acquisition rates them, with respect to one output."""
+    """Properties of m candidate steps (states and actions) from which an acquisition rates them, with respect to one
+    output of the model."""
 
     model: DynamicsModel
-    points: Points  # m states and actions
-    output: int  # index of the output, in the order of the definition
-    tolerance: float  # tolerance of the output, in the output's unit
-    # (m,) standard deviation without noise, in the output's unit, as if all pending queries had been answered.
+    points: Points  # the m candidates: states and actions
+    output: int  # index of the output in ``definition.outputs``
+    tolerance: float  # error that is too small to matter, in the output's unit
+    # (m,) standard deviation without noise, in the output's unit, as if all earlier queries had been answered.
     std: Tensor
     distance: Tensor  # (m,) distance to the nearest query so far, in standard deviations of the sampling range
     # (m,) logarithm of the input probability P_i (eq. 11); 0 unless the acquisition sets ``reads_probability``.
@@ -50,8 +52,8 @@ class CandidateView:
 
     @cached_property
     def variance_reduction(self) -> Tensor:
-        """How much an answer at each candidate would reduce the weighted variance over the reference points, (m,). Only
-        acquisitions that set ``reads_reference`` may use it."""
+        """How much a real step at each candidate would reduce the weighted variance over the reference points, (m,).
+        Only acquisitions with ``reads_reference`` = True may use it."""
         return self._reduction()
 
 
@@ -59,8 +61,8 @@ class CandidateView:
 class PathView:
     """Properties of b predicted paths of T steps from which an acquisition rates them, with respect to one output."""
 
-    tolerance: float  # tolerance of the output, in the output's unit
-    # (b, T) at least 0; weight of each step: 0 outside the sampling range, smaller where the path is uncertain.
+    tolerance: float  # error that is too small to matter, in the output's unit
+    # (b, T) weight of each step, at least 0: 0 outside the sampling range, and smaller where the path is uncertain.
     weight: Tensor
     _std: Callable[[], Tensor]
     _information: Callable[[], Tensor]
@@ -72,15 +74,15 @@ class PathView:
 
     @cached_property
     def information(self) -> Tensor:
-        """Information about the output, in nats, that each path gives up to each of its steps, (b, T)."""
+        """Information about the output, in nats, that the first 1, 2, ... T steps of each path give, (b, T)."""
         return self._information()
 
 
 class Acquisition(ABC):
-    """Criterion that rates queries by their expected use. The docstring of this module says what every criterion has to
-    obey."""
+    """Criterion that rates candidates for the next real steps. The docstring of this module has the rules for its
+    subclasses."""
 
-    adaptive: ClassVar[bool] = True  # if False, the whole budget is queried before the first fit
+    adaptive: ClassVar[bool] = True  # if False, all steps of the budget are requested before the first fit of a model
     reads_reference: ClassVar[bool] = False  # whether the acquisition uses ``variance_reduction``
     reads_probability: ClassVar[bool] = False  # whether the acquisition uses ``log_probability``
 
@@ -94,23 +96,21 @@ class Acquisition(ABC):
 
     @abstractmethod
     def value(self, candidates: CandidateView) -> Tensor:
-        """Return the value of a query at each of m candidates, (m,). The candidate with the largest value is
-        queried."""
+        """Return the value of a real step at each of m candidates, (m,). The step with the largest value is
+        requested."""
 
     def path_value(self, paths: PathView) -> Tensor:
-        """Return the value of each path if it is followed up to each of its steps, (b, T). The value does not decrease
-        along a path.
+        """Return the value of the first 1, 2, ... T steps of each of b paths, (b, T). More steps never have less value.
 
-        By default it is the information about the output that the steps give, where each step counts with what it adds
-        to the earlier ones.
+        By default it is the information about the output that these steps give together.
         """
         return paths.information
 
 
 @dataclass(frozen=True)
 class IntegratedVariance(Acquisition):
-    """Criterion: by how much an answer to the query would reduce the variance at reference points, which are spread
-    over the sampling range and the states that policies visited.
+    """Criterion: by how much a real step at the candidate would reduce the variance at reference points, which are
+    spread over the sampling range and the states that policies visited.
 
     Reference: D. Cohn (1993), NIPS 6.
     """
@@ -134,7 +134,8 @@ class Variance(Acquisition):
 
 @dataclass(frozen=True)
 class UncertaintyIndex(Acquisition):
-    """Criterion of the paper: the uncertainty index, log U = log U_m + log P_i (eq. 12)."""
+    """Criterion of the paper: the uncertainty index, log U = log U_m + log P_i (eq. 12), with the model uncertainty U_m
+    and the input probability P_i."""
 
     reads_probability: ClassVar[bool] = True
 
@@ -148,8 +149,8 @@ class UncertaintyIndex(Acquisition):
 
 @dataclass(frozen=True)
 class LatinHypercube(Acquisition):
-    """Criterion of a design that is not adaptive: the whole budget is one Latin hypercube. Queries after that are as
-    far as possible from all earlier ones."""
+    """Criterion of a design that is not adaptive: all steps of the budget form one Latin hypercube. If more steps are
+    requested, each is as far as possible from all earlier ones."""
 
     adaptive: ClassVar[bool] = False
 
@@ -186,14 +187,14 @@ def check_acquisition(definition: EnvironmentDefinition) -> None:
 
 
 def value_of(choice: Choice, candidates: CandidateView) -> Tensor:
-    """Return the acquisition's value of each of m candidates, (m,). Raises ``ChoiceFailed`` if the acquisition fails or
-    the values are not finite numbers of this shape."""
+    """Return the value that the acquisition ``choice`` gives to each of m candidates, (m,). Raises ``ChoiceFailed`` if
+    the acquisition fails or the values are not m finite numbers."""
     return _criterion_values(choice, acquisition_of(choice).value, candidates, candidates.distance.shape)
 
 
 def path_value_of(choice: Choice, paths: PathView) -> Tensor:
-    """Return the acquisition's value of each of b paths if it is followed up to each of its T steps, (b, T). Raises
-    ``ChoiceFailed`` if the acquisition fails or the values are not finite numbers of this shape."""
+    """Return the value that the acquisition ``choice`` gives to the first 1, 2, ... T steps of each of b paths, (b, T).
+    Raises ``ChoiceFailed`` if the acquisition fails or the values are not finite numbers of this shape."""
     return _criterion_values(choice, acquisition_of(choice).path_value, paths, paths.weight.shape)
 
 
@@ -202,9 +203,18 @@ def _criterion_values(choice: Choice, criterion: Callable[[Any], Tensor], view: 
     with guarded(what, ChoiceFailed):
         values: object = criterion(view)
     if not isinstance(values, Tensor):
-        raise ChoiceFailed(f"{what}: expected a tensor of shape {tuple(shape)}, got {type(values).__name__}")
+        raise ChoiceFailed(
+            f"{what}: expected a tensor of shape {tuple(shape)}, got {type(values).__name__}; "
+            "correct the values that this acquisition returns"
+        )
     if values.shape != shape:
-        raise ChoiceFailed(f"{what}: expected a tensor of shape {tuple(shape)}, got {tuple(values.shape)}")
+        raise ChoiceFailed(
+            f"{what}: expected a tensor of shape {tuple(shape)}, got {tuple(values.shape)}; "
+            "correct the values that this acquisition returns"
+        )
     if bad := int((~values.isfinite()).sum()):
-        raise ChoiceFailed(f"{what}: expected finite values, got {bad} of {values.numel()} that are infinite or NaN")
+        raise ChoiceFailed(
+            f"{what}: expected finite values, got {bad} of {values.numel()} that are infinite or NaN; "
+            "correct the values that this acquisition returns"
+        )
     return values

@@ -1,4 +1,5 @@
-"""Greedy batches of queries from a candidate set, by an acquisition (eq. 13)."""
+"""Choose several real steps to request (queries) from a set of candidates, one after the other, by an acquisition
+(eq. 13)."""
 
 from __future__ import annotations
 
@@ -16,7 +17,8 @@ from surrogym_server.sampling.acquisition import CandidateView, acquisition_of, 
 from surrogym_server.sampling.candidates import Candidates
 from surrogym_server.sampling.outlook import outlook_of
 
-NEAR = 0.02  # queries closer than this, in standard deviations of the sampling range, count as duplicates
+# A candidate closer than this to an earlier query, in standard deviations of the sampling range, is not chosen.
+NEAR = 0.02
 
 
 def choose(
@@ -27,8 +29,8 @@ def choose(
     outputs: Sequence[int],
     tolerances: Sequence[float],
 ) -> list[int]:
-    """Choose queries one after the other: for each of the ``outputs`` the candidate with the largest value of the
-    acquisition, as if the queries chosen before were answered.
+    """Choose real steps to request (queries) one after the other: for each entry of ``outputs`` the candidate with the
+    largest value of the acquisition, as if the queries chosen before were answered.
 
     Args:
         model: the model whose standard deviations the batch should lower.
@@ -39,8 +41,8 @@ def choose(
         tolerances: (O,) tolerance of each output, in its unit.
 
     Returns:
-        Indices of the chosen candidates. There are fewer of them than ``outputs`` if every other candidate is close to
-        a query.
+        Indices of the chosen candidates. There are fewer of them than entries of ``outputs`` if all other candidates
+        are close to a query or would teach nothing.
     """
     definition, points = model.definition, candidates.points
     acquisition = definition.design.acquisition
@@ -81,10 +83,10 @@ def candidate_view(
     """Return the properties of the candidates that an acquisition uses, for one output.
 
     Args:
-        model: the model of the round.
+        model: the model from which the outlook was computed.
         candidates: the m candidates.
         column: index of the output, which must vary in the samples.
-        outlook: forecast of how answers would change the variance of this output.
+        outlook: forecast of how further real steps would change the variance of this output.
         tolerance: tolerance of this output, in its unit.
         distance: (m,) distance of each candidate to the nearest query so far.
     """

@@ -1,4 +1,5 @@
-"""Candidate points for queries: from the declared ranges, and from the states that policies visited."""
+"""Candidates for the next real steps: states and actions from the sampling range and from the states that policies
+visited."""
 
 from __future__ import annotations
 
@@ -15,31 +16,34 @@ from surrogym_server.sampling.acquisition import acquisition_of
 from surrogym_server.sampling.latin_hypercube import random_points
 from surrogym_server.sampling.occupancy import log_occupancy
 
-MAX_CANDIDATES = 4_096  # greatest number of candidates of each kind, which bounds the memory for covariances
-REFERENCE = 256  # number of reference points of each kind: from the Monte Carlo set, and from visited states
-# Share of the reference points' total weight that visited states have; points of the whole range have the rest.
+MAX_CANDIDATES = 4_096  # at most this many candidates come from the Monte Carlo set, and as many from visited states
+REFERENCE = 256  # at most this many reference points come from the Monte Carlo set, and as many from visited states
+# If policies have visited states, these have this share of the total weight of the reference points at which a query
+# should reduce the variance. Reference points from the Monte Carlo set have the rest.
 OCCUPIED = 0.75
 
 
 @dataclass(frozen=True)
 class Candidates:
-    """Candidate points (states and actions) for queries, their input probabilities, and the reference points at which
-    queries should reduce the variance."""
+    """Candidates for the next real steps (states and actions), their input probabilities, and the reference points at
+    which these steps should reduce the model's variance."""
 
-    points: Points  # m candidates
+    points: Points  # the m candidates: states and actions
     log_p: Tensor  # (m,) logarithm of the input probability P_i (eq. 11); 0 if the acquisition does not use it
-    reference: Points  # r reference points
+    reference: Points  # r states and actions at which the variance should become small
     weights: Tensor  # (r,) weight of each reference point in the mean variance; the weights add up to 1
-    reserved: Tensor | None = None  # (m,) bool: candidates to query first, near a termination or a peak of the reward
+    # (m,) bool, true for the candidates of which one becomes the first query, because they are near a termination, a
+    # jump or a peak of the reward; None if there are none.
+    reserved: Tensor | None = None
 
 
 def candidates_of(model: DynamicsModel, points: Points, states: Tensor | None, rng: np.random.Generator) -> Candidates:
-    """Build candidates from the Monte Carlo set, m ``points`` spread over the sampling range, and from states (v, C)
-    that policies visited, with random actions.
+    """Build candidates for queries from the Monte Carlo set, m ``points`` spread over the sampling range, and from
+    ``states`` (v, C) that policies visited, with random actions.
 
-    Visited states are added because few points of the Monte Carlo set lie where a policy goes. The reference points are
-    chosen from both in the same way. Visited states outside the sampling range or within the margin of a limit are left
-    out: if the model is wrong, a policy can reach states to which the real system must not be set.
+    Visited states are added because few points of the Monte Carlo set lie where a policy goes. Reference points are
+    chosen from both sets too. Visited states outside the sampling range or within the margin of a limit are left out:
+    if the model is wrong, a policy can reach states to which the real system must not be set.
     """
     definition = model.definition
     states = None if states is None else states[definition.in_range(states) & ~definition.falls_back(states, states)]
@@ -58,8 +62,8 @@ def candidates_of(model: DynamicsModel, points: Points, states: Tensor | None, r
 
 
 def with_reserved(candidates: Candidates, points: Points) -> Candidates:
-    """Add k points to the candidates and reserve only these for the next query. Their input probability is the largest
-    of all candidates."""
+    """Add k ``points`` to the candidates and reserve only them: the first query of the round is one of them. They get
+    the largest input probability of all candidates."""
     log_p = torch.cat([candidates.log_p, candidates.log_p.max().expand(len(points))])
     points_of_all = Points.joined([candidates.points, points])
     reserved = torch.arange(len(points_of_all)) >= len(candidates.points)
@@ -69,8 +73,8 @@ def with_reserved(candidates: Candidates, points: Points) -> Candidates:
 def input_probability(model: DynamicsModel, points: Points, states: Tensor | None) -> Tensor:
     """Return the logarithm of the input probability P_i (eq. 11) at m points, (m,), given visited states (v, C).
 
-    It follows from the density of the visited states. Without visited states it is 0, or, if the definition's
-    ``input_probability`` is "predicted", it follows from the density of the model's predicted next states.
+    It follows from the density of the visited states. Without visited states the logarithm is 0, or, if the
+    definition's ``input_probability`` is "predicted", it follows from the density of the predicted next states.
     """
     definition = model.definition
     if states is not None and len(states):

@@ -1,7 +1,7 @@
 """Confidence of a model over a Monte Carlo set: eq. 8 to 10, with a tolerance tau for each output.
 
-C_m = Phi(tau / sigma). The paper has tau = 1 in the output's raw unit, so its value depends on units. U_m = 1 - C_m is
-kept as a logarithm, because the difference rounds to 0 if sigma is below tau / 8.
+The certainty at a point is C_m = Phi(tau / sigma). The paper has tau = 1 in the output's unit, so its C_m depends on
+the unit. The model uncertainty U_m = 1 - C_m is kept as a logarithm, because it rounds to 0 if sigma is below tau / 8.
 """
 
 from __future__ import annotations
@@ -19,33 +19,33 @@ from surrogym_server.models.port import DynamicsModel
 from surrogym_server.sampling.prequential import PrequentialScores
 from surrogym_server.sampling.regions import Region, regions_of
 
-SUREST = 1e9  # upper limit of the ratio of tolerance to standard deviation
+SUREST = 1e9  # the ratio of tolerance to standard deviation is at most this, so that log U_m is finite
 
 
 @dataclass(frozen=True)
 class OutputConfidence:
-    """Measures of how well a model knows one output, and of what limits its knowledge, such as noise."""
+    """How well a model knows one output (confidence index, prediction errors), and what limits it, such as noise."""
 
-    confidence_index: float  # mean certainty over the Monte Carlo set (eq. 8)
-    confidence_index_paper: float  # the paper's index, with a tolerance of 1 in the output's unit
-    coverage: float  # share of the Monte Carlo set where the standard deviation is below the tolerance
-    # Root mean square error, in the output's unit; None if the model family does not compute leave-one-out errors.
+    confidence_index: float  # mean certainty C_m over the Monte Carlo set (eq. 8)
+    confidence_index_paper: float  # the confidence index with a tolerance of 1 in the output's unit, as in the paper
+    coverage: float  # share of the Monte Carlo set where the standard deviation is at most the tolerance
+    # Root mean square leave-one-out error, in the output's unit; None if the model family does not compute it.
     leave_one_out_error: float | None
-    leave_one_out_within_one: float | None  # share of the samples within one predictive standard deviation
-    leave_one_out_within_two: float | None  # share of the samples within two predictive standard deviations
-    # Standard deviation of a single step's noise, confirmed by repeated or consecutive steps, in the output's unit.
+    leave_one_out_within_one: float | None  # share of leave-one-out errors up to one predictive standard deviation
+    leave_one_out_within_two: float | None  # share of leave-one-out errors up to two predictive standard deviations
+    # Standard deviation of one step's noise, in the output's unit; 0 unless repeated or consecutive steps confirm it.
     noise: float = 0.0
     # Standard deviation of one measurement by the sensor; 0 unless most of the noise comes from the sensor.
     sensor_noise: float = 0.0
-    # Share of the squared errors that earlier steps explain, for example because of a dead time or a hidden state.
+    # Share of the model's squared errors that earlier steps of the episode explain, as with a dead time.
     past: float = 0.0
     region: Region | None = None  # part of the sampling range in which most of the model uncertainty lies
     prequential: PrequentialScores | None = None  # scores of predictions of samples before the model learned from them
 
 
 def stds(model: DynamicsModel, q: Tensor, u: Tensor) -> Tensor:
-    """Return the standard deviation, without noise, of every output at q (m, C) and u (m, F), the reward last:
-    (m, O)."""
+    """Return the standard deviation, without noise, of each of the O outputs at states q (m, C) and actions u (m, F),
+    (m, O). The last output is the reward."""
     transition = model.transition(q, u, stds=True, reward_std=True)
     require_shapes(model, transition, q, stds=True)
     assert transition.std is not None
@@ -76,8 +76,8 @@ def log_uncertainty_index(log_model_uncertainty: Tensor, log_probability: Tensor
 def confidences_of(
     model: DynamicsModel, points: Points, std: Tensor, tolerances: Sequence[float]
 ) -> list[OutputConfidence]:
-    """Return the confidence of every output (O,), from the standard deviations of all outputs (m, O) at the points of
-    the Monte Carlo set."""
+    """Return the confidence of every output (O,), from their standard deviations ``std`` (m, O) at the m points of the
+    Monte Carlo set."""
     able = offers(model, LeaveOneOut)
     errors = [None] * len(tolerances) if able is None else able.leave_one_out()
     doubt = log_model_uncertainty(std, std.new_tensor(tolerances)).exp()
@@ -87,8 +87,8 @@ def confidences_of(
 
 
 def confidence(std: Tensor, tolerance: float, errors: LeaveOneOutErrors | None) -> OutputConfidence:
-    """Return the confidence of one output, from its standard deviations (m,) at the points of the Monte Carlo set, its
-    tolerance, and its leave-one-out errors (None if unknown)."""
+    """Return the confidence of one output, from its standard deviations (m,) at the m points of the Monte Carlo set,
+    its tolerance, and its leave-one-out errors (None if unknown)."""
     return OutputConfidence(
         float(certainty(std, tolerance).mean()),
         float(certainty(std, 1.0).mean()),

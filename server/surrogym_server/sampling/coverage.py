@@ -1,9 +1,9 @@
-"""Search for those initial queries of a design that a log makes unnecessary."""
+"""Find the initial real steps of a design that need not be taken, because a log contains similar steps."""
 
 from __future__ import annotations
 
 import numpy as np
-import scipy  # scipy loads its parts on first use, so a server that needs none starts sooner
+import scipy  # SciPy imports its submodules on first use, so a server that needs none of them starts sooner
 from numpy.typing import NDArray
 
 from surrogym_server.environment.definition import EnvironmentDefinition
@@ -13,9 +13,10 @@ Bools = NDArray[np.bool_]
 
 
 def covered(definition: EnvironmentDefinition, q: Array, u: Array, logged_q: Array, logged_u: Array) -> Bools:
-    """Return which of m planned queries are unnecessary because recorded steps of a log lie close enough, (m,) bool.
+    """Return for each of m planned steps (queries) whether it is unnecessary because a logged step lies close enough,
+    (m,) bool.
 
-    A query is unnecessary if the distance to the nearest logged step is less than half the distance to the nearest
+    A query is unnecessary if its distance to the nearest logged step is less than half its distance to the nearest
     other query.
 
     Distances combine the differences of all coordinates and actions, in widths of the sampling range; those of angles
@@ -31,15 +32,15 @@ def covered(definition: EnvironmentDefinition, q: Array, u: Array, logged_q: Arr
         return np.zeros(len(q), dtype=np.bool_)
     queries, steps = _places(definition, q, u), _places(definition, logged_q, logged_u)
     tree = scipy.spatial.cKDTree(queries)
-    other = tree.query(queries, k=2)[0][:, 1]  # infinite if there is no other query
+    other = tree.query(queries, k=2)[0][:, 1]  # distance to the nearest other query, infinite if there is none
     nearest: Array = scipy.spatial.cKDTree(steps).query(queries)[0]
     result: Bools = nearest < 0.5 * other
     return result
 
 
 def _places(definition: EnvironmentDefinition, q: Array, u: Array) -> Array:
-    """Map n states and actions to points (n, D) whose Euclidean distances are the distances that the docstring of
-    ``covered`` describes."""
+    """Map n states q (n, C) and actions u (n, F) to points (n, D) whose Euclidean distances are those that the
+    docstring of ``covered`` describes."""
     columns: list[Array] = []
     for index, coordinate in enumerate(definition.coordinates):
         if coordinate.kind == "angle":

@@ -1,6 +1,6 @@
-"""Algorithm 1 of the paper: one call for its start, and one call for each round.
+"""Algorithm 1 of the AUR paper (see docs/glossary.md): one function for its start, and one for each round.
 
-The real steps of the algorithm are taken elsewhere and take long, so the algorithm is cut where it waits for them:
+Real steps take long, and samplers take them, so the algorithm is split where it waits for them:
 
 =========  ============================================================  ==============================================
 line       of Algorithm 1                                                where
@@ -16,8 +16,8 @@ line       of Algorithm 1                                                where
 15         step function of the virtual environment                      ``virtual``
 =========  ============================================================  ==============================================
 
-A policy is trained in the virtual environment, by ``surrogym_trainer``. All functions here are pure: samples and state
-in, decision and state out.
+A policy is trained in the virtual environment, by ``surrogym_trainer``. All functions here are pure: they receive
+samples and state, and return a decision and the next state.
 """
 
 from __future__ import annotations
@@ -42,7 +42,8 @@ from surrogym_server.sampling.tolerances import frozen_tolerances
 from surrogym_shared.nouns import Query
 from surrogym_shared.states import Verdict
 
-# With more points only one Latin hypercube is drawn, because comparing the distances of all pairs takes much memory.
+# With more initial points only one Latin hypercube is drawn. Otherwise several are compared by the distances of all
+# pairs of points, which takes much memory.
 FEW_POINTS = 500
 
 
@@ -52,15 +53,15 @@ class Decision:
     the next queries."""
 
     model: DynamicsModel
-    confidences: tuple[OutputConfidence, ...]  # (O,) confidence of each output
-    tolerances: tuple[float, ...]  # (O,) tolerances of the confidences: declared or default, widened by confirmed noise
+    confidences: tuple[OutputConfidence, ...]  # (O,) how well the model knows each output
+    tolerances: tuple[float, ...]  # (O,) tolerance of each output: declared or default, widened by confirmed noise
     state: DesignState  # state to pass to the next round
     verdict: Verdict
-    queries: tuple[Query, ...]  # queries of the next round
+    queries: tuple[Query, ...]  # real steps that are requested before the next round
 
 
 def initial_queries(definition: EnvironmentDefinition, budget: int) -> tuple[Query, ...]:
-    """Return the queries before the first fit, with at most ``budget`` real steps in total.
+    """Return the real steps to request (queries) before the first fit of a model, at most ``budget`` in total.
 
     They are a Latin hypercube, or random rollouts if the environment can't be set to any state.
     """
@@ -79,14 +80,14 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
     """Do one round of Algorithm 1 of the paper: lines 3 to 6, 8 to 10 and 12 to 14. The module's docstring says where
     the other lines are.
 
-    The paper fits models again after every real step (line 12). Here a round chooses several queries, each as if those
-    chosen before it were answered. The next round fits when all of them have answers.
+    The paper fits models again after every real step (line 12). Here a round chooses several real steps to request
+    (queries), each as if those chosen before had been taken. The next round starts when all of them are taken.
 
     Args:
         definition: the environment, with the settings of its design.
         samples: results of all real steps so far.
         state: state that the previous round returned; ``DesignState()`` before the first round.
-        request: budget and target of the design, and those of its queries that have no answer.
+        request: budget and target of the design, and its queries without an answer.
 
     Raises:
         InvalidInput: too few samples to learn from.
@@ -97,25 +98,27 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
     # Lines 3, 4 and 12: fit the processes of all outputs, transitions and reward, to all samples.
     fit = learn(definition, samples, state.warm, request.prior)
 
-    # CI needs a tolerance for each output, (O,): the declared one, or a default, which is 1 in preset "paper" and
-    # otherwise 5 % of the output's standard deviation. Later rounds keep it, unless the range of the samples grows far.
+    # The confidence index (CI) needs a tolerance for each output, (O,): the declared one, or a default, which is 1 in
+    # preset "paper" and otherwise 5 % of the output's standard deviation in the first round. Later rounds compute a
+    # default again only if the range of the samples has grown a thousandfold, or larger with snapshots.
     defaults = frozen_tolerances(definition, samples, state.defaults)
     tolerances = definition.tolerances_or(defaults.values)
 
     # Lines 5, 6, 13, and the test of line 14: the CI of each output over the Monte Carlo set, whose points are also
-    # candidates below, and a verdict: "continue", or why the design may end, such as a spent budget. Tolerances are
-    # widened by confirmed noise here. Unless stopping is "confidence", as in the paper, leave-one-out errors have to be
-    # within them too, ends and peaks of the reward have to be known, and some adaptive queries have to be answered.
+    # candidates for queries, and a verdict: "continue", or why the design may end, such as a spent budget. Tolerances
+    # are widened by confirmed noise here. Unless the stopping rule is "confidence", as in the paper, leave-one-out
+    # errors must be within the tolerances too, ends of episodes and peaks of the reward must be known, and some
+    # adaptive steps must have been taken.
     judgement = judge_model(fit.model, samples, tolerances, request, state)
 
-    # A ready design stays ready until a person asks for more, or new samples contradict the model. Another ended design
-    # takes no further steps until its conditions change, and becomes ready if its model is. The cost is the number of
-    # real steps taken, without those of logs and audits.
+    # A ready design stays ready until a person changes budget, target or tolerances, or new samples contradict the
+    # model. A design that ended without being ready takes no further steps until its conditions change, and becomes
+    # ready if its model satisfies the stopping rule. ``request.cost`` leaves out real steps of logs and audits.
     conditions = Conditions(request.cost(len(samples)), request.budget, request.target, tolerances)
     verdict = verdict_with_history(judgement, state, request, conditions)
 
-    # Not in the paper: a ready design that begins at snapshots continues for an excursion, a rollout beyond the sampled
-    # states that tests the model. Without room for it in the budget, the design ends as not ready.
+    # Not in the paper: if the environment has snapshots, a ready design continues for an excursion, an action sequence
+    # beyond the sampled states that tests the model. If the budget has no steps left for it, the design ends not ready.
     testing = verdict == "ready" and _lacks_excursion(definition, samples, state)
     if testing:
         tested_at = len(samples)
@@ -123,24 +126,24 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
         tested_at = state.tested_at if verdict == "ready" else 0
     continues = verdict == "continue" or testing
 
-    # Line 8, "for each process with CI < target": the indices of these outputs, the least confident first; if there is
-    # none, the least confident output alone.
+    # Line 8, "for each process with CI < target": the indices of the outputs with CI < target, the least confident
+    # first. If there are none, only the output with the lowest CI.
     outputs = below_target(judgement.confidences, request.target)
 
     # Lines 9 and 10: the first rule that does not return None chooses the queries. The last rule, which always applies,
-    # is that of the paper: for each of these outputs, query the candidate with the largest value of the acquisition
+    # is that of the paper: for each index in ``outputs``, query the candidate with the largest value of the acquisition
     # (the uncertainty index U in preset "paper"), or plan rollouts; candidates that may end an episode are reserved for
-    # the first query. Earlier rules are not in the paper, such as repeats, which show what is noise. A design that has
-    # ended chooses no query, or as many steps as ``request.extra``.
+    # the first query. The rules before it are not in the paper, such as repeated steps, which show what is noise. A
+    # design that has ended chooses only ``request.extra`` further steps, by default none.
     round = Round(state.round, fit.model, samples, request, judgement, tolerances, outputs, continues, testing)
     rules = STEP_RULES if definition.max_rollout is None else ROLLOUT_RULES
     queries = next(choice for rule in rules if (choice := rule(round)) is not None)
     if continues:
         verdict = _verdict_with(queries, round)
 
-    # Store the state that the next round needs; the caller of ``advance`` adds the predictions of the new samples. A
-    # design with extra queries has not ended, whatever its verdict. A design that has ended continues if the conditions
-    # change.
+    # The state that the next round needs; the caller of ``advance`` adds the predictions of the new samples. A design
+    # with queries has not ended, even if its verdict is not "continue". The conditions are stored so that a design that
+    # has ended continues if they change.
     ended = verdict != "continue" and not queries
     following = DesignState(
         round=state.round + 1,
@@ -155,11 +158,10 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
 
 
 def _verdict_with(queries: tuple[Query, ...], round: Round) -> Verdict:
-    """Return the verdict on a design that may continue: "continue" if a query was chosen or an earlier one may still be
-    answered. Otherwise the design ends.
+    """Return the verdict on a design that may continue: "continue" if a query was chosen or an earlier query may still
+    be answered, otherwise "unsure", or "over_budget" if the budget is spent.
 
-    Without a query, either every candidate is close to an earlier query, or the rest of the budget is too small for
-    one.
+    If no query was chosen, either every candidate is close to an earlier query, or the rest of the budget is too small.
     """
     if queries or round.request.open:
         return "continue"
@@ -167,9 +169,9 @@ def _verdict_with(queries: tuple[Query, ...], round: Round) -> Verdict:
 
 
 def _lacks_excursion(definition: EnvironmentDefinition, samples: Samples, state: DesignState) -> bool:
-    """Return whether a ready design still has to be tested by an excursion. It has to if the stopping rule is
-    ``tested_confidence``, if the environment has snapshots, and if no excursion was planned yet or no sample has come
-    since the last one was planned."""
+    """Return whether a ready design still has to be tested by an excursion (see ``sampling.excursions``). It has to if
+    the stopping rule is ``tested_confidence``, if the environment has snapshots, and if no excursion was planned yet or
+    no sample has come since the last excursion was planned."""
     if not definition.snapshots or definition.design.stopping != "tested_confidence":
         return False
     return not state.tested_at or len(samples) <= state.tested_at

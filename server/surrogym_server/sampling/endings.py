@@ -1,5 +1,5 @@
-"""Queries reserved for the end of an episode and for edges of the reward, where the model needs samples from both
-sides."""
+"""Find candidates for queries at which an episode may end or the reward jumps, because the model needs samples from
+both sides of such an edge."""
 
 from __future__ import annotations
 
@@ -13,22 +13,23 @@ from surrogym_server.environment.samples import Samples
 from surrogym_server.models.abilities import RewardEdges, offers
 from surrogym_server.models.port import DynamicsModel
 
-# States whose distance from the range of earlier states, in widths of this range, is below this need no query.
+# If no candidate's next state is farther than this outside the range of the samples' states, in widths of this range,
+# no query is reserved to search there for an unknown termination.
 FRONTIER = 0.1
-# Acceptable probability, as a mean over the candidates, that the model is wrong about a termination or a jump of the
-# reward.
+# If the probability that the model is wrong about a termination or a jump of the reward, as a mean over the candidates,
+# is at most this, no query is reserved to find out.
 DOUBT = 0.005
 
 
 def ending(model: DynamicsModel, samples: Samples, points: Points) -> Tensor | None:
-    """Return which of m candidates are reserved for the next query, because it should clarify where episodes end or
-    where the reward jumps, (m,) bool; None if this is clear.
+    """Return which of m candidates are reserved for the next query, because it should show where episodes end or where
+    the reward jumps, (m,) bool; None if this is known well enough.
 
-    The first of these groups that is not empty is reserved. With a declared termination: the points at which the model
-    predicts an end, as long as no sample has ended an episode; then the points at which a jump of the reward is
-    doubtful. With a learned termination: the points at which it is most doubtful whether the episode ends; then the
-    points at which a jump of the reward is doubtful; then those that lie farthest outside the range of known
-    non-terminal states, where an unknown termination may lie.
+    Several groups are tried, and the first that is not empty is reserved. With a declared termination: the points at
+    which the model predicts an end, as long as no sample has ended an episode; then the points at which a jump of the
+    reward is doubtful. With a learned termination: the points at which it is most doubtful whether the episode ends;
+    then the points at which a jump of the reward is doubtful; then the points whose next state lies farthest outside
+    the range of known non-terminal states, where an unknown termination may lie.
     """
     q_next = model.transition(points.q, points.u).q_next
     if not model.definition.learns_termination:
@@ -61,8 +62,8 @@ def edge_in_doubt(model: DynamicsModel, q: Tensor, q_next: Tensor) -> Tensor:
 
 
 def _edges(model: DynamicsModel, points: Points, q_next: Tensor) -> Tensor | None:
-    """Return the candidates at which it is most doubtful whether the step lies inside a region at whose edge the reward
-    jumps, (m,) bool. The first region with doubt counts; None if there is none."""
+    """Return for each candidate whether it is among those at which it is most doubtful on which side of an edge, where
+    the reward jumps, the step lies, (m,) bool. The first doubtful edge is used. None if no edge is doubtful."""
     for doubt in _edge_doubts(model, points.q, q_next):
         if float(doubt.mean()) > DOUBT:
             return doubt >= 0.5 * doubt.max()

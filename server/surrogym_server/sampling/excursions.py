@@ -1,8 +1,8 @@
-"""Excursions: action sequences that test a model where no sample has been.
+"""Excursions: action sequences that test a model where there are no samples.
 
-A design that begins at resets or snapshots sees a small part of the sampling range at first. A model that fits this
-part can be sure of all the rest and wrong there: beside an inflection every function looks linear. So before such a
-design is ready, one sequence leads away from all samples.
+If real steps begin at resets or snapshots, the first ones cover a small part of the sampling range. A model that fits
+this part can be sure of the rest and wrong there: near an inflection point every function looks linear. So before a
+design with snapshots is ready, one sequence leads away from all samples.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ from surrogym_server.models.port import DynamicsModel
 from surrogym_server.sampling.rollouts import Sequences, best_rollout, predict_paths
 from surrogym_shared.nouns import Query, Vector
 
-# Distance that the end of an excursion should have from all samples, in standard deviations of the sampling range.
+# An excursion should end at least this far from the states of all samples, in standard deviations of the sampling
+# range.
 FAR = 0.5
 LONGEST = 16  # greatest number of actions of an excursion
 
@@ -55,10 +56,10 @@ def _reach(model: DynamicsModel, samples: Tensor, starts: Tensor, sequences: Seq
         model: the model.
         samples: states (n, C) of all samples.
         starts: s equally likely first states for each of k sequences, (k, s, C).
-        sequences: actions (k, T, F).
+        sequences: k sequences of T actions, (k, T, F).
 
     Returns:
-        Value of each sequence (k,), and the number of its first actions that give this value (k,).
+        Value of each sequence (k,), and the number of actions (k,) after which it is reached.
     """
     count, lanes = starts.shape[:2]
     paths = predict_paths(model, starts.flatten(0, 1), torch.from_numpy(sequences).repeat_interleave(lanes, 0))
@@ -67,7 +68,7 @@ def _reach(model: DynamicsModel, samples: Tensor, starts: Tensor, sequences: Seq
     away = (away.reshape(paths.running.shape) * paths.running).reshape(count, lanes, -1).mean(1)
     farthest = away.max(1)
     reached = away >= FAR
-    first = reached.double().argmax(1)  # the first step that reaches FAR, because argmax returns the first of equals
+    first = reached.double().argmax(1)  # index of the first step that reaches FAR: argmax returns the first maximum
     value = torch.where(reached.any(1), FAR + away.shape[1] - first, farthest.values)
     return value, torch.where(reached.any(1), first, farthest.indices) + 1
 

@@ -1,4 +1,4 @@
-"""Judgement of a model: confidence of each output, the verdict that follows, and candidates for the next queries."""
+"""Judge a model: how well it knows each output, whether the design has to continue, and candidates for queries."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ from surrogym_shared.states import Verdict
 
 @dataclass(frozen=True)
 class Judgement:
-    """Judgement of a model: how well it knows each output, the verdict that follows, and the candidates for the next
-    queries."""
+    """Judgement of a model with O outputs: how well it knows each, the verdict that follows, and the candidates for the
+    next queries."""
 
-    confidences: tuple[OutputConfidence, ...]  # (O,) confidence of each output
-    # (O,) tolerances with which the confidences were computed, which include confirmed noise.
+    confidences: tuple[OutputConfidence, ...]  # (O,) how well the model knows each output
+    # (O,) tolerance of each output for which its confidence was computed: sqrt(tolerance^2 + noise^2), confirmed noise.
     widened_tolerances: tuple[float, ...]
     verdict: Verdict  # verdict that follows from this model alone, without regard to earlier rounds
     candidates: Candidates  # points from which the next queries are chosen
@@ -65,7 +65,8 @@ def judge_model(
         sensors = tuple(None if any(past) else one for one in sensor_noise(model, samples, tolerances))
         of_sensors = noise_of_sensors(model, samples, sensors, tolerances)
         noise = established_noise(model, samples, tolerances).maximum(of_sensors)
-        # A hidden state may influence every output, so differences between repeated steps are no evidence of noise.
+        # If earlier steps explain errors of any output, there is a hidden state, which may influence every output. Then
+        # differences between repeated steps are no evidence of noise.
         if any(past):
             noise = torch.zeros_like(noise)
     widened = widened_by(noise, tolerances)
@@ -95,7 +96,7 @@ def judge_model(
         settled = False
         if (
             candidates.reserved is None or state.round % 2
-        ):  # if both endings and peaks need queries, they get them in alternate rounds
+        ):  # if both ends of episodes and a peak of the reward need queries, rounds serve them alternately
             candidates = with_reserved(candidates, peak)
     verdict = judge(definition, confidences, widened, len(samples), request, settled)
     return Judgement(confidences, widened, verdict, candidates)
@@ -116,13 +117,14 @@ def judge(
     request: Request,
     settled: bool = True,
 ) -> Verdict:
-    """Decide whether the design continues, is ready, or has spent its budget.
+    """Return the verdict on a model: "ready", "continue", "over_budget" if the budget is spent, or "from_log" if the
+    budget is 0.
 
     A design is ready if the confidence index of every output has reached the target. With the stopping rule
-    ``tested_confidence`` three more conditions have to be met: leave-one-out errors are known and within the
-    tolerances; ends of episodes and peaks of the reward are known; and at least half as many adaptive queries as
-    initial ones were answered. Logged samples count as initial ones, because they were not chosen to disprove the
-    model.
+    ``tested_confidence`` the budget must also be above 0, and three more conditions have to be met: leave-one-out
+    errors are known and within the tolerances; ends of episodes and peaks of the reward are known; and at least half as
+    many adaptive steps as initial ones were taken. Logged steps count as initial ones, because they were not chosen to
+    disprove the model.
 
     Args:
         definition: the environment, with the settings of its design.
@@ -146,15 +148,15 @@ def judge(
 
 
 def agrees(confidence: OutputConfidence, tolerance: float) -> bool:
-    """Return whether the leave-one-out error of an output is known and within the tolerance. If the output has
-    confirmed noise, the error may be slightly larger."""
+    """Return whether the leave-one-out error of an output is known and within the tolerance, or within 1.25 times the
+    tolerance if the output has confirmed noise."""
     limit = SLACK * tolerance if confidence.noise else tolerance
     return confidence.leave_one_out_error is not None and confidence.leave_one_out_error <= limit
 
 
 def below_target(confidences: Sequence[OutputConfidence], target: float) -> list[int]:
-    """Return the indices of the outputs whose confidence index is below the target, the lowest first. If there is none,
-    return only the index of the output with the lowest confidence index."""
+    """Return the indices of the outputs whose confidence index is below the target, the lowest first. If all reach the
+    target, return only the index of the output with the lowest confidence index."""
     index = [confidence.confidence_index for confidence in confidences]
     order = sorted(range(len(index)), key=index.__getitem__)
     return [i for i in order if index[i] < target] or order[:1]
@@ -164,9 +166,10 @@ def verdict_with_history(judgement: Judgement, state: DesignState, request: Requ
     """Return the verdict on a design, given the verdict on its present model and how the design ended in an earlier
     round, if it did.
 
-    A design that was ready stays ready, unless a person has asked for more or later steps contradict the model. Without
-    this rule, a fit to more steps could lower the confidence index a little, although the model had predicted these
-    steps well. A design that has ended does not continue only because audits or logs have added samples.
+    A design that was ready stays ready, unless a person has changed its budget, target or tolerances, or later steps
+    contradict the model. Without this rule, a design could lose its readiness because a fit to further steps lowers the
+    confidence index a little, although the model had predicted these steps well. A design that has ended does not
+    continue only because audits or logs have added samples.
 
     Args:
         judgement: judgement of the present model.
@@ -194,9 +197,9 @@ def _asks_more(now: Conditions, before: Conditions | None) -> bool:
 
 
 def _contradicted(judgement: Judgement, request: Request) -> bool:
-    """Return whether the recent prediction errors of an output exceed its tolerance.
+    """Return whether the recent prediction errors of any output exceed 1.25 times its tolerance, as root mean square.
 
-    These are the errors with which the previous model predicted the newest samples. If there are no new samples,
+    Recent errors are those with which the previous model predicted the newest samples. If there are no new samples,
     leave-one-out errors are used.
     """
     surprises = request.surprises

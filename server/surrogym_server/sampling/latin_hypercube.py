@@ -1,9 +1,10 @@
-"""Latin hypercube over the joint state-action space (section 3.2): equally probable intervals, one point in each."""
+"""Latin hypercube over states and actions (section 3.2 of the paper): each input is divided into equally probable
+intervals with one point in each."""
 
 from __future__ import annotations
 
 import numpy as np
-import scipy  # scipy loads its parts on first use, so a server that needs none starts sooner
+import scipy  # SciPy imports its submodules on first use, so a server that needs none of them starts sooner
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
@@ -11,7 +12,7 @@ from torch import Tensor
 from surrogym_server.environment.definition import EnvironmentDefinition
 
 Array = NDArray[np.float64]
-REDRAWS = 100  # greatest number of times that unsuitable points are drawn again
+REDRAWS = 100  # greatest number of times that points in terminated states or near a limit are drawn again
 
 
 def latin_hypercube(
@@ -54,8 +55,8 @@ def going_on(
 
 
 def from_unit(definition: EnvironmentDefinition, p: Tensor) -> tuple[Tensor, Tensor]:
-    """Map probabilities p (n, C + F) in [0, 1) to coordinates (n, C) and actions (n, F) of the sampling
-    distributions."""
+    """Map probabilities p (n, C + F) in [0, 1) to coordinates (n, C) and actions (n, F) by the quantile functions of
+    the sampling distributions."""
     size = len(definition.coordinates)
     q = torch.stack([c.sampling.quantile(p[:, i]) for i, c in enumerate(definition.coordinates)], -1)
     action, u = definition.action, p[:, size:]

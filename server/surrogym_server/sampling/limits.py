@@ -1,6 +1,6 @@
-"""Search for declared limits at which many samples end.
+"""Find declared limits of coordinates at which many samples end.
 
-A limit cuts the change of a coordinate off, so such samples say little about the dynamics.
+A limit cuts the change of a coordinate off, so samples that end at a limit say little about the dynamics.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ class Limit:
     coordinate: str
     side: Side
     value: float
-    share: float  # share of the samples that end at the limit
+    share: float  # share of the samples whose next state is at the limit
 
 
 def reached_limits(definition: EnvironmentDefinition, samples: Samples) -> tuple[Limit, ...]:
-    """Return the limits at which a share of ``MANY`` or more of the samples end, the most frequent first."""
+    """Return the limits at which at least the share ``MANY`` (0.2) of the samples end, the most frequent first."""
     if not len(samples):
         return ()
     limits: list[Limit] = []

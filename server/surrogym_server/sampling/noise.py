@@ -1,9 +1,9 @@
 """Distinguish noise of the original environment from misfit of the model, by steps that are taken twice.
 
-A process that does not fit its samples explains the rest as noise. Only a repeat of the same step shows which it is: a
-deterministic environment gives the same result. Repeats are few, so each conclusion is a chi-squared test, at the level
-``LEVEL``, of the sum of their squared differences from their mean. Steps are repeated until every doubtful output has a
-conclusion.
+A Gaussian process that does not fit its samples explains the residuals as noise. Only a repetition of the same step
+distinguishes misfit from noise: a deterministic environment gives the same result. Repeated steps are few, so each
+conclusion is a chi-squared test, at the level ``LEVEL``, of the sum of the squared differences of their results from
+their mean. Steps are repeated until each output with large learned noise has a conclusion.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import scipy  # scipy loads its parts on first use, so a server that needs none starts sooner
+import scipy  # SciPy imports its submodules on first use, so a server that needs none of them starts sooner
 import torch
 from torch import Tensor
 
@@ -22,21 +22,21 @@ from surrogym_server.environment.samples import Samples, increments, preceding, 
 from surrogym_server.models.abilities import LearnedNoise, LeaveOneOut, offers
 from surrogym_server.models.port import DynamicsModel
 
-ENOUGH = 3  # least number of degrees of freedom of the repeats with which noise can be confirmed
-STAGES = (1, ENOUGH, 6, 9)  # numbers of degrees of freedom up to which steps are repeated before the next test
-LEVEL = 0.01  # significance level of each test
+ENOUGH = 3  # noise is confirmed only after at least this many repetitions of earlier steps
+STAGES = (1, ENOUGH, 6, 9)  # a test for noise follows when this many earlier steps have been repeated
+LEVEL = 0.01  # significance level of each test for noise
 NEGLIGIBLE = 0.5  # true noise below this share of the tolerance is confirmed with probability ``LEVEL`` at most
-# If learned noise is larger than the noise of repeats by more than this factor, it is misfit of the model.
+# If the noise that a model has learned is larger than that of repeated steps by more than this factor, it is misfit.
 AT_MOST = 3.0
-SLACK = 1.25  # a leave-one-out error may exceed noise or tolerance by this factor by chance, because samples are few
+SLACK = 1.25  # a leave-one-out error up to this many times the tolerance is accepted, because samples are few
 
 
 @dataclass(frozen=True)
 class Repeats:
     """Differences between the results of steps that were taken several times (repeats), pooled over all such steps."""
 
-    degrees: int  # degrees of freedom: number of samples less the number of different steps
-    std: Tensor  # (O,) standard deviation of the result of one step, in each output's unit
+    degrees: int  # degrees of freedom: number of samples less the number of different steps among them
+    std: Tensor  # (O,) standard deviation of an output's values at the same step, in the output's unit
 
 
 def repeats(model: DynamicsModel, samples: Samples) -> Repeats:
@@ -60,7 +60,7 @@ def _conditions(definition: EnvironmentDefinition, samples: Samples) -> Tensor:
     of the step before.
 
     The first step of an episode has zeros for the step before. If the environment can be set to any state, the step
-    before is left out, because such an environment does not remember it.
+    before is left out, because it does not influence the result.
     """
     now = torch.cat([samples.q, samples.u], -1)
     if definition.max_rollout is None:
@@ -73,7 +73,7 @@ def _conditions(definition: EnvironmentDefinition, samples: Samples) -> Tensor:
 def established_noise(model: DynamicsModel, samples: Samples, tolerances: Sequence[float]) -> Tensor:
     """Return the standard deviation of each output's noise that repeated steps confirm, in the output's unit, (O,).
 
-    It is 0 if repeated steps confirm no noise, or if the noise is below the output's tolerance.
+    It is 0 if repeated steps confirm no noise, or if the noise that the model has learned is within the tolerance.
     """
     model_noise, limits = _model_noise(model, tolerances)
     differences = repeats(model, samples)
@@ -87,11 +87,11 @@ def to_repeat(model: DynamicsModel, samples: Samples, tolerances: Sequence[float
     """Return earlier steps (states and actions) that should be taken again to tell noise from misfit of the model; None
     if none are needed.
 
-    Repeats are needed if noise above a tolerance could explain the samples, and repeats have neither confirmed nor
-    refuted it yet. First one step is repeated, which suffices to refute noise if the environment is deterministic.
-    Further repeats follow in the ``STAGES``. An output is also tested again if its confirmed noise does not explain its
-    leave-one-out error, because few repeats may show too little noise. Steps that ended at a bound are not repeated,
-    because the bound hides noise.
+    Repetitions are needed if noise above a tolerance could explain the samples, and repeated steps have neither
+    confirmed nor refuted this noise. First one step is repeated, which suffices to refute noise if the environment is
+    deterministic. Further repetitions follow until their number is the next of ``STAGES``. An output is also tested
+    again if its confirmed noise does not explain its leave-one-out error, because few repetitions may show too little
+    noise. Steps that ended at a bound are not repeated, because the bound hides noise.
     """
     model_noise, limits = _model_noise(model, tolerances)
     differences = repeats(model, samples)
@@ -113,15 +113,15 @@ def to_repeat(model: DynamicsModel, samples: Samples, tolerances: Sequence[float
 
 
 def _confirmed(differences: Repeats, limits: Tensor) -> Tensor:
-    """Return for each output whether repeats show that its noise exceeds ``NEGLIGIBLE`` times its tolerance in
-    ``limits`` (O,), (O,) bool."""
+    """Return for each output whether repeated steps show that its noise exceeds ``NEGLIGIBLE`` (0.5) times its
+    tolerance in ``limits`` (O,), (O,) bool."""
     bound = (NEGLIGIBLE * limits).square() * float(scipy.special.chdtri(differences.degrees, LEVEL))
     return differences.degrees * differences.std.square() > bound
 
 
 def _unexplained(model: DynamicsModel, limits: Tensor, noise: Tensor) -> Tensor:
-    """Return for each output whether its leave-one-out error is larger than its tolerance in ``limits`` (O,) and its
-    ``noise`` (O,) explain together, (O,) bool."""
+    """Return for each output whether its leave-one-out error exceeds 1.25 sqrt(tolerance^2 + noise^2), with its
+    tolerance in ``limits`` (O,) and its ``noise`` (O,), (O,) bool."""
     able = offers(model, LeaveOneOut)
     if able is None:
         return torch.zeros_like(noise, dtype=torch.bool)
@@ -130,8 +130,8 @@ def _unexplained(model: DynamicsModel, limits: Tensor, noise: Tensor) -> Tensor:
 
 
 def _refuted(differences: Repeats, model_noise: Tensor) -> Tensor:
-    """Return for each output whether repeats show that most of the noise that the model learned, ``model_noise`` (O,),
-    is misfit of the model, (O,) bool."""
+    """Return for each output whether repeated steps show that most of the noise that the model has learned,
+    ``model_noise`` (O,), is misfit of the model, (O,) bool."""
     bound = (model_noise / AT_MOST).square() * float(scipy.special.chdtri(differences.degrees, 1 - LEVEL))
     return differences.degrees * differences.std.square() <= bound
 

@@ -1,7 +1,7 @@
-"""Occupancy P_i (eq. 11): a kernel density over states, as a ratio to the uniform density over the sampling range.
+"""Input probability P_i (eq. 11): kernel density of the states that policies visited, relative to a uniform density.
 
-Gaussian kernels on standardised coordinates, a von Mises kernel for angles, Scott's bandwidth n^(-1/(d+4)), and a
-uniform floor, so that every region keeps some probability.
+It has a Gaussian kernel for each coordinate, a von Mises kernel for each angle, and Scott's bandwidth n^(-1/(d+4)) for
+n states with d moving coordinates. A uniform density is mixed in, so that no region has the probability 0.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from torch import Tensor
 from surrogym_server.environment.definition import CoordinateDefinition, EnvironmentDefinition
 from surrogym_server.environment.distributions import scaling
 
-FLOOR = 0.1  # share of the uniform density in the mixture
-BLOCK = 2**17  # number of kernel values computed at once, so that they stay in a core's cache
+FLOOR = 0.1  # share of the uniform density in the mixture with the density of visited states
+BLOCK = 2**17  # number of kernel values computed at once, so that they stay in the cache of a processor core
 
 
 def log_occupancy(definition: EnvironmentDefinition, states: Tensor, q: Tensor, floor: float = FLOOR) -> Tensor:
@@ -43,7 +43,7 @@ def _log_kernel(coordinate: CoordinateDefinition, at: Tensor, states: Tensor, ba
     if coordinate.kind == "angle":
         spread = _circular_std(states)
         kappa = 1 / (bandwidth * spread).square()
-        log_normaliser = torch.log(torch.special.i0e(kappa))  # i0(k) = i0e(k) exp(k)
+        log_normaliser = torch.log(torch.special.i0e(kappa))  # i0e(k) = i0(k) exp(-k), i0 the modified Bessel function
         return kappa * (difference.cos() - 1) - log_normaliser
     _, scale = scaling(coordinate.sampling)
     width = (bandwidth * states.std(correction=0)).clamp_min(1e-3 * scale)

@@ -1,4 +1,4 @@
-"""Outlook: the effect of further queries on a model's variance, predicted by the model itself or from distances."""
+"""Forecast of how further real steps would reduce a model's variance, by the model itself or from distances."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from surrogym_server.sampling.confidence import stds
 def outlook_of(
     model: DynamicsModel, candidates: Points, reference: Points, unanswered: Points
 ) -> tuple[OutputOutlook | None, ...]:
-    """Return, for every output, a forecast of how answers to queries at m candidates would change the variance at r
-    reference points.
+    """Return, for every output, a forecast of how real steps at m candidates would change the variance at the
+    candidates and at r reference points; None for an output that never varied.
 
-    The forecast is made as if the queries ``unanswered`` had been answered.
+    The forecast is made as if the steps ``unanswered``, which are requested already, had been taken.
     """
     if (able := offers(model, Lookahead)) is not None:
         return able.outlook(candidates, reference, unanswered)
@@ -31,7 +31,7 @@ def outlook_of(
 
 def path_outlook(model: DynamicsModel, steps: PredictedSteps, column: int) -> PathOutlook | None:
     """Return a forecast of the information that real steps along b predicted paths of T steps would give about the
-    output with index ``column``."""
+    output with index ``column``; None if the output never varied."""
     if (able := offers(model, Lookahead)) is not None:
         return able.along(steps, column)
     spread = stds(model, steps.flat.q, steps.flat.u)[:, column].reshape(steps.q.shape[:-1])
@@ -39,24 +39,24 @@ def path_outlook(model: DynamicsModel, steps: PredictedSteps, column: int) -> Pa
 
 
 def as_if_answered(model: DynamicsModel, steps: PredictedSteps) -> DynamicsModel:
-    """Return the model as if T real steps had been taken with the predicted results. A model without the ability
-    ``Lookahead`` is returned unchanged."""
+    """Return the model as if the T real steps ``steps`` had been taken with the predicted results. A model without the
+    ability ``Lookahead`` is returned unchanged."""
     able = offers(model, Lookahead)
     return model if able is None else able.as_if_answered(steps)
 
 
 @dataclass(frozen=True)
 class NearbyAnswers(OutputOutlook):
-    """Forecast of the effect of further answers on an output's standard deviations, computed from distances alone. It
-    is used for models that can't compute it themselves.
+    """Forecast of the effect of further real steps on an output's standard deviations, computed from distances alone.
+    It is used for models that can't compute it themselves.
 
     The outputs at two points at distance d, in standard deviations of the sampling range, are assumed to have the
-    correlation exp(-d^2 / 2). An answer removes all variance at the point of its query.
+    correlation exp(-d^2 / 2). A real step removes all variance at its own point.
     """
 
     definition: EnvironmentDefinition
-    candidates: Points  # m candidates
-    reference: Points  # r reference points
+    candidates: Points  # m states and actions at which real steps may be taken
+    reference: Points  # r states and actions at which the variance should become small
     own: Tensor  # (m,) variance at each candidate, as if all queries so far were answered
     there: Tensor  # (r,) variance at each reference point, as if all queries so far were answered
     # (m,) bool: whether a model would learn from a step at the candidate; it does not if a lag (past value) is unknown.
@@ -96,8 +96,8 @@ class NearbyAnswers(OutputOutlook):
 
 @dataclass(frozen=True)
 class IndependentSteps(PathOutlook):
-    """Forecast of the information that steps along paths give, as if steps were independent: 1/2 sum log(1 + (w sigma /
-    tau)^2), with weights w, standard deviations sigma and tolerance tau.
+    """Forecast of the information that steps along b paths give about an output, as if steps were independent: 1/2 sum
+    log(1 + (w sigma / tau)^2), with weights w, standard deviations sigma and tolerance tau.
 
     It is used for models that can't compute the effect of further steps themselves.
     """
@@ -115,6 +115,5 @@ class IndependentSteps(PathOutlook):
 
 
 def _removed_share(definition: EnvironmentDefinition, points: Points, queries: Points) -> Tensor:
-    """Return the share of the variance at each of m points that the answer to each of k queries would remove, (m,
-    k)."""
+    """Return the share of the variance at each of m points that each of k real steps (queries) would remove, (m, k)."""
     return (-distances(definition, points, queries).square()).exp()

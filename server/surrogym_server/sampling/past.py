@@ -4,14 +4,14 @@ A dead time, or a state that is not measured, makes equal steps differ, as noise
 the difference: their actions u_{t-1}, u_{t-2}, ..., or the change d_{t-1} = q_t - q_{t-1} in the step before. The test
 compares linear regressions of the increments, and of the model's residuals r_t, by leave-one-out errors:
 
-    on (q_t, u_t), without the past, and on (q_t, u_t, d_{t-1}, u_{t-1}, ...), with it.
+    on state and action (q_t, u_t) alone, and on (q_t, u_t, d_{t-1}, u_{t-1}, ...), with the past.
 
-The explained share is the reduction of the squared error by the past, relative to the smallest squared error without
-the past, that of the model included.
+The explained share is 1 less the ratio of the smallest squared error with the past to the smallest without the past,
+where the model's own squared error counts as one without the past.
 
 Noise of the process is independent of the past. An error e of a sensor falsifies the end of one step and the start of
 the next: r_t = e_{t+1} - a e_t. The past contains e_t - a e_{t-1} at best, which explains at most a quarter of r_t.
-Earlier changes would explain more of it, so they are left out. If the share exceeds ``EXPLAINED``, it is not noise.
+Earlier changes would explain more of it, so they are left out. If the share reaches ``EXPLAINED``, noise is ruled out.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from surrogym_server.environment.samples import Samples, increments, preceding
 from surrogym_server.models.abilities import AtSamples, LeaveOneOut, SampledFunctions, offers
 from surrogym_server.models.port import DynamicsModel
 
-EXPLAINED = 0.5  # least share of the squared error that must be explained by earlier steps to count as their influence
-PAIRS = 3  # least number of pairs of consecutive steps for each coefficient of a regression
-DEPTHS = (1, 3)  # numbers of earlier actions that the test tries; a dead time of more steps is not found
-MOST = 400  # greatest number of samples in a test, because its time grows with their third power
-RIDGE = 1e-6  # ridge of the regressions, relative to the variance of the inputs
+EXPLAINED = 0.5  # earlier steps count as a cause only if they explain at least this share of the squared error
+PAIRS = 3  # a regression needs at least this many pairs of consecutive steps for each of its coefficients
+DEPTHS = (1, 3)  # numbers of earlier actions that the regressions include; a dead time of more steps is not found
+MOST = 400  # greatest number of samples in the test, because its time grows with their third power
+RIDGE = 1e-6  # ridge parameter of the regressions, relative to the variance of the inputs
 
 
 def owed_to_past(model: DynamicsModel, samples: Samples, limits: Sequence[float]) -> tuple[float, ...]:
@@ -82,7 +82,7 @@ def _past(u: Tensor, change: Tensor, follows: Tensor, depth: int) -> tuple[Tenso
     """
     place, complete, columns = torch.arange(len(follows)), torch.ones(len(follows), dtype=torch.bool), [change[follows]]
     for _ in range(depth):
-        # -1 if there is no step before; as an index it selects any row, which ``complete`` excludes.
+        # If there is no step before, ``place`` is -1, which selects the last row; ``complete`` excludes this sample.
         place = follows[place]
         complete &= place >= 0
         columns.append(u[place])
@@ -95,8 +95,8 @@ def _explained_share(at: AtSamples, now: Tensor, past: Tensor, complete: Tensor)
 
     Args:
         at: values of the output at the samples, and covariance of its process.
-        now: (n, e) state and action.
-        past: (n, d) past of each sample, see ``_past``.
+        now: (n, e) features of state and action.
+        past: (n, d) features of the past of each sample, see ``_past``.
         complete: (n,) bool, whether the past of each sample is known. Other samples are not used.
     """
     some = complete[at.rows]

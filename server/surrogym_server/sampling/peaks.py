@@ -1,9 +1,9 @@
-"""Search for the highest reward of an environment that pays almost nowhere, by optimism about unknown rewards.
+"""Search for the highest reward of an environment whose reward is 0 almost everywhere, by an optimistic score.
 
-Such a reward is known well in nearly the whole range, where it is 0 and does not matter. So the uncertainty index does
-not find the place that pays, which lies between the points of any set spread over the range. Instead the search climbs
-from the best candidates to the highest optimistic score (``RewardPeaks.promise``). The place found is queried until its
-reward is known to the reward's tolerance.
+The model knows such a reward well in nearly the whole range, where it is 0. So the uncertainty index does not find the
+small region with a reward, which lies between the points of any set spread over the range. Instead the search climbs
+from the best candidates to the highest optimistic score of the reward (``RewardPeaks.promise``). Real steps are
+requested at the point found until its reward is known within the tolerance.
 """
 
 from __future__ import annotations
@@ -18,15 +18,16 @@ from surrogym_server.environment.samples import Samples
 from surrogym_server.models.abilities import RewardPeaks, offers
 from surrogym_server.models.port import DynamicsModel
 
-# Number of points that climb, of random steps that each tries in an iteration, and of iterations.
+# The search climbs from this many points, tries this many random steps from each in an iteration, and has this many
+# iterations.
 CLIMBERS, TRIES, CLIMBS = 16, 16, 24
-WIDEST = 0.25  # standard deviation of the first iteration's random steps, as a share of the sampling range
-SHRINK = 0.75  # factor by which the random steps become shorter from one iteration to the next
+WIDEST = 0.25  # standard deviation of the search's first random steps, as a share of the sampling range
+SHRINK = 0.75  # factor by which the search's random steps become shorter from one iteration to the next
 NOTHING = torch.finfo(torch.float32).tiny  # trainers compute in float32, in which a smaller reward counts as 0
-# A predicted reward is clearly above those of all samples if it exceeds them by this share of its distance from the
-# lowest.
+# A predicted reward r is clearly above the rewards of all samples if r - highest > UNMET * (r - lowest), where highest
+# and lowest are rewards of samples.
 UNMET = 0.1
-NEW = 0.01  # a point whose distance from a sample is below this share of the sampling range needs no query
+NEW = 0.01  # a point closer to a sample's state than this share of the sampling range needs no query
 
 
 def highest(
@@ -56,17 +57,16 @@ def highest(
 
 
 def _least(samples: Samples) -> float:
-    """Return the smallest difference of rewards that matters. Trainers compute in float32 and can't distinguish smaller
-    ones."""
+    """Return the smallest difference of rewards that trainers can distinguish, because they compute in float32."""
     return max(NOTHING, torch.finfo(torch.float32).eps * float(samples.reward.abs().max()))
 
 
 def _unknown(model: DynamicsModel, samples: Samples, points: Points, tolerance: float) -> Tensor:
-    """Return at which of m points the reward is unknown enough to query it, (m,) bool.
+    """Return for each of m points whether its reward is so uncertain that a real step is needed there, (m,) bool.
 
-    That is so if the reward's standard deviation is above the tolerance, or if its prediction is clearly above the
-    rewards of all samples. It is so at every point as long as the rewards of the samples differ too little for a
-    trainer.
+    A step is needed if the reward's standard deviation is above the tolerance, or if its prediction is clearly above
+    the rewards of all samples. It is needed at every point as long as the rewards of the samples differ too little for
+    a trainer to distinguish them.
     """
     prediction = model.transition(points.q, points.u, reward_std=True)
     assert prediction.reward_std is not None
@@ -79,8 +79,8 @@ def _climbed(definition: EnvironmentDefinition, able: RewardPeaks, points: Point
     """Climb from the best of m points to points with a higher optimistic score of the reward (``RewardPeaks.promise``).
     Return the points that are reached, those with the highest score first.
 
-    From each point, several random steps are tried, and the best is taken if it increases the score. Their length
-    decreases from one iteration to the next.
+    From each point, several random steps are tried in each iteration, and the best is taken if it increases the score.
+    The length of the random steps decreases from one iteration to the next.
     """
     low, high = _limits(definition)
     value = able.promise(points.q, points.u)
@@ -101,7 +101,8 @@ def _climbed(definition: EnvironmentDefinition, able: RewardPeaks, points: Point
 
 
 def _over(definition: EnvironmentDefinition, q: Tensor) -> Tensor:
-    """Return whether the declared termination holds at q (m, C), (m,) bool. A query there would teach nothing."""
+    """Return whether the declared termination holds at states q (m, C), (m,) bool; false if termination is learned. A
+    real step from a terminated state would teach nothing."""
     return q.new_zeros(len(q), dtype=torch.bool) if definition.learns_termination else definition.terminated(q)
 
 

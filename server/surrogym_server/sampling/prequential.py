@@ -1,10 +1,10 @@
-"""Prequential scores: each new sample is predicted by the last model before the next model learns from it.
+"""Prequential scores: how well each new sample is predicted by the latest model before the next model learns from it.
 
 References: A. P. Dawid (1984), Journal of the Royal Statistical Society A 147(2), for the principle; T. Gneiting, A. E.
 Raftery (2007), Journal of the American Statistical Association 102(477), eq. 43, for the interval score.
 
-Predictive standard deviations contain the noise of a single step. Hyperparameters are fixed at their optimum, because
-averaging over their posterior would add a second to every round.
+Predictive standard deviations include the noise of a single step. Hyperparameters are fixed at their optimum, because
+averaging over their posterior would take a second more in every round.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from surrogym_server.environment.samples import Samples, increments, saturated
 from surrogym_server.models.abilities import LearnedNoise, offers
 from surrogym_server.models.port import DynamicsModel
 
-LEVELS = (0.5, 0.8, 0.9)  # probabilities of the central prediction intervals
+LEVELS = (0.5, 0.8, 0.9)  # probabilities of the central prediction intervals that are scored
 LATEST = 20  # greatest number of predictions that are kept for each output
 
 
@@ -43,11 +43,11 @@ class PrequentialScores:
     """
 
     predictions: int
-    within_50: float  # share of the samples in the central 50 % interval, or within the tolerance
-    within_80: float  # share of the samples in the central 80 % interval, or within the tolerance
-    within_90: float  # share of the samples in the central 90 % interval, or within the tolerance
-    # Mean interval score of the 90 % intervals, in units of the tolerance; half of an interval is at least the
-    # tolerance.
+    within_50: float  # share of the samples that lie in the central 50 % prediction interval or within the tolerance
+    within_80: float  # share of the samples that lie in the central 80 % prediction interval or within the tolerance
+    within_90: float  # share of the samples that lie in the central 90 % prediction interval or within the tolerance
+    # Mean interval score of the 90 % prediction intervals, divided by the tolerance. Intervals that reach less far than
+    # the tolerance from their centre are widened to it.
     interval_score: float
 
 
@@ -64,20 +64,20 @@ def scores_of(predictions: Sequence[Prediction], tolerance: float) -> Prequentia
 
 
 def half_width(level: float) -> float:
-    """Return half the width of the central interval in which a standard normal number lies with probability
+    """Return half the width of the interval around 0 in which a standard normal number lies with probability
     ``level``."""
     return NormalDist().inv_cdf((1 + level) / 2)
 
 
 def interval_score(low: Tensor, high: Tensor, value: Tensor, level: float) -> Tensor:
-    """Return the interval score (m,), eq. 43, of central prediction intervals from ``low`` to ``high`` (m,) with
-    probability ``level``, for true values (m,). Lower is better."""
+    """Return the interval scores (m,), eq. 43 of Gneiting and Raftery, of central prediction intervals from ``low``
+    (m,) to ``high`` (m,) with probability ``level``, for the true values ``value`` (m,). Lower is better."""
     missed = (low - value).clamp_min(0) + (value - high).clamp_min(0)
     return high - low + 2 / (1 - level) * missed
 
 
 def predicted(model: DynamicsModel, samples: Samples) -> Predictions:
-    """Predict samples that the model has not learned from.
+    """Return the predictions of samples that the model has not learned from, for each output.
 
     Outputs of steps that ended at a declared limit are left out, because the limit cuts the change off. Rewards of
     steps that ended the episode are left out, because they contain the terminal reward.
@@ -99,7 +99,7 @@ def predicted(model: DynamicsModel, samples: Samples) -> Predictions:
 
 
 def latest(before: Predictions, new: Predictions) -> Predictions:
-    """Return the last ``LATEST`` predictions of each output, from the earlier ones followed by the new ones."""
+    """Append the new predictions of each output to the earlier ones, and return the last ``LATEST`` (20) of each."""
     return tuple((*old, *more)[-LATEST:] for old, more in zip(before or [()] * len(new), new, strict=True))
 
 
@@ -123,8 +123,8 @@ def _reward_std_by_state(model: DynamicsModel, samples: Samples) -> Tensor:
     """Return the standard deviation (m,) of the reward that is due to the uncertain next state; 0 if the reward does
     not depend on the next state.
 
-    It is computed to first order: the square root of the sum of the squared changes of the reward when one transition
-    output after the other changes by one standard deviation.
+    It is computed to first order: the root of the sum of the squared changes of the reward, where each transition
+    output in turn changes by one standard deviation.
     """
     count, outputs = len(samples), len(model.definition.outputs) - 1
     one = torch.eye(outputs, dtype=samples.q.dtype).repeat_interleave(count, 0)

@@ -1,7 +1,8 @@
 """Search for the region where a model is uncertain about an output: a range of one coordinate or action entry.
 
-Of all ranges of all inputs, the chosen one has the largest difference between its share of the doubt and its share of
-the Monte Carlo points (Youden's index). If that difference is small, the doubt is spread, and there is no region.
+Of all ranges of all inputs, the one is chosen with the largest difference between its share of the model uncertainty
+and its share of the Monte Carlo points (Youden's index). If this difference is small, the model uncertainty is spread
+over the whole sampling range, and there is no region.
 """
 
 from __future__ import annotations
@@ -17,14 +18,15 @@ from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.points import Points
 
 LEAST_GAIN = 0.5  # least difference between a region's share of the model uncertainty and its share of the points
-LEAST_DOUBT = 1e-12  # mean model uncertainty below which no region is searched
+LEAST_DOUBT = 1e-12  # if the mean model uncertainty is below this, no region is searched for
 
 
 @dataclass(frozen=True)
 class Region:
-    """Part of the sampling range, given by a range of one input. An end that is None has no limit."""
+    """Part of the sampling range: the points where one input is in a range. If ``low`` or ``high`` is None, the range
+    has no such end."""
 
-    input: str  # name of the coordinate, or of the action entry
+    input: str  # name of the input: a coordinate or an entry of the action
     low: float | None
     high: float | None
     outside: bool  # whether the region is everything outside [low, high]; then both ends are numbers
@@ -39,7 +41,7 @@ def regions_of(
     Args:
         definition: gives the names of the coordinates.
         points: the m points of the Monte Carlo set.
-        doubt: model uncertainty 1 - C of each output, (m, O).
+        doubt: model uncertainty 1 - C_m of each output at these points, (m, O).
         names: names of the action's entries; if empty, they are called ``action`` or ``action 1``, ``action 2``...
 
     Returns:
@@ -63,10 +65,10 @@ def _region(inputs: Tensor, doubt: Tensor, names: Sequence[str]) -> Region | Non
 
 
 def _ranges(values: Tensor, share: Tensor, name: str) -> list[tuple[float, Region]]:
-    """Return two candidate regions of one input, each with its gain (share of the uncertainty less share of the points
-    in it): the range with the greatest gain, and the complement of the range with the smallest."""
+    """Return two candidate regions of one input, each with its gain (share of the model uncertainty less share of the
+    points in it): the range with the greatest gain, and the complement of the range with the smallest gain."""
     ordered, order = values.sort(stable=True)
-    # The end of a range may not separate equal values.
+    # True at the last of equal values. Ranges end only there, so that none separates points with equal values.
     last = torch.cat([ordered[1:] != ordered[:-1], torch.tensor([True])])
     doubt = torch.cat([torch.zeros(1, dtype=share.dtype), share[order].cumsum(0)[last]])
     gain = doubt - torch.cat([torch.zeros(1, dtype=share.dtype), (torch.arange(len(values)) + 1.0)[last] / len(values)])
@@ -79,7 +81,7 @@ def _range(gain: Tensor, doubt: Tensor, values: Tensor, name: str, *, outside: b
     and as a region the interval, or its complement if ``outside``.
 
     Args:
-        gain: share of the uncertainty less share of the points, cumulated over the values.
+        gain: (d + 1,) share of the uncertainty less share of the points, both cumulative over the sorted values.
         doubt: (d + 1,) cumulative share of the uncertainty.
         values: (d,) distinct values of the input, sorted.
         name: name of the input.
@@ -95,7 +97,7 @@ def _range(gain: Tensor, doubt: Tensor, values: Tensor, name: str, *, outside: b
     high = None if end == len(values) else float((values[end - 1] + values[end]) / 2)
     inside = float(doubt[end] - doubt[begin])
     share = 1 - inside if outside else inside
-    # The complement of a range without a lower or upper limit is again such a range.
+    # The complement of a range with one end is also a range with one end, so it is returned as that range.
     if outside and (low is None or high is None):
         return float(gain[end] - gain[begin]), Region(name, high, low, False, share)
     return float(gain[end] - gain[begin]), Region(name, low, high, outside, share)

@@ -2,10 +2,10 @@
 
 A sequence begins at a reset, or at a snapshot: a state to which the environment can return.
 
-The value of a sequence is the acquisition's value per real step: for most acquisitions, the information that a path
-gives about each output (``PathOutlook.information``). A step has weight 0 outside the sampling range and after the end
-of an episode. The weight falls with the standard deviation accumulated along the path, so a plan ends where it can't be
-predicted.
+The value of a sequence is the acquisition's value per real step: for most acquisitions, the information that the
+predicted path gives about the outputs (``PathOutlook.information``). A step has weight 0 outside the sampling range and
+after the end of an episode. The weight falls with the variance accumulated along the path, so a sequence ends where its
+path can't be predicted.
 """
 
 from __future__ import annotations
@@ -29,31 +29,32 @@ from surrogym_server.sampling.occupancy import log_occupancy
 from surrogym_server.sampling.outlook import as_if_answered, path_outlook
 from surrogym_shared.nouns import Query, Vector
 
-STARTS = 6  # number of random states after a reset from which each action sequence is predicted
+STARTS = 6  # the path of an action sequence after a reset is predicted from this many random start states
 POPULATION = 48  # number of action sequences that are compared at once
-ELITE = 12  # number of the best sequences, whose variations form the next population
+ELITE = 12  # number of the best sequences that remain, together with variations of them, in the next population
 GENERATIONS = 3  # number of populations in a search, the random first one included
-# Least probability of finding an unknown termination or jump of the reward with which a rollout is planned for this.
+# A sequence is planned to find an unknown termination or jump of the reward only if some sequence finds it with more
+# than this probability. Otherwise sequences are planned for the acquisition's value.
 DOUBTFUL = 0.25
 
-Sequences = NDArray[np.float64]  # k sequences of T actions, (k, T, F)
-# Function that rates k action sequences, each from s equally likely start states (k, s, C). It returns the value of
-# each sequence, and the number of its first actions that give this value, (k,) each.
+Sequences = NDArray[np.float64]  # k sequences of T actions with F entries, (k, T, F)
+# Function that rates k action sequences, each from s equally likely start states (k, s, C). It may cut each sequence
+# off. It returns the value of each sequence, and the number of its actions that remain, (k,) each.
 Worth = Callable[[Tensor, Sequences], tuple[Tensor, Tensor]]
 
 
 @dataclass(frozen=True)
 class Aim:
-    """Objective of a planned action sequence (which outputs it should give information about), and restrictions
-    on it."""
+    """Objective of a planned action sequence (about which outputs it should give information), and restrictions on the
+    sequence."""
 
     columns: Sequence[int]  # indices of the outputs about which the sequence should give information
     tolerances: Sequence[float]  # (O,) tolerance of every output, in its unit
     longest: int  # greatest number of actions in the sequence
     snapshots: Mapping[str, Vector] = field(default_factory=dict)  # states at which a sequence may begin, by name
     states: Tensor | None = None  # (v, C) states that policies visited; steps count more where these are dense
-    ending: bool = False  # whether sequences that lead to an unknown termination or jump of the reward have priority
-    ended: bool = False  # whether a sample has ended an episode, so that a declared termination counts as known
+    ending: bool = False  # whether to prefer sequences that may show an unknown termination or jump of the reward
+    ended: bool = False  # whether a sample has ended an episode; if so, a declared termination need not be searched for
 
 
 @dataclass(frozen=True)
@@ -65,16 +66,16 @@ class Paths:
     q_next: Tensor  # (b, T, C) states after each step
     running: Tensor  # (b, T) 1 for steps of a running episode; 0 after the episode ended or came too close to a limit
     ended: Tensor  # (b, T) 1 from the step that ends the episode, 0 before
-    # (b, T) sum over the earlier steps of the predictive variances of all coordinates, in variances of the sampling
-    # range.
+    # (b, T) predictive variances of the moving coordinates, summed over coordinates and earlier steps, each divided by
+    # the variance of the coordinate's sampling range.
     drift: Tensor
 
 
 def first_rollouts(definition: EnvironmentDefinition, steps: int, rng: np.random.Generator) -> tuple[Query, ...]:
     """Draw random action sequences (rollouts) of 1, 2, 3, ... actions, until they have ``steps`` actions in total.
 
-    A sequence repeats each action for a random number of steps, so that the states spread. If the environment has lags
-    (past values), each sequence is longer by the number of first steps at which they are not known yet.
+    A sequence repeats each action for a random number of steps, so that the states spread. If coordinates repeat past
+    values (lags), each sequence is longer by the number of first steps at which these values are not known yet.
     """
     rollouts: list[Query] = []
     while steps > definition.unknown_steps:
@@ -104,7 +105,7 @@ def plan_round(
 
 
 def plan_rollout(model: DynamicsModel, aim: Aim, rng: np.random.Generator) -> Query:
-    """Plan the action sequence with the highest value per expected real step. It begins at a reset or at a snapshot.
+    """Plan the action sequence with the highest value per expected real step, from a reset or from a snapshot.
 
     The search first compares random sequences of at most ``aim.longest`` actions, then variations of the best ones.
     """
@@ -138,8 +139,8 @@ def _search(
     population: int,
     rng: np.random.Generator,
 ) -> tuple[NDArray[np.float64], int, float]:
-    """Search for the sequence of actions (T, F) with the highest value by ``worth``, from any of k origins. Each origin
-    is s equally likely states; ``origins`` is (k, s, C).
+    """Search for the sequence of actions (T, F) with the highest value by the function ``worth``, from any of k
+    origins. Each origin consists of s equally likely states; ``origins`` is (k, s, C).
 
     Return the sequence, the index of its origin, and its value.
     """
@@ -160,8 +161,8 @@ def _search(
 def as_if_done(
     model: DynamicsModel, query: Query, snapshots: Mapping[str, Vector], rng: np.random.Generator
 ) -> DynamicsModel:
-    """Return the model as if a rollout (query) had been answered along its predicted path: variances decrease, means
-    stay.
+    """Return the model as if the action sequence ``query`` had been carried out with the predicted results: variances
+    decrease, means stay.
 
     If the query's snapshot is not among ``snapshots``, the path begins at a reset.
     """
@@ -216,9 +217,9 @@ def predict_paths(model: DynamicsModel, starts: Tensor, actions: Tensor) -> Path
 
 
 def _may_leave_limits(definition: EnvironmentDefinition, q: Tensor, q_next: Tensor, variance: Tensor) -> Tensor:
-    """Return which of b paths come too close to a declared limit in a step from q (b, C) to q_next (b, C), (b,) bool. A
-    path does if the fallback action would take over, or if the probability of being outside the limit is above the
-    allowed one.
+    """Return which of b paths come too close to a declared limit in a step from q (b, C) to q_next (b, C), (b,) bool: a
+    state within the limit's margin, where the sampler switches to its fallback action, or a probability of being
+    outside the limit that is above the declared one.
 
     ``variance`` (b, M) is the predictive variance of the moving coordinates, summed along each path.
     """
@@ -236,8 +237,8 @@ def _may_leave_limits(definition: EnvironmentDefinition, q: Tensor, q_next: Tens
 
 
 def path_values(model: DynamicsModel, aim: Aim, paths: Paths) -> Tensor:
-    """Return the acquisition's value of each path if it is followed up to each of its steps, (b, T), summed over the
-    outputs in ``aim.columns``."""
+    """Return the acquisition's value of the first 1, 2, ... T steps of each path, (b, T), summed over the outputs in
+    ``aim.columns``."""
     acquisition = model.definition.design.acquisition
     weight = _weights(model.definition, aim, paths)
     total = torch.zeros_like(weight)
@@ -255,11 +256,10 @@ def _view(output: PathOutlook, weight: Tensor, tolerance: float) -> PathView:
 
 
 def _worth(model: DynamicsModel, aim: Aim, starts: Tensor, sequences: Sequences) -> tuple[Tensor, Tensor]:
-    """Rate the action sequences (k, T, F). A sequence may be cut off: the number of its first actions is chosen that
-    gives the highest value per expected real step. ``starts`` (k, s, C) are s equally likely first states of each
-    sequence.
+    """Rate k action sequences (k, T, F). Each is cut off after the number of actions that gives the highest value per
+    expected real step. ``starts`` (k, s, C) are s equally likely first states of each sequence.
 
-    Return this value (k,) and this number (k,).
+    Return the highest value per expected real step (k,), and the number of actions (k,) that gives it.
     """
     count, lanes = starts.shape[:2]
     actions = torch.from_numpy(sequences).repeat_interleave(lanes, 0)
@@ -276,7 +276,7 @@ def _endings(model: DynamicsModel, aim: Aim, paths: Paths) -> Tensor:
     """Return for each step of each path the largest probability, up to this step, that the model is wrong about a
     termination or about a jump of the reward, (b, T).
 
-    If termination is declared and no sample has ended an episode, it is 1 from the step at which the path ends.
+    If termination is declared and no sample has ended an episode, the result is 1 from the step that ends the episode.
     """
     q, q_next = paths.q.flatten(0, 1), paths.q_next.flatten(0, 1)
     doubt = in_doubt(model, q_next).maximum(edge_in_doubt(model, q, q_next)).reshape(paths.running.shape)
@@ -287,8 +287,8 @@ def _endings(model: DynamicsModel, aim: Aim, paths: Paths) -> Tensor:
 def _weights(definition: EnvironmentDefinition, aim: Aim, paths: Paths) -> Tensor:
     """Return the weight with which each step of each path counts in the value of a planned sequence, (b, T).
 
-    If sequences may begin at snapshots, the weight also contains the sampling density at the state. Otherwise sequences
-    could lead farther and farther away, to states that hardly matter for the confidence.
+    If sequences may begin at snapshots, the weight also has the square root of the sampling density at the state as a
+    factor. Otherwise sequences could lead farther and farther away, to states that hardly matter for the confidence.
     """
     weight = paths.running * definition.in_range(paths.q) * definition.known(paths.q) * (-0.5 * paths.drift).exp()
     if aim.snapshots:

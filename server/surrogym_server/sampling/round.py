@@ -1,4 +1,4 @@
-"""One round of the design, in the form in which the rules that choose its queries use it."""
+"""One round of the design: the data from which rules choose the real steps to request (queries)."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from surrogym_server.sampling.state import Request
 
 @dataclass(frozen=True)
 class Round:
-    """Everything from which rules choose the queries of one round of the design: the model with O outputs, its
-    judgement, the samples and the request."""
+    """Everything from which rules choose the real steps that one round of the design requests (queries): the model with
+    O outputs, its judgement, the samples and the request."""
 
     number: int
     model: DynamicsModel
@@ -26,10 +26,10 @@ class Round:
     judgement: Judgement
     tolerances: tuple[float, ...]  # (O,) declared or default tolerances, not widened by noise
     outputs: list[int]  # indices of the outputs that queries should improve, the least confident first; at least one
-    # Whether the design continues, so that the round may spend the rest of the budget; otherwise only ``request.extra``
-    # steps.
+    # True if the design continues, so that the round may use the rest of the budget. If false, the round may only
+    # request ``request.extra`` steps.
     continues: bool
-    testing: bool  # whether the design is ready, except that an excursion has to test its model first
+    testing: bool  # true if the model satisfies the stopping rule, but still has to be tested by an excursion
 
     @property
     def definition(self) -> EnvironmentDefinition:
@@ -42,15 +42,16 @@ class Round:
 
     @property
     def room(self) -> int:
-        """Number of real steps that are left in the budget, without those that are reserved for pending queries."""
+        """Number of real steps that the budget still allows, after those that are reserved for pending queries."""
         return max(0, self.request.budget - self.cost - self.request.pending_steps)
 
     @property
     def may_examine(self) -> bool:
         """Whether rules may spend real steps on finding the causes of large errors, such as noise or hidden state.
 
-        They may if at least half of the budget is spent and at least half as many adaptive steps as initial ones were
-        taken. With a stopping rule other than ``tested_confidence``, as in preset ``paper``, they never may.
+        They may if the design continues, at least half of the budget is spent, and at least half as many adaptive steps
+        as initial ones were taken. With a stopping rule other than ``tested_confidence``, as in preset ``paper``, they
+        never may.
         """
         design = self.definition.design
         enough = self.cost >= max(self.request.budget / 2, 1.5 * design.initial)

@@ -1,4 +1,4 @@
-"""Random numbers of a design: one independent stream for each purpose, from the design's seed."""
+"""Random generators of a design: an independent one for each purpose, all from the design's seed."""
 
 from __future__ import annotations
 

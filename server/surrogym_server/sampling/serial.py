@@ -1,17 +1,18 @@
 """Distinguish noise of the sensors from noise of the process, by consecutive steps of one episode.
 
-A sensor's error v falsifies the end of one step and the start of the next: with s_t + v_t measured, the residual of a
-step is r_t = v_{t+1} - a_t v_t + w_t, where a_t is the slope of the next state over the state and w_t the noise of the
-process. So the residuals of neighbouring steps have the covariance -a_t var(v), and those of process noise have none.
+A sensor's error v falsifies the end of one step and the start of the next: if s_t + v_t is measured for the state s_t,
+the residual of a step is r_t = v_{t+1} - a_t v_t + w_t, where a_t is the derivative of the next state with respect to
+the state and w_t the noise of the process. So residuals of neighbouring steps have the covariance -a_t var(v) by sensor
+noise, and none by process noise.
 
-The residuals of a learned function are not only noise, because its errors at near states are alike. So the test
+The residuals of a learned function are not only noise: its errors at neighbouring states are similar. So the test
 compares Gaussian processes whose noise has the covariance
 
     c s^2 ((1 - share) I + share S),  S_tt ~ 1 + a_t^2,  S_{t-1,t} ~ -a_t,  mean diagonal of S 1,
 
-where s^2 is the learned variance of the noise and c a factor near 1. The statistic is the likelihood ratio of the best
-share against a share of 0. Because 0 lies at the edge of the allowed shares, half the chi-squared distribution of one
-degree of freedom applies (Self and Liang 1987).
+where s^2 is the learned variance of the noise, c a factor near 1, and share the part that comes from the sensor. The
+statistic is the likelihood ratio of the best share against a share of 0. Because 0 lies at the edge of the allowed
+shares, half the chi-squared distribution of one degree of freedom applies (Self and Liang 1987).
 """
 
 from __future__ import annotations
@@ -27,31 +28,32 @@ from surrogym_server.environment.samples import Samples, preceding
 from surrogym_server.models.abilities import AtSamples, LearnedNoise, SampledFunctions, offers
 from surrogym_server.models.port import DynamicsModel
 
-FEWEST = 12  # least number of pairs of consecutive steps for a test
-MOST = 256  # greatest number of samples in a test, because its time grows with their third power
+FEWEST = 12  # the test for sensor noise needs at least this many pairs of consecutive steps
+MOST = 256  # greatest number of samples in the test for sensor noise, whose time grows with their third power
 CRITICAL = 5.41  # upper 2 % point of chi-squared with one degree of freedom: the one-sided test has level 1 %
 MAINLY = 0.5  # if at least this share of the noise comes from the sensor, it counts as sensor noise
-SHARES = torch.linspace(0, 1, 21, dtype=torch.float64)  # candidate shares of the sensor in the noise (see the module)
-FACTORS = torch.logspace(-0.6, 0.6, 9, dtype=torch.float64)  # values of c to try; see the module's formula
-# Safety factor for an estimated standard deviation, because it is computed with slopes of the model, which has errors.
+SHARES = torch.linspace(0, 1, 21, dtype=torch.float64)  # shares of the noise that are tried as noise of the sensor
+FACTORS = torch.logspace(-0.6, 0.6, 9, dtype=torch.float64)  # factors c of the learned noise variance that are tried
+# Safety factor for the noise in an output that measurement errors at the start of a step cause, because it is computed
+# with derivatives of the model, which has errors.
 CARRIED = 1.25
-DIFFERENCE = 1e-4  # step of the numerical derivatives, as a share of a coordinate's sampling range
+DIFFERENCE = 1e-4  # step of the numerical derivatives with respect to a coordinate, as a share of its sampling range
 
 
 @dataclass(frozen=True)
 class SensorNoise:
-    """Estimated noise of one output's sensor."""
+    """Estimated noise of the sensor that measures the coordinate of one output."""
 
-    share: float  # share of the noise's variance that comes from the sensor
+    share: float  # share of the variance of a step's noise that comes from the sensor
     std: float  # standard deviation of one measurement, in the output's unit
     step: float  # standard deviation of a single step's noise from all sources, in the output's unit
 
 
 def sensor_noise(model: DynamicsModel, samples: Samples, limits: Sequence[float]) -> tuple[SensorNoise | None, ...]:
-    """Estimate the noise of the sensor that measures each output (O,).
+    """Estimate, for each of the O outputs, the noise of the sensor that measures its coordinate.
 
-    The entry is None for an output whose learned noise is below its tolerance in ``limits`` (O,), or if consecutive
-    steps don't show that most of this noise comes from the sensor.
+    The entry is None for an output whose learned noise is within its tolerance in ``limits`` (O,), or if consecutive
+    steps don't show that most of this noise comes from the sensor. It is None for the reward.
     """
     definition, able = model.definition, offers(model, SampledFunctions)
     follows = preceding(definition, samples)
@@ -76,8 +78,9 @@ def noise_of_sensors(
 ) -> Tensor:
     """Return the standard deviation of the noise in each output that comes from sensors, (O,), in the output's unit.
 
-    If the output's own sensor is noisy, it is the noise of a single step of this output. Otherwise it is the noise that
-    results from measurement errors in the start of a step. A value below the tolerance in ``limits`` (O,) counts as 0.
+    If the output's own sensor is noisy, this is the whole noise of a single step of this output. Otherwise it is the
+    noise that results from measurement errors in the state at the start of a step. A value within the tolerance in
+    ``limits`` (O,) counts as 0.
     """
     if not any(sensors):
         return torch.zeros(len(sensors), dtype=torch.float64)
@@ -110,7 +113,7 @@ def _sensor_noise(at: AtSamples, follows: Tensor, slope: Tensor) -> SensorNoise 
 
     Args:
         at: values of the output at its samples, and covariance of its process.
-        follows: index of the sample that is the step before each sample; -1 if there is none.
+        follows: (n,) index of the sample that is the step before each of the n samples; -1 if there is none.
         slope: (n,) derivative of the next value of the output's coordinate with respect to its present value.
     """
     slope = slope[at.rows]
@@ -125,7 +128,7 @@ def _sensor_noise(at: AtSamples, follows: Tensor, slope: Tensor) -> SensorNoise 
 def _among(follows: Tensor, rows: Tensor) -> Tensor:
     """Return ``follows`` (the index of the sample before each sample, or -1) for the samples ``rows`` only, with
     indices counted among ``rows``."""
-    # The last entry is selected by the index -1 (no step before) and is -1 too.
+    # One entry more than samples: the index -1, which means no step before, selects the last entry, which stays -1.
     places = torch.full((len(follows) + 1,), -1)
     places[rows] = torch.arange(len(rows))
     return places[follows[rows]]
@@ -135,8 +138,8 @@ def sensor_pattern(slope: Tensor, follows: Tensor) -> Tensor:
     """Return the matrix S (n, n) of the module's docstring: the covariance between the results of n steps that sensor
     noise causes, divided by its mean diagonal.
 
-    Step ``follows[i]`` is the one before step i, -1 if there is none. ``slope[i]`` is the derivative of the next value
-    with respect to the present value in step i.
+    ``follows[i]`` is the index of the step before step i, or -1 if there is none. ``slope[i]`` is the derivative of the
+    next value of the coordinate with respect to its present value in step i.
     """
     pattern = torch.diag(1 + slope.square())
     later = (follows >= 0).nonzero()[:, 0]

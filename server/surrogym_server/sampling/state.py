@@ -1,4 +1,4 @@
-"""Inputs of a round of the design: the state that the previous round returned, and the request for this one."""
+"""Inputs of a round of the design: the state that the previous round returned, and the request for this round."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from surrogym_shared.nouns import Query, Vector
 class Conditions:
     """Conditions under which a design with O outputs has ended. If they change later, the design may continue."""
 
-    cost: float  # number of real steps that count towards the budget
-    budget: float  # greatest number of real steps that count
-    target: float  # confidence index to reach
-    tolerances: tuple[float, ...]  # (O,) declared or default tolerances
+    cost: float  # number of real steps taken that count towards the budget
+    budget: float  # greatest number of real steps that the design may take
+    target: float  # confidence index that every output has to reach
+    tolerances: tuple[float, ...]  # (O,) declared or default tolerance of each output
 
     def to_list(self) -> list[float]:
         """Return the conditions as one list, for JSON."""
@@ -40,9 +40,9 @@ class DesignState:
     """State that one round passes to the next. It can be stored as JSON."""
 
     round: int = 0
-    # Default tolerances, for outputs without a declared one.
+    # Default tolerances, for outputs without a declared tolerance.
     defaults: DefaultTolerances = field(default_factory=DefaultTolerances)
-    warm: dict[str, NDArray[np.float64]] = field(default_factory=dict)  # warm start for the next fit
+    warm: dict[str, NDArray[np.float64]] = field(default_factory=dict)  # values at which the next fit of a model starts
     ended_under: Conditions | None = None  # conditions when the design ended; None while it continues
     ended_as: str = ""  # the verdict with which the design ended; "" while it continues
     predictions: Predictions = ()  # predictions of the latest samples by models that had not learned from them
@@ -79,26 +79,26 @@ class Request:
 
     Steps of pending queries are reserved: ``cost`` does not count them, but ``Round.room`` subtracts them from the
     budget, so that a design whose queries all fail comes to an end. Refused queries need no budget, because no real
-    step was taken. The acquisition computes standard deviations as if both had been answered, so that the next queries
-    are chosen elsewhere.
+    step was taken. The acquisition computes standard deviations as if pending and refused queries had been answered, so
+    that the next queries are chosen elsewhere.
     """
 
-    budget: int  # greatest number of real steps of the design
-    target: float  # confidence index to reach
-    pending: tuple[Query, ...] = ()  # queries that may still be answered, or that were set aside
-    refused: tuple[Query, ...] = ()  # queries that the environment refused
-    extra: int = 0  # number of real steps for which queries are chosen even if the design has ended
+    budget: int  # greatest number of real steps that the design may take
+    target: float  # confidence index that every output has to reach
+    pending: tuple[Query, ...] = ()  # queries without an answer, including those set aside after repeated failures
+    refused: tuple[Query, ...] = ()  # queries that the original environment refused
+    extra: int = 0  # if the design has ended, this many further real steps are requested
     states: Tensor | None = None  # (v, C) states that policies visited
     snapshots: Mapping[str, Vector] = field(default_factory=dict)  # coordinates (C,) of each snapshot, by its name
     logged: int = 0  # number of the samples that come from a log
     audited: int = 0  # number of the samples that come from audits
     unlearned: int = 0  # number of real steps that are not among the samples, because lags (past values) were not known
-    open: int = 0  # number of real steps of those pending queries that may still be answered
-    prior: DynamicsModel | None = None  # model of earlier knowledge, such as one of a simulator
+    open: int = 0  # number of real steps of the pending queries that may still be answered, without those set aside
+    prior: DynamicsModel | None = None  # model of what is known beforehand, such as a model of a simulator
     surprises: Predictions = ()  # predictions of this round's new samples by the previous model
 
     def cost(self, samples: int) -> int:
-        """Return the number of real steps that count towards the budget of a design that has this many samples.
+        """Return the number of real steps that count towards the budget of a design with this number of ``samples``.
 
         Samples from logs and audits don't count. Steps at which lags (past values) were not known do count, although
         they are not among the samples.
@@ -117,10 +117,9 @@ class Request:
         return sum(query.steps for query in self.pending)
 
     def is_mostly_refused(self, cost: float) -> bool:
-        """Return whether the design should end because too many steps were refused: at least as many as ``cost`` and
-        the budget together.
+        """Return whether the design should end because the environment refused too many steps: at least as many as the
+        budget plus ``cost``, the number of real steps taken that count towards the budget.
 
-        ``cost`` is the number of real steps that count towards the budget. Without this limit, a design whose queries
-        are all refused would never end.
+        Without this limit, a design whose queries are all refused would never end.
         """
         return sum(query.steps for query in self.refused) >= self.budget + cost

@@ -1,9 +1,9 @@
-"""Default tolerances: 5 % of each output's standard deviation over the initial design, within bounds.
+"""Default tolerances: 5 % of each output's standard deviation over the initial design.
 
-Default tolerances are frozen after the first round, so that a design does not change its own goal. A size estimated
-from few samples can be wrong in two ways: it may be rounding, or the samples may have missed everything of interest. So
-sizes have a floor, and a tolerance is computed again when later samples cover a far larger range. The initial design of
-an environment with snapshots stays near the resets, so there a tolerance grows with the samples' standard deviation.
+Default tolerances stay the same after the first round, so that a design does not change its own goal. There are three
+exceptions, because few samples can be misleading. A standard deviation that may be a rounding error is replaced by a
+lower limit. A tolerance is computed again when later samples cover a far larger range. With snapshots the initial
+design stays near the resets, so a tolerance grows with the samples' standard deviation.
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ from surrogym_server.environment.distributions import scaling
 from surrogym_server.environment.samples import Samples, increments
 
 TOLERANCE = 0.05  # default tolerance, as a share of the output's standard deviation over the initial design
-FLOOR = 1e-9  # increments below this share of a coordinate's standard deviation over its range are rounding errors
-# A tolerance is derived from the range of the first targets. If that is below this share of the range of all targets so
-# far, it is derived again.
+FLOOR = 1e-9  # changes of a coordinate below this share of its standard deviation over its range are rounding errors
+# If the samples from which a default tolerance was computed cover less than this share of the output's range over all
+# samples so far, the tolerance is computed again.
 NOTHING = 1e-3
 
 
 def sizes_of(definition: EnvironmentDefinition, samples: Samples) -> list[float]:
     """Return the size of each output (O,): its standard deviation over the samples, or its absolute mean if it never
-    varied."""
+    varied, or 1 if it was always 0."""
     targets = _targets(definition, samples)
     spread, mean = targets.std(0, correction=0), targets.mean(0).abs()
     return torch.where(spread > 0, spread, torch.where(mean > 0, mean, 1.0)).tolist()
 
 
 def default_tolerances(definition: EnvironmentDefinition, sizes: Sequence[float]) -> tuple[float, ...]:
-    """Return the default tolerances (O,) of outputs with these ``sizes`` (O,) (standard deviations): 5 % of the size,
-    or 1 if the design's ``tolerance`` is `raw`."""
+    """Return the default tolerances (O,) of outputs with these ``sizes`` (O,), their standard deviations: 5 % of the
+    size, or 1 if the design's ``tolerance`` is `raw`."""
     if definition.design.tolerance == "raw":
         return (1.0,) * len(sizes)
     floors = _floors(definition)
@@ -46,8 +46,8 @@ def default_tolerances(definition: EnvironmentDefinition, sizes: Sequence[float]
 class DefaultTolerances:
     """Default tolerances of all O outputs of a design. They are used for outputs without a declared tolerance."""
 
-    values: tuple[float, ...] = ()  # (O,) in each output's unit; empty before the first round
-    ranges: tuple[float, ...] = ()  # (O,) ranges of the targets from which the values were computed
+    values: tuple[float, ...] = ()  # (O,) tolerance of each output, in its unit; empty before the first round
+    ranges: tuple[float, ...] = ()  # (O,) largest less smallest value of each output when its tolerance was computed
 
 
 def frozen_tolerances(
@@ -55,10 +55,10 @@ def frozen_tolerances(
 ) -> DefaultTolerances:
     """Return the default tolerances of a round: those of the previous round, ``before``, unless they have to change.
 
-    They are computed from the samples of the first round. For an output whose range of targets has grown by a factor of
-    more than 1 / ``NOTHING`` since then, they are computed again. With snapshots they increase whenever the samples of
-    a round give a larger tolerance. Tolerances that were stored without ranges don't change. Ranges don't include
-    rewards of terminating steps, because the reward's process does not model these.
+    They are computed from the samples of the first round. If the range of an output's values has grown since then by a
+    factor of more than 1 / ``NOTHING`` (1,000), its tolerance is computed again. With snapshots a tolerance also
+    increases whenever the samples of a round give a larger one. Tolerances that were stored without ranges don't
+    change. Ranges don't include rewards of terminating steps, because the process of the reward does not model these.
     """
     sizes, ranges = sizes_of(definition, samples), _ranges(definition, samples)
     current = default_tolerances(definition, sizes)
@@ -72,10 +72,9 @@ def frozen_tolerances(
 
 
 def _later(last: tuple[float, float], new: tuple[float, float], *, grows: bool) -> tuple[float, float]:
-    """Return the ``last`` pair of tolerance and range of an output, or the ``new`` pair if the range has grown by a
-    factor of more than 1 / ``NOTHING``.
-
-    With ``grows`` the pair with the larger tolerance is returned otherwise.
+    """Return the pair of tolerance and range of an output that a round uses: the ``new`` pair if the range has grown by
+    a factor of more than 1 / ``NOTHING`` (1,000); otherwise the ``last`` pair, that of the previous round, or, if
+    ``grows``, the pair with the larger tolerance.
     """
     if new[1] * NOTHING > last[1]:
         return new
@@ -83,7 +82,8 @@ def _later(last: tuple[float, float], new: tuple[float, float], *, grows: bool) 
 
 
 def _ranges(definition: EnvironmentDefinition, samples: Samples) -> tuple[float, ...]:
-    """Return the range of each output's targets over non-terminating steps, (O,); 0 if it is a rounding error."""
+    """Return the largest less the smallest value of each output over non-terminating steps, (O,); 0 if the difference
+    is a rounding error."""
     targets = _targets(definition, samples)[~samples.terminated]
     if not len(targets):
         return (0.0,) * len(definition.outputs)

@@ -1,4 +1,4 @@
-"""Uncertainty of a model at given points, and in the states that policies visit, as numpy arrays."""
+"""Uncertainty of a model at given states and actions, and in the states that policies visit, as numpy arrays."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ class UncertaintyResult:
 def query_uncertainty(
     model: DynamicsModel, q: Array, u: Array, tolerances: Array, occupancy: Array | None = None
 ) -> UncertaintyResult:
-    """Return prediction and uncertainty at q (n, C) and u (n, F).
+    """Return predictions and uncertainties at n points.
 
     Args:
-        model: the model.
-        q, u: coordinates and actions.
+        model: the model with O outputs.
+        q, u: coordinates (n, C) and actions (n, F) of the points.
         tolerances: (O,) tolerance of each output, in its unit.
         occupancy: (v, C) states that policies visited, or None.
     """
@@ -55,8 +55,8 @@ def visited_confidence(model: DynamicsModel, states: Array, tolerances: Sequence
     It shows how well the model knows the outputs where a policy goes, whereas the Monte Carlo set covers the whole
     range.
 
-    States outside the sampling range count too, although the design never queries there. Each state has one random
-    action, as have the reference points of the acquisition, because a policy tries many actions while it learns.
+    States outside the sampling range count too, although the design requests no real steps there. Each state has one
+    random action, because a policy tries many actions while it learns.
     """
     definition = model.definition
     rng = np.random.default_rng(definition.design.seed)

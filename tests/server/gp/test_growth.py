@@ -110,5 +110,5 @@ def test_input_warping_far_outside_the_data_stays_finite_and_monotone():
 
 
 def test_fitting_a_process_with_growth_rates_to_inputs_beyond_two_deviations_is_refused():
-    with pytest.raises(ValueError, match="within 2"):
+    with pytest.raises(ValueError, match="at most 2"):
         fit_growing(torch.full((3, 1), 2.5, dtype=torch.float64), torch.zeros(3), ALL[:1], FitOptions(), [])

@@ -1,4 +1,4 @@
-"""Rule: test a confident model by an excursion, an action sequence that leads far away from all samples."""
+"""Rule: before a design is ready, test its model by an excursion: an action sequence away from all samples."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from surrogym_shared.nouns import Query
 
 def take_excursion(round: Round) -> tuple[Query, ...] | None:
     """Return an excursion (an action sequence that leads far away from all samples) as the next query. Return None if
-    the model need not be tested by one, and () if no budget is left for it."""
+    the model need not be tested by an excursion, and () if no budget is left for an excursion."""
     if not round.testing:
         return None
     if not round.room:

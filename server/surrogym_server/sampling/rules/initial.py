@@ -1,4 +1,4 @@
-"""Rule: replace the steps that an initial design lacks because its rollouts ended early."""
+"""Rule: request the real steps that are missing in the initial design because its action sequences ended early."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from surrogym_shared.nouns import Query
 
 
 def complete_initial_rollouts(round: Round) -> tuple[Query, ...] | None:
-    """Return further random rollouts if more steps of the initial design are missing than a planned round would take,
-    otherwise None.
+    """Return further random action sequences (rollouts) if the initial design lacks more steps than a planned round
+    would take, otherwise None.
 
-    Steps are missing if rollouts ended early. Without this rule many small rounds would follow, each with a fit to few
-    samples. Steps from a log count as steps of the initial design.
+    The initial design lacks steps if episodes ended before the end of its sequences. Without this rule many small
+    rounds would follow, each with a fit to few samples. Steps from a log count as steps of the initial design.
     """
     if not round.continues or round.definition.snapshots:
         return None

@@ -1,4 +1,4 @@
-"""Order of the rules. The first rule that applies chooses the queries of a round."""
+"""Order of the rules. The first rule that applies chooses the real steps that a round requests."""
 
 from surrogym_server.sampling.rules.excursions import take_excursion
 from surrogym_server.sampling.rules.initial import complete_initial_rollouts
@@ -11,5 +11,5 @@ from surrogym_server.sampling.rules.valued import ask_best_candidates
 # Rules for an environment that can be set to any state, whose queries are single steps.
 STEP_RULES: tuple[Rule, ...] = (repeat_steps, ask_best_candidates)
 
-# Rules for an environment that begins at resets or snapshots, whose queries are rollouts.
+# Rules for an environment that can only begin at resets or snapshots, whose queries are action sequences.
 ROLLOUT_RULES: tuple[Rule, ...] = (take_excursion, see_the_past, complete_initial_rollouts, plan_rollouts)

@@ -8,15 +8,15 @@ from surrogym_server.sampling.rollouts import random_sequences
 from surrogym_server.sampling.round import Round
 from surrogym_shared.nouns import Query
 
-LENGTH = 8  # number of steps of each rollout
+LENGTH = 8  # number of actions in each random sequence that ``see_the_past`` requests, if the environment allows it
 
 
 def see_the_past(round: Round) -> tuple[Query, ...] | None:
-    """Return random rollouts if a leave-one-out error exceeds its tolerance and there are too few consecutive steps to
-    test whether earlier steps explain it (``sampling.past``). Otherwise return None.
+    """Return random action sequences if a leave-one-out error exceeds its tolerance and there are too few consecutive
+    steps to test whether earlier steps explain the error (``sampling.past``). Otherwise return None.
 
-    It is always None for an environment with snapshots, because a snapshot contains everything that the environment
-    remembers.
+    The result is always None for an environment with snapshots, because a snapshot contains the whole state, also the
+    hidden part.
     """
     definition, judgement = round.definition, round.judgement
     if not round.may_examine or definition.snapshots or round.request.pending:

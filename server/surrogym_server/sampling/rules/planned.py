@@ -1,4 +1,4 @@
-"""Rule: plan rollouts in the model that maximise the acquisition's value along their predicted paths."""
+"""Rule: plan action sequences (rollouts) in the model that maximise the acquisition's value along their paths."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ from surrogym_server.sampling.rollouts import Aim, plan_round
 from surrogym_server.sampling.round import Round
 from surrogym_shared.nouns import Query
 
-SHORTEST = 4  # least number of real steps of a planned round without snapshots
+SHORTEST = 4  # if the environment has no snapshots, a planned round has at least this many real steps
 
 
 def plan_rollouts(round: Round) -> tuple[Query, ...]:
-    """Return rollouts (action sequences) that are planned in the model to give most information about the outputs whose
-    confidence is below the target."""
+    """Return action sequences (rollouts) that are planned in the model to give most information about the outputs whose
+    confidence index is below the target."""
     request, judgement = round.request, round.judgement
     aim = Aim(
         columns=round.outputs,
@@ -27,10 +27,11 @@ def plan_rollouts(round: Round) -> tuple[Query, ...]:
 
 
 def steps_of_a_round(round: Round) -> int:
-    """Return the number of real steps of a planned round: a quarter of the number of samples, at least ``SHORTEST``.
+    """Return the number of real steps of a planned round: a quarter of the number of samples, at least ``SHORTEST``
+    (4). With snapshots it is an eighth of the samples, at least one step for each output below the target, because
+    sequences need not lead away from a reset first.
 
-    Rounds grow with the number of samples so that few fits are needed. With snapshots it is an eighth, at least one
-    step for each output below the target, because sequences need not lead away from a reset first.
+    Rounds grow with the number of samples so that few fits are needed.
     """
     samples = len(round.samples)
     if round.definition.snapshots:

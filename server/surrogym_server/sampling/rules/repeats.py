@@ -1,4 +1,4 @@
-"""Rule: take steps again, to distinguish noise from misfit of the model."""
+"""Rule: take earlier steps again, to distinguish noise of the environment from misfit of the model."""
 
 from __future__ import annotations
 

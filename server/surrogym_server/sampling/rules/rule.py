@@ -1,4 +1,4 @@
-"""Rule: the signature of the functions that may choose the queries of a round."""
+"""Type of a rule: a function that may choose the real steps that a round of the design requests (queries)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rule: query the candidates with the largest value of the acquisition (eq. 13)."""
+"""Rule: request real steps at the candidates with the largest value of the acquisition (eq. 13)."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from surrogym_shared.nouns import Query
 
 
 def ask_best_candidates(round: Round) -> tuple[Query, ...]:
-    """Return one query for each output whose confidence is below the target, the least confident first, as far as the
-    budget allows: the candidate with the largest value of the acquisition.
+    """Return one query (a real step to request) for each output whose confidence index is below the target, the lowest
+    first, as far as the budget allows: the candidate with the largest value of the acquisition.
 
-    If the design has ended, return ``request.extra`` queries, for these outputs in turn. If some candidates are
-    reserved (see ``Candidates``), the first query is one of them.
+    If the design has ended, return ``request.extra`` queries, for the outputs below the target in turn. If some
+    candidates are reserved (see ``Candidates``), the first query is one of them.
     """
     judgement = round.judgement
     unanswered = Points.of(round.definition, round.request.unanswered)
