@@ -16,7 +16,7 @@ class Code(StrEnum):
     INVALID_SPEC = "invalid_spec"  # a specification that contradicts itself
     UNAUTHENTICATED = "unauthenticated"  # no token, or an unknown one
     FORBIDDEN = "forbidden"  # the token's role does not allow this request
-    BEYOND_BUDGET = "beyond_budget"  # more real steps than the budget has left; only an admin's token may raise it
+    BEYOND_BUDGET = "beyond_budget"  # the request needs more real steps than the budget has left
     NOT_FOUND = "not_found"  # no such route
     UNKNOWN_SURROGATE = "unknown_surrogate"
     UNKNOWN_SESSION = "unknown_session"
@@ -28,11 +28,13 @@ class Code(StrEnum):
     METHOD_NOT_ALLOWED = "method_not_allowed"
     SPEC_CONFLICT = "spec_conflict"  # a surrogate of this name exists with another specification
     IDEMPOTENCY_CONFLICT = "idempotency_conflict"  # an earlier request with the same idempotency key had another body
-    SEQ_CONFLICT = "seq_conflict"  # seq is neither the next one nor a repeat of the last request
-    FOREIGN_LEASE = "foreign_lease"  # the lease token was never given out for this query
-    LEASE_EXPIRED = "lease_expired"  # a query was renewed or reported as failed after its lease had ended
+    SEQ_CONFLICT = (
+        "seq_conflict"  # the number ``seq`` of a session's request is neither the next one nor that of the last request
+    )
+    FOREIGN_LEASE = "foreign_lease"  # the lease token does not belong to a lease of the query
+    LEASE_EXPIRED = "lease_expired"  # a lease, of a query or of a job, has ended before the request that names it
     NOT_RESET = "not_reset"  # a step before the first reset, or of a lane whose episode ended, with autoreset disabled
-    NO_MODEL = "no_model"  # no model has been fitted yet
+    NO_MODEL = "no_model"  # the surrogate has no model yet
     TOO_LARGE = "too_large"
     UNSUPPORTED_MEDIA_TYPE = "unsupported_media_type"
     REQUEST_TIMEOUT = "request_timeout"  # the body of the request did not arrive in time
@@ -84,9 +86,11 @@ class Problem(BaseModel):
     model_config = ConfigDict(extra="allow")
 
     type: str = "about:blank"
-    title: str = Field(description="The code in words.")
+    title: str = Field(description="The error code in words.")
     status: int
     code: Code
-    detail: str = Field(description="What was expected and what came.")
+    detail: str = Field(description="What was expected, and what came instead.")
     request: str | None = Field(default=None, description="Id of the request; the server's log names it too.")
-    expected_seq: int | None = Field(default=None, description="With seq_conflict: the seq the session waits for.")
+    expected_seq: int | None = Field(
+        default=None, description="With code seq_conflict: the number ``seq`` that the session expects next."
+    )

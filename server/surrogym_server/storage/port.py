@@ -106,7 +106,7 @@ class Surrogates(ABC):
 
         ``tolerances`` are by output; None for an output restores its default. Another budget, target or tolerance, or
         resuming a failed design, makes a fit due. ``paused`` False, even if the surrogate was not paused, retries the
-        queries that were set aside, each with ``MAX_ATTEMPTS`` more attempts.
+        queries that were set aside or refused, each with ``MAX_ATTEMPTS`` more attempts.
 
         After a change of target or tolerance, or a lower budget, adaptive queries without a real step so far are
         withdrawn, a running fit loses its lease, and the next fit chooses new queries. Queries requested by ``improve``

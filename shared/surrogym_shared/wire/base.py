@@ -24,9 +24,10 @@ MAX_LANES = 65_536
 MAX_PARTICLES = 1_000_000
 MAX_CLAIM = 256
 MAX_BATCH = 65_536
-MAX_IMAGINED = 500  # most steps of an imagined episode
+MAX_IMAGINED = 500  # largest number of steps of an imagined (virtual) episode
 MAX_DRAWS = 64
-MAX_MEASURED = 1e30  # largest number of a sample; the variance of larger ones overflows, which prevents every fit
+# Largest absolute value of a number in a sample; with larger ones a variance overflows, and no fit is possible.
+MAX_MEASURED = 1e30
 
 Role = Literal["read", "train", "sample", "admin"]
 

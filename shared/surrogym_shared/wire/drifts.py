@@ -13,9 +13,9 @@ class AddDrift(Request):
 
     output: Text = Field(description="name of the output that differs most")
     error: Measured = Field(
-        description="mean of real minus predicted values in its unit; or their root mean square, if the errors have "
-        "grown in both directions"
+        description="mean of real minus predicted values of the output, in its unit; or the root mean square, if the "
+        "errors have grown in both directions"
     )
     words: Text = Field(description="the error and the region in which it was found, for people")
-    steps: Count = Field(description="number of real steps that were compared, up to the alarm")
+    steps: Count = Field(description="number of real steps that were compared with the model until drift was found")
     idempotency_key: Key = Field(description="a repeat with the same key adds nothing")

@@ -11,9 +11,9 @@ from surrogym_shared.states import JobEnd as JobEnd
 from surrogym_shared.states import JobStatus as JobStatus
 from surrogym_shared.wire.base import LEASE_SECONDS, Key, Measured, Reply, Request
 
-MAX_JOB_EPISODES = 1_000  # most real episodes of an evaluation
-MAX_JOB_STEPS = 10_000_000  # most virtual steps of a training
-MAX_JOB_POINTS = 200  # most points of a training's curve
+MAX_JOB_EPISODES = 1_000  # largest number of real episodes of an evaluation
+MAX_JOB_STEPS = 10_000_000  # largest number of virtual steps of a training
+MAX_JOB_POINTS = 200  # largest number of points of a training's learning curve
 
 JobAlgorithm = Literal["ppo", "fastppo", "a2c", "sac", "td3", "ddpg", "dqn", "cmaes"]
 JobPreset = Literal["default", "quick"]
@@ -33,15 +33,15 @@ class TrainTask(Request):
 
     kind: Literal["train"]
     algorithm: JobAlgorithm | None = Field(
-        default=None, description="policy search; null: the one that ``surrogym train`` would choose"
+        default=None, description="name of the training algorithm; null: the one that ``surrogym train`` would choose"
     )
     steps: Annotated[int, Field(ge=1, le=MAX_JOB_STEPS)] | None = Field(
-        default=None, description="most virtual steps; null: as many as the algorithm suggests"
+        default=None, description="largest number of virtual steps; null: as many as the algorithm suggests"
     )
     preset: JobPreset = Field(
         default="default",
         description="``default``, or ``quick`` for a trial: a quarter of the steps that the algorithm suggests, "
-        "never prolonged",
+        "and the training is never prolonged",
     )
     seed: Seed = Field(default=0, description="seed of the training")
     audit: bool = Field(
@@ -70,30 +70,32 @@ class EvaluateTask(Request):
     first_seed: Seed = Field(
         default=10_000, description="reset seed of the first episode; each further episode takes the next seed"
     )
-    wide: bool = Field(default=False, description="whether to start anywhere in the sampling range")
+    wide: bool = Field(
+        default=False,
+        description="whether each episode starts anywhere in the sampling ranges, not at the specified starts",
+    )
     compare: Literal["zero", "random"] | None = Field(
         default=None,
-        description="also run the same starts without the policy, with an action of zero or with random actions; "
-        "null: don't",
+        description="controller to compare with, which runs from the same starts: an action of ``zero``, or ``random`` "
+        "actions; null: none",
     )
     reference: bool = Field(
         default=False,
         exclude_if=lambda value: not value,  # omitted if false, because older workers refuse the field
-        description="also run the same starts with the reference controller that the worker was started with",
+        description="whether the worker's reference controller runs from the same starts too, for comparison",
     )
     video: bool = Field(
         default=False,
         exclude_if=lambda value: not value,
-        description="draw the best, the median and the worst episode into a video of the policy",
+        description="whether to store a video of the policy's best, median and worst episode",
     )
 
     @model_validator(mode="after")
     def _within_limit(self) -> EvaluateTask:
         if self.real_episodes > MAX_JOB_EPISODES:
             raise ValueError(
-                f"expected at most {MAX_JOB_EPISODES} real episodes, those of the controllers to compare with "
-                "included, got "
-                f"{self.real_episodes}"
+                f"expected at most {MAX_JOB_EPISODES} real episodes, including those of the controllers to compare "
+                f"with, got {self.real_episodes}: reduce episodes, or compare with fewer controllers"
             )
         return self
 
@@ -119,18 +121,18 @@ class ClaimJob(Request):
     worker: Key = Field(description="name of the worker, shown to people")
     most_episodes: Annotated[int, Field(ge=0, le=MAX_JOB_EPISODES)] = Field(
         default=0,
-        description="most real episodes that an evaluation for this worker may have; 0: it takes only trainings",
+        description="largest number of real episodes of an evaluation that the worker accepts; 0: trainings only",
     )
     reference: bool = Field(
         default=False,
         exclude_if=lambda offered: not offered,  # omitted if false, because older servers refuse the field
-        description="whether the worker has a reference controller; evaluations that ask for one go to no other",
+        description="whether the worker has a reference controller; only such a worker gets evaluations that need one",
     )
     wait_seconds: Annotated[float, Field(ge=0, le=60)] = Field(
         default=0.0, description="seconds that the reply may wait for a job; 0: reply at once"
     )
     lease_seconds: LeaseSeconds = Field(
-        default=LEASE_SECONDS, description="seconds until the lease ends, unless a report renews it"
+        default=LEASE_SECONDS, description="seconds until the lease ends, unless a report renews the lease"
     )
 
 
@@ -138,9 +140,11 @@ class LeasedJob(Reply):
     """A job that a worker has claimed, with its lease."""
 
     id: int = Field(description="id of the job")
-    attempt: int = Field(description="1 for the first lease of this job")
+    attempt: int = Field(description="number of this lease among the leases of the job: 1, 2, ...")
     lease_token: str = Field(description="token of the lease, for reports and for the end of the job")
-    lease_seconds: float = Field(description="seconds from this reply until the lease ends, unless a report renews it")
+    lease_seconds: float = Field(
+        description="seconds from this reply until the lease ends, unless a report renews the lease"
+    )
     task: Task = Field(description="training or evaluation to run")
 
 
@@ -151,7 +155,7 @@ class ClaimedJob(Reply):
 
 
 class JobPoint(Request):
-    """One point of a training's curve."""
+    """One point of a training's learning curve: virtual steps and imagined return."""
 
     steps: Count = Field(description="virtual steps so far")
     imagined_return: Measured | None = Field(
@@ -162,8 +166,8 @@ class JobPoint(Request):
 class JobState(Request):
     """Progress of a job, as its worker reports it."""
 
-    stage: JobStage = Field(description="stage that the job is in")
-    share: Share = Field(default=0.0, description="share of this stage that is done, between 0 and 1")
+    stage: JobStage = Field(description="present stage of the job")
+    share: Share = Field(default=0.0, description="share of the present stage that is done, between 0 and 1")
     steps: Count | None = Field(
         default=None, description="virtual steps of the training so far; null outside of a training"
     )
@@ -176,23 +180,25 @@ class JobState(Request):
     curve: list[JobPoint] = Field(
         default=[],
         max_length=MAX_JOB_POINTS,
-        description="all points of the training's curve so far; they replace those of the last report",
+        description="all points of the learning curve so far; they replace the points of earlier reports",
     )
 
 
 class ReportJob(Request):
-    """Heartbeat of a worker, with the progress of its job. It renews the lease for ``lease_seconds``."""
+    """Report of a worker on the progress of its job, which extends the job's lease to ``lease_seconds`` from now."""
 
     lease_token: Key = Field(description="token of the lease")
     lease_seconds: LeaseSeconds = Field(default=LEASE_SECONDS, description="seconds from now until the lease ends")
-    state: JobState | None = Field(default=None, description="progress of the job; null: as in the last report")
+    state: JobState | None = Field(
+        default=None, description="progress of the job; null: unchanged since the last report"
+    )
 
 
 class ReportedJob(Reply):
     """Reply to a worker's report on its job."""
 
     cancel: bool = Field(
-        description="whether a person cancelled the job: the worker then stops, and keeps the best policy so far"
+        description="whether a person cancelled the job; the worker then stops, and stores the best policy so far"
     )
 
 
@@ -201,7 +207,7 @@ class FinishJob(Request):
 
     lease_token: Key = Field(description="token of the lease")
     status: JobEnd = Field(description="how the job ended")
-    error: Said | None = Field(default=None, description="why it failed, for people; null if it did not")
+    error: Said | None = Field(default=None, description="why the job failed, for people; null if it did not fail")
     version: Version | None = Field(
         default=None, description="version of the policy that was stored or evaluated; null if there is none"
     )
@@ -213,29 +219,33 @@ class JobView(Reply):
 
     id: int = Field(description="id of the job")
     task: Task = Field(description="training or evaluation")
-    status: JobStatus = Field(description="queued, running, or how it ended")
+    status: JobStatus = Field(description="whether the job is queued or running, or how it ended")
     cancelling: bool = Field(
         description="whether a person cancelled the running job, and its worker has not ended it yet"
     )
-    created_at: float = Field(description="when it was queued, in seconds since 1970, by the server's clock")
-    begun_at: float | None = Field(description="when its last worker began; null if none has")
-    finished_at: float | None = Field(description="when it ended; null before")
-    worker: str | None = Field(description="name of the last worker that claimed it")
-    attempts: int = Field(description="number of leases so far")
-    stage: JobStage | None = Field(default=None, description="stage that it is in; null before the first report")
-    share: float = Field(default=0.0, description="share of this stage that is done")
-    steps: int | None = Field(default=None, description="virtual steps so far")
-    total_steps: int | None = Field(default=None, description="virtual steps that are planned")
+    created_at: float = Field(description="when the job was queued, in seconds since 1970, by the server's clock")
+    begun_at: float | None = Field(
+        description="when a worker claimed the job last, in seconds since 1970; null if none has"
+    )
+    finished_at: float | None = Field(description="when the job ended, in seconds since 1970; null before its end")
+    worker: str | None = Field(description="name of the worker that claimed the job last; null if none has")
+    attempts: int = Field(description="how often workers have leased the job so far")
+    stage: JobStage | None = Field(default=None, description="present stage of the job; null before the first report")
+    share: float = Field(default=0.0, description="share of the present stage that is done, between 0 and 1")
+    steps: int | None = Field(default=None, description="virtual steps of the training so far")
+    total_steps: int | None = Field(
+        default=None, description="virtual steps that the training will take, as planned now"
+    )
     imagined_return: float | None = Field(default=None, description="imagined return of the policy at its last check")
-    error: str | None = Field(description="why it failed, or why its last lease ended")
-    version: int | None = Field(description="version of the policy that was stored or evaluated")
-    evaluation: int | None = Field(description="id of the stored evaluation")
+    error: str | None = Field(description="why the job failed, or why its last lease ended; null if neither happened")
+    version: int | None = Field(description="version of the policy that the job stored or evaluated; null without one")
+    evaluation: int | None = Field(description="id of the stored evaluation; null without one")
 
 
 class JobDetail(JobView):
-    """A job with the curve of its training."""
+    """A job with the learning curve of its training."""
 
-    curve: list[JobPoint] = Field(description="points of the training's curve so far")
+    curve: list[JobPoint] = Field(description="points of the learning curve so far, oldest first")
 
 
 class WorkerView(Reply):
@@ -243,13 +253,15 @@ class WorkerView(Reply):
 
     name: str = Field(description="name of the worker")
     most_episodes: int = Field(
-        description="most real episodes that an evaluation for this worker may have; 0: it takes only trainings"
+        description="largest number of real episodes of an evaluation that the worker accepts; 0: trainings only"
     )
-    reference: bool = Field(default=False, description="whether it has a reference controller")
+    reference: bool = Field(
+        default=False, description="whether the worker has a reference controller, which some evaluations need"
+    )
 
 
 class JobList(Reply):
     """The jobs of a surrogate, and its connected workers."""
 
-    jobs: list[JobView] = Field(description="newest first")
+    jobs: list[JobView] = Field(description="jobs of the surrogate, newest first")
     workers: list[WorkerView] = Field(description="trainer workers that claimed or reported within the last minute")

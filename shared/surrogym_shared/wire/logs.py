@@ -11,8 +11,8 @@ from surrogym_shared.patterns import VISIBLE
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire.base import Reply, Request
 
-MAX_LOG = 4 * 1024 * 1024  # most letters of a log
-MAX_REJECTED = 1_000  # most rejected rows that a reply lists
+MAX_LOG = 4 * 1024 * 1024  # largest number of characters of a log
+MAX_REJECTED = 1_000  # largest number of rejected rows that a reply lists
 
 
 class SentLog(Request):
@@ -20,7 +20,7 @@ class SentLog(Request):
 
     text: Annotated[str, Field(min_length=1, max_length=MAX_LOG, description="the log as CSV with a heading")]
     mapping: LogMapping | None = Field(
-        default=None, description="role of each column; null: the names of the columns decide"
+        default=None, description="role of each column of the log; null: the names of the columns decide"
     )
 
 
@@ -31,7 +31,7 @@ class DraftLog(SentLog):
         default="", description="name of the environment"
     )
     budget: Annotated[int, Field(ge=0, le=100_000)] = Field(
-        default=0, description="real steps that the design may take in addition to the log; 0 without a machine"
+        default=0, description="real steps that the design may take in addition to the log; 0 if it can take none"
     )
 
 
@@ -51,23 +51,25 @@ class RejectedRow(Reply):
 class LogReport(Reply):
     """Report on the rows of a log and the roles of its columns."""
 
-    rows: int = Field(description="number of rows, without the heading")
+    rows: int = Field(description="number of rows of the log, without the heading")
     steps: int = Field(description="number of usable steps")
     without_next_state: int = Field(
         description="number of rows without a next state, because an episode ends there, or a gap in time follows"
     )
     rejected: int = Field(description="number of rows that can't be used")
-    rejected_rows: list[RejectedRow] = Field(description=f"the first {MAX_REJECTED} of them, with line and reason")
-    columns: dict[str, str] = Field(description="role of each column that is used")
-    ignored: dict[str, str] = Field(description="reason for each column that is not used")
+    rejected_rows: list[RejectedRow] = Field(
+        description=f"the first {MAX_REJECTED} rows that can't be used, with line and reason"
+    )
+    columns: dict[str, str] = Field(description="role of each used column, by the column's name")
+    ignored: dict[str, str] = Field(description="why a column is not used, by the column's name")
     mapping: LogMapping = Field(description="mapping that gives the columns these roles")
 
 
 class DraftedLog(LogReport):
     """Reply with a specification drafted from a log, and with the report on the log's rows."""
 
-    spec: EnvironmentSpec = Field(description="the draft, to be checked by a person")
-    notes: list[str] = Field(description="what each part of the draft was concluded from")
+    spec: EnvironmentSpec = Field(description="drafted specification, which a person should check")
+    notes: list[str] = Field(description="sentences that say from which data the parts of the draft were concluded")
 
 
 class AddedLog(LogReport):

@@ -13,8 +13,8 @@ from surrogym_shared.wire.surrogates import Fidelity
 class Points(Request):
     """States and actions at which the model is evaluated."""
 
-    coordinates: Matrix = Field(description="(n, C) states")
-    action: Matrix = Field(description="(n, F) actions")
+    coordinates: Matrix = Field(description="(n, C) states: n points of C coordinates")
+    action: Matrix = Field(description="(n, F) action of F entries at each of the n points")
     model: Annotated[int, Field(ge=1)] | None = Field(
         default=None, description="version of the model; null: the latest"
     )
@@ -28,21 +28,25 @@ class Uncertainty(Reply):
     mean: list[list[float]] = Field(
         description="(n, O) posterior mean: the change of each moving coordinate, and the reward"
     )
-    deviation: list[list[float]] = Field(description="(n, O) standard deviation, without the noise of a step")
-    model_uncertainty: list[list[float]] = Field(description="(n, O) U_m of eq. 10")
-    input_probability: list[list[float]] = Field(description="(n, O) P_i of eq. 11")
-    log_uncertainty_index: list[list[float]] = Field(description="(n, O) logarithm of U")
-    uncertainty_index: list[list[float]] = Field(description="(n, O) U of eq. 12")
+    deviation: list[list[float]] = Field(description="(n, O) posterior standard deviation, without the noise of a step")
+    model_uncertainty: list[list[float]] = Field(
+        description="(n, O) model uncertainty, U_m of eq. 10 of Active Uncertainty Reduction"
+    )
+    input_probability: list[list[float]] = Field(description="(n, O) input probability, P_i of eq. 11")
+    log_uncertainty_index: list[list[float]] = Field(description="(n, O) natural logarithm of the uncertainty index")
+    uncertainty_index: list[list[float]] = Field(description="(n, O) uncertainty index, U of eq. 12")
 
 
 class Prediction(Reply):
     """Predictions of one step from each of n points."""
 
     model_version: int = Field(description="version of the model")
-    next_coordinates: list[list[float]] = Field(description="(n, C) mean of the next state")
-    next_observation: list[list[float]] = Field(description="(n, D) observation at that state")
-    reward: list[float] = Field(description="(n,) mean of the reward, without a penalty")
-    reward_deviation: list[float] = Field(description="(n,) standard deviation of the reward")
+    next_coordinates: list[list[float]] = Field(description="(n, C) predicted mean of the next state")
+    next_observation: list[list[float]] = Field(
+        description="(n, D) observation of D entries at the predicted next state"
+    )
+    reward: list[float] = Field(description="(n,) predicted mean of the reward, without a penalty for uncertainty")
+    reward_deviation: list[float] = Field(description="(n,) predicted standard deviation of the reward")
     terminated: list[bool] = Field(description="(n,) whether the step ends the episode")
 
 
@@ -51,8 +55,12 @@ class Imagine(Request):
     with functions that are sampled from the model's posterior."""
 
     coordinates: Vector = Field(description="(C,) state at the start")
-    actions: Annotated[list[Vector], Field(min_length=1, max_length=MAX_IMAGINED)] = Field(description="(T, F) actions")
-    draws: Annotated[int, Field(ge=0, le=MAX_DRAWS)] = Field(default=0, description="number of functions to sample")
+    actions: Annotated[list[Vector], Field(min_length=1, max_length=MAX_IMAGINED)] = Field(
+        description="(T, F) actions of F entries to apply in T steps"
+    )
+    draws: Annotated[int, Field(ge=0, le=MAX_DRAWS)] = Field(
+        default=0, description="number of episodes that each follow a function sampled from the posterior"
+    )
     seed: Seed = Field(default=0, description="seed of the sampled functions")
     model: Annotated[int, Field(ge=1)] | None = Field(
         default=None, description="version of the model; null: the latest"
@@ -62,26 +70,26 @@ class Imagine(Request):
 class ImaginedEpisode(Reply):
     """A virtual episode of t steps. t is less than T, the number of actions, if the episode terminated before."""
 
-    coordinates: list[list[float]] = Field(description="(t + 1, C) states, the start included")
-    reward: list[float] = Field(description="(t,) rewards")
-    terminated: bool = Field(description="whether the episode terminated")
+    coordinates: list[list[float]] = Field(description="(t + 1, C) states, beginning with the start")
+    reward: list[float] = Field(description="(t,) reward of each step")
+    terminated: bool = Field(description="whether the episode ended in a terminal state")
 
 
 class Imagined(Reply):
     """Reply with virtual episodes under the requested actions."""
 
     model_version: int = Field(description="version of the model")
-    mean: ImaginedEpisode = Field(description="episode along the mean")
-    draws: list[ImaginedEpisode] = Field(description="episode along each drawn function")
+    mean: ImaginedEpisode = Field(description="episode that moves by the model's mean prediction")
+    draws: list[ImaginedEpisode] = Field(description="one episode for each sampled function, which it follows")
 
 
 class ModelView(Reply):
     """A version of a surrogate's model."""
 
     version: int = Field(description="version number; a later model has a higher one")
-    created_at: float = Field(description="when it was stored, in seconds since 1970, by the server's clock")
-    samples: int = Field(description="number of samples that it was fitted to")
-    data_hash: str = Field(description="hash of these samples")
+    created_at: float = Field(description="when the model was stored, in seconds since 1970, by the server's clock")
+    samples: int = Field(description="number of samples that the model was fitted to")
+    data_hash: str = Field(description="hash of the samples that the model was fitted to")
     fidelity: Fidelity = Field(description="how well the model predicts")
     fit_seconds: float = Field(description="duration of the fit; 0 for an imported model")
     description: dict[str, Any] = Field(description="structure and hyperparameters of every output")
@@ -90,4 +98,4 @@ class ModelView(Reply):
 class ModelList(Reply):
     """All versions of a surrogate's model."""
 
-    models: list[ModelView] = Field(description="versions, oldest first")
+    models: list[ModelView] = Field(description="all versions of the model, oldest first")

@@ -11,7 +11,9 @@ from surrogym_shared.patterns import ALIAS, DIGEST, VISIBLE
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire.base import MAX_MEASURED, Key, Measured, Reply, Request, Vector
 
-PolicyForm = Literal["zip", "onnx", "pt2", "mp4", "gif"]  # suffixes of policy files, and of videos of policies
+PolicyForm = Literal[
+    "zip", "onnx", "pt2", "mp4", "gif"
+]  # formats of policy files (zip, onnx, pt2) and of videos of policies
 Controller = Literal["policy", "zero", "random", "reference"]
 TraceRank = Literal["paired", "best", "median", "worst"]  # paired: an episode from the same start for every controller
 Digest = Annotated[str, Field(pattern=DIGEST, description="SHA-256 of the file, as hex")]
@@ -19,12 +21,12 @@ AliasName = Annotated[str, Field(pattern=ALIAS)]
 Count = Annotated[int, Field(ge=0, le=2**53)]
 Text = Annotated[str, Field(max_length=2_000, pattern=VISIBLE)]
 
-FEWEST_TO_JUDGE = 30  # least number of episodes whose mean return is certain enough to judge a promised return
+FEWEST_TO_JUDGE = 30  # an evaluation with fewer episodes does not judge a policy's promise (interval of the return)
 MAX_CURVE = 500
 MAX_EPISODES = 10_000
-MAX_TRACE = 10_000  # most steps of one episode's trace
+MAX_TRACE = 10_000  # largest number of steps in a trace (record of one episode's states, actions and rewards)
 MAX_TRACES = 16
-CARD_DEPTH = 8  # most levels of nested lists and objects in the settings of a policy's training
+CARD_DEPTH = 8  # largest number of nested lists and objects in the settings of a policy's training
 
 
 class PolicyPromise(BaseModel):
@@ -32,11 +34,11 @@ class PolicyPromise(BaseModel):
 
     model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
 
-    median: float = Field(description="median")
-    low: float = Field(description="5 % quantile")
-    high: float = Field(description="95 % quantile")
-    functions: Count = Field(default=0, description="number of functions that were sampled from the posterior")
-    episodes: Count = Field(default=0, description="number of virtual episodes")
+    median: float = Field(description="median of the predicted mean return")
+    low: float = Field(description="5 % quantile of the predicted mean return")
+    high: float = Field(description="95 % quantile of the predicted mean return")
+    functions: Count = Field(default=0, description="number of functions sampled from the posterior for the prediction")
+    episodes: Count = Field(default=0, description="number of virtual episodes that the prediction was computed from")
 
 
 class PolicyRangeLeft(BaseModel):
@@ -45,10 +47,10 @@ class PolicyRangeLeft(BaseModel):
     model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
 
     coordinate: Text = Field(description="name of the coordinate")
-    side: Side = Field(description="the end of the range that the way passes")
-    end: float = Field(description="value of this end")
-    share: float = Field(description="share of the way's states beyond it")
-    farthest: float = Field(description="the state farthest beyond it")
+    side: Side = Field(description="the end of the sampling range that the policy's states exceed")
+    end: float = Field(description="value of the coordinate at this end of the range")
+    share: float = Field(description="share of the policy's states that lie beyond this end")
+    farthest: float = Field(description="value of the coordinate farthest beyond this end")
 
 
 class PolicyAudit(BaseModel):
@@ -56,24 +58,29 @@ class PolicyAudit(BaseModel):
 
     model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
 
-    steps: Count = Field(description="number of real steps")
+    steps: Count = Field(description="number of real steps of the audit")
     elsewhere: Count = Field(
-        default=0, description="how many of them were taken in gaps of the samples, off the policy's way"
+        default=0,
+        description="number of real steps in gaps between the samples, not at states that the policy visits",
     )
     passed: bool = Field(description="whether the model agrees with the real steps")
     faults: tuple[Text, ...] = Field(
         default=(), max_length=100, description="reasons why the audit failed; empty if it passed"
     )
-    errors: dict[str, float] = Field(default={}, description="root mean square error of each output, in its unit")
-    expected: dict[str, float] = Field(
-        default={}, description="root mean square error that the model expected of each output, in its unit"
+    errors: dict[str, float] = Field(
+        default={}, description="root mean square error of the predictions of each output, in the output's unit"
     )
-    before: PolicyPromise | None = Field(default=None, description="promise before the audit")
+    expected: dict[str, float] = Field(
+        default={}, description="root mean square error of each output that the model expected, in the output's unit"
+    )
+    before: PolicyPromise | None = Field(
+        default=None, description="promise (interval of the mean return) before the audit"
+    )
     after: PolicyPromise | None = Field(
         default=None, description="promise of the model that has learned from the audit's steps"
     )
     range_left: PolicyRangeLeft | None = Field(
-        default=None, description="where the policy's way leaves the sampling range; null if it hardly does"
+        default=None, description="where the policy's states leave the sampling range; null if hardly any do"
     )
 
 
@@ -82,51 +89,52 @@ class PushedCard(BaseModel):
 
     model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
 
-    algorithm: Text = Field(default="", description="name of the policy search")
+    algorithm: Text = Field(default="", description="name of the training algorithm")
     spec: EnvironmentSpec | None = Field(default=None, description="specification that the policy was trained for")
     seed: Count | None = Field(default=None, description="seed of the training")
     virtual_steps: Count | None = Field(default=None, description="virtual steps of the training")
-    model: Text = Field(default="", description="hash of the samples of the model that the promise is of")
-    seconds: float | None = Field(default=None, description="duration of the training")
+    model: Text = Field(default="", description="hash of the samples of the model that predicted the promise")
+    seconds: float | None = Field(default=None, description="duration of the training in seconds")
     imagined_return: float | None = Field(default=None, description="imagined return of the policy")
     untrained: float | None = Field(default=None, description="imagined return of an untrained network")
-    promise: PolicyPromise | None = Field(default=None, description="promise of the policy")
+    promise: PolicyPromise | None = Field(default=None, description="predicted interval of the policy's mean return")
     audit: PolicyAudit | None = Field(default=None, description="audit of the policy")
-    trusted: bool | None = Field(default=None, description="verdict on the promise; null: none was made")
-    reason: Text = Field(default="", description="reason of the verdict")
+    trusted: bool | None = Field(default=None, description="whether the promise is trusted; null: not decided")
+    reason: Text = Field(default="", description="why the promise is trusted or not")
     networks: Count = Field(default=1, description="number of networks that the training tried")
     settings: dict[str, Any] = Field(default={}, description="settings of the training, by name")
     versions: dict[str, Text] = Field(default={}, description="versions of the packages of the training, by name")
 
 
 class CurvePoint(BaseModel):
-    """One point of a training's curve."""
+    """One point of a training's learning curve."""
 
     model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
 
     steps: Count = Field(description="virtual steps so far")
-    imagined_return: float | None = Field(default=None, description="imagined return at this point")
+    imagined_return: float | None = Field(default=None, description="imagined return of the policy at this point")
     seconds: float | None = Field(default=None, description="seconds since the training began")
 
 
 class FileNotice(Request):
     """Announcement of a file to be uploaded. The upload is accepted only if size and digest match."""
 
-    form: PolicyForm = Field(description="form of the file, which is also the ending of its name")
-    bytes: Annotated[int, Field(ge=1)] = Field(description="size of the file")
+    form: PolicyForm = Field(description="format of the file, which is also the suffix of its name")
+    bytes: Annotated[int, Field(ge=1)] = Field(description="size of the file in bytes")
     digest: Digest
 
 
 class AddPolicy(Request):
-    """Request to store a policy: its card, its training curve, and the announcement of its file.
+    """Request to store a policy: its card, its learning curve, and the announcement of its file.
 
     A stored version never changes. The same file with another card or curve becomes a new version.
     """
 
-    model_config = ConfigDict(extra="forbid", strict=False)  # the card checks its own types
+    # Not strict here, because ``PushedCard`` checks the types of its fields.
+    model_config = ConfigDict(extra="forbid", strict=False)
 
     card: PushedCard = Field(description="settings and results of the training")
-    curve: list[CurvePoint] = Field(default=[], max_length=MAX_CURVE, description="curve of the training")
+    curve: list[CurvePoint] = Field(default=[], max_length=MAX_CURVE, description="learning curve of the training")
     file: FileNotice = Field(description="announcement of the policy's file")
 
     @field_validator("card")
@@ -138,7 +146,7 @@ class AddPolicy(Request):
         for promise in [one for one in promises if one is not None]:
             if not promise.low <= promise.median <= promise.high:
                 came = f"{promise.low:g}, {promise.median:g} and {promise.high:g}"
-                raise ValueError(f"expected a promise with low <= median <= high, got {came}")
+                raise ValueError(f"card: expected a promise with low <= median <= high, got {came}")
         return card
 
     @field_validator("curve")
@@ -159,7 +167,7 @@ def _require_sane(place: str, value: Any, depth: int) -> None:
     elif isinstance(value, (list, tuple)):
         for number, each in enumerate(value):
             _require_sane(f"{place}.{number}", each, depth - 1)
-    elif isinstance(value, (int, float)) and not abs(value) <= MAX_MEASURED:  # also true for NaN
+    elif isinstance(value, (int, float)) and not abs(value) <= MAX_MEASURED:  # ``not <=`` is also true for NaN
         raise ValueError(f"{place}: expected a finite number of at most {MAX_MEASURED:g} in size, got {value:g}")
     elif isinstance(value, str) and "\0" in value:
         raise ValueError(f"{place}: expected text without the character NUL, got {value[:40]!r}")
@@ -174,10 +182,10 @@ class EpisodeTrace(Request):
     )
     seed: Count = Field(description="reset seed of the episode")
     coordinates: Annotated[list[Vector], Field(min_length=1, max_length=MAX_TRACE + 1)] = Field(
-        description="(T + 1, C) states, the start included"
+        description="(T + 1, C) states, beginning with the start"
     )
-    action: Annotated[list[Vector], Field(max_length=MAX_TRACE)] = Field(description="(T, F) actions")
-    reward: Annotated[list[Measured], Field(max_length=MAX_TRACE)] = Field(description="(T,) rewards")
+    action: Annotated[list[Vector], Field(max_length=MAX_TRACE)] = Field(description="(T, F) action of each step")
+    reward: Annotated[list[Measured], Field(max_length=MAX_TRACE)] = Field(description="(T,) reward of each step")
 
 
 class AddEvaluation(Request):
@@ -188,14 +196,14 @@ class AddEvaluation(Request):
 
     controller: Controller = Field(
         default="policy",
-        description="who chose the actions: the policy; nobody, so an action of ``zero`` or ``random`` actions; or "
-        "a ``reference`` controller, such as the one in use",
+        description="what chose the actions: the policy, a constant action of ``zero``, ``random`` choice, or a "
+        "``reference`` controller, such as the one in use",
     )
     note: Text = Field(default="", description="remark for people, such as which machine was used")
     declared: bool = Field(
         default=True,
-        description="whether starts and machine are as the specification declares them; the promise is about those "
-        "only",
+        description="whether starts and machine are as the specification declares them; otherwise the evaluation does "
+        "not judge the promise",
     )
     environment: Text = Field(
         default="",
@@ -204,8 +212,8 @@ class AddEvaluation(Request):
     )
     seeded: bool = Field(
         default=True,
-        description="whether a reset with the same seed repeats the start; otherwise the episodes are not compared "
-        "with others start by start",
+        description="whether a reset with the same seed repeats the start; if not, the episodes are not compared with "
+        "those of another controller from the same start",
     )
     first_seed: Count = Field(description="reset seed of the first episode; each further episode has the next seed")
     returns: Annotated[list[Measured], Field(min_length=1, max_length=MAX_EPISODES)] = Field(
@@ -218,7 +226,7 @@ class AddEvaluation(Request):
         default=None, description="whether each episode was a success; null without a criterion in the specification"
     )
     traces: list[EpisodeTrace] = Field(
-        default=[], max_length=MAX_TRACES, description="some of the episodes, step by step"
+        default=[], max_length=MAX_TRACES, description="states, actions and rewards of some episodes"
     )
     idempotency_key: Key = Field(description="a repeat with the same key adds nothing")
 
@@ -232,8 +240,8 @@ class PutAlias(Request):
 class PolicyFileView(Reply):
     """Description of a stored or announced file of a policy."""
 
-    form: PolicyForm = Field(description="form of the file, which is also the ending of its name")
-    bytes: int = Field(description="size of the file")
+    form: PolicyForm = Field(description="format of the file, which is also the suffix of its name")
+    bytes: int = Field(description="size of the file in bytes")
     digest: str = Field(description="SHA-256 of the file, as hex")
     stored: bool = Field(
         description="whether the server has the file; false: it was announced and has not arrived yet, or it was "
@@ -252,14 +260,16 @@ class EvaluationView(Reply):
     """Statistics of the real episodes of one evaluation."""
 
     id: int = Field(description="number of the evaluation")
-    controller: Controller = Field(description="who chose the actions")
+    controller: Controller = Field(
+        description="what chose the actions: the policy, zero, random or a reference controller"
+    )
     created_at: float = Field(description="when it was stored, in seconds since 1970, by the server's clock")
     note: str = Field(description="remark for people")
     declared: bool = Field(description="whether starts and machine are as the specification declares them")
     environment: str = Field(description="name of the environment in which the episodes ran; empty: not known")
     own: bool = Field(
-        description="whether that is the surrogate's own environment. If the surrogate names it by free text only, its "
-        "own is the one of its first evaluation"
+        description="whether the episodes ran in the surrogate's own environment. If the specification describes it by "
+        "free text only, it is the environment of the surrogate's first evaluation"
     )
     seeded: bool = Field(description="whether a reset with the same seed repeats the start")
     first_seed: int = Field(description="reset seed of the first episode")
@@ -267,7 +277,7 @@ class EvaluationView(Reply):
     steps: int = Field(description="number of real steps")
     mean: float = Field(description="mean return")
     mean_interval: Interval | None = Field(
-        description="interval of the mean return over new starts; null for a single episode"
+        description="95 % interval of the mean return over new starts; null for a single episode"
     )
     median: float = Field(
         description="return of the median episode; of an even number, the lower of the two middle ones"
@@ -277,76 +287,81 @@ class EvaluationView(Reply):
     success_rate: float | None = Field(
         description="share of the episodes that were a success; null without a criterion in the specification"
     )
-    success_interval: Interval | None = Field(description="interval of the success rate")
+    success_interval: Interval | None = Field(description="95 % interval of the success rate; null without a criterion")
     promise_kept: bool | None = Field(
-        description="whether the mean return is at least the promise's lower end; null without a promise, if "
-        "the environment or the starts are not those of the promise, or with fewer than 30 episodes"
+        description="whether the mean return is at least the lower end of the policy's promise; null without a "
+        "promise, with fewer than 30 episodes, or if the environment or the starts are other ones"
     )
 
 
 class EvaluationDetail(EvaluationView):
-    """An evaluation with all its episodes, and traces of some."""
+    """An evaluation with the results of all its episodes, and with states, actions and rewards of some."""
 
     returns: list[float] = Field(description="return of each episode")
     lengths: list[int] = Field(description="number of steps of each episode")
     success: list[bool] | None = Field(description="whether each episode was a success")
-    traces: list[EpisodeTrace] = Field(description="some of the episodes, step by step")
-    missing: str | None = Field(default=None, description="why episodes and traces can't be read; null if they can")
+    traces: list[EpisodeTrace] = Field(description="states, actions and rewards of some episodes")
+    missing: str | None = Field(
+        default=None, description="why the results of the episodes can't be read; null if they can"
+    )
 
 
 class PolicyView(Reply):
     """One version of a surrogate's policies, with its files and evaluations."""
 
-    version: int = Field(description="version number; it is never used again")
+    version: int = Field(description="number of the version: 1, 2, ...; a deleted number is not used again")
     created_at: float = Field(description="when it was stored, in seconds since 1970, by the server's clock")
     aliases: list[str] = Field(description="aliases that point to this version")
-    algorithm: str = Field(description="name of the policy search")
+    algorithm: str = Field(description="name of the training algorithm")
     virtual_steps: int | None = Field(description="virtual steps of the training")
     imagined_return: float | None = Field(description="imagined return of the policy")
-    promise: PolicyPromise | None = Field(description="promise of the policy")
+    promise: PolicyPromise | None = Field(description="predicted interval of the policy's mean return")
     audit: PolicyAudit | None = Field(description="audit of the policy")
     trusted: bool | None = Field(
-        description="verdict on the promise; false if the latest evaluation that judges it broke it, or if drift was "
-        "found later; null: none was made"
+        description="whether the promise is trusted; false if the mean return of the latest evaluation that can judge "
+        "it is lower, or if drift was reported later; null: not decided"
     )
-    reason: str = Field(description="reason of the verdict")
-    drifted_at: float | None = Field(default=None, description="when drift was found, if the verdict rests on it")
+    reason: str = Field(description="why the promise is trusted or not")
+    drifted_at: float | None = Field(
+        default=None,
+        description="when drift was reported, in seconds since 1970; null if trust does not depend on drift",
+    )
     differs: str | None = Field(
         description="difference between the specification that the policy was trained for and the surrogate's; "
         "null if there is none"
     )
     pushed_by: str | None = Field(
         default=None,
-        description="who stored it: role and fingerprint of the token, or ``anybody`` without tokens; null for "
-        "policies of earlier programs",
+        description="who stored the policy: role and fingerprint of the token, or ``anybody`` without tokens; null if "
+        "an earlier version of the server stored it",
     )
     files: list[PolicyFileView] = Field(description="files of the policy")
     evaluations: list[EvaluationView] = Field(
-        description="real episodes of the policy, of no policy and of reference controllers"
+        description="real episodes of the policy, and of other controllers from the same starts"
     )
 
 
 class PolicyDetail(PolicyView):
-    """A policy with the settings and the curve of its training."""
+    """A policy with the settings and the learning curve of its training."""
 
     seed: int | None = Field(description="seed of the training")
-    seconds: float | None = Field(description="duration of the training")
-    model: str = Field(default="", description="hash of the samples of the model that the promise is of")
+    seconds: float | None = Field(description="duration of the training in seconds")
+    model: str = Field(default="", description="hash of the samples of the model that predicted the promise")
     untrained: float | None = Field(default=None, description="imagined return of an untrained network")
     settings: dict[str, Any] = Field(description="settings of the training, by name")
     versions: dict[str, str] = Field(description="versions of the packages of the training, by name")
-    curve: list[CurvePoint] = Field(description="curve of the training")
+    curve: list[CurvePoint] = Field(description="learning curve of the training")
 
 
 class PushedPolicy(PolicyView):
     """Reply after a policy was stored."""
 
     created: bool = Field(
-        description="whether this request created the version; false: the server had this file already"
+        description="whether this request created the version; false: the same file, card and curve were stored before"
     )
 
 
 class PolicyList(Reply):
     """All policies of a surrogate."""
 
-    policies: list[PolicyView] = Field(description="newest first")
+    policies: list[PolicyView] = Field(description="policies of the surrogate, newest first")

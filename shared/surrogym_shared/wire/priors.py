@@ -16,30 +16,36 @@ Word = Annotated[str, Field(min_length=1, max_length=200, pattern=VISIBLE)]
 class CalibratedParameter(Request):
     """A parameter of a simulator, calibrated on real steps."""
 
-    name: Word = Field(description="its name")
+    name: Word = Field(description="name of the parameter")
     value: Measured = Field(description="calibrated value")
-    low: Measured = Field(description="lower end of its 90 % interval")
-    high: Measured = Field(description="upper end of its 90 % interval")
-    determined: bool = Field(description="whether the real steps say more of it than its range does")
+    low: Measured = Field(description="lower end of the value's 90 % interval")
+    high: Measured = Field(description="upper end of the value's 90 % interval")
+    determined: bool = Field(description="whether the real steps narrow the value more than its declared range does")
 
 
 class PriorAbout(Request):
     """Origin of a prior, a model learned from a simulator. The simulator's errors are given as shares of the standard
     deviation of each coordinate's changes in a step."""
 
-    source: Word = Field(description="the simulator, or the surrogate")
+    source: Word = Field(description="name of the simulator or of the surrogate that the prior was made from")
     parameters: Annotated[list[CalibratedParameter], Field(max_length=64)] = Field(
-        default_factory=list, description="parameters that were calibrated"
+        default_factory=list, description="parameters of the simulator that were calibrated"
     )
-    real_steps: int = Field(default=0, ge=0, description="real steps that they were calibrated on")
-    error_before: Share | None = Field(default=None, description="error of the simulator with its own values")
-    error: Share | None = Field(default=None, description="error with the calibrated values")
-    simulated_steps: int = Field(default=0, ge=0, description="steps of the simulator that the prior learned from")
+    real_steps: int = Field(default=0, ge=0, description="number of real steps that the parameters were calibrated on")
+    error_before: Share | None = Field(
+        default=None, description="error of the simulator with its original values of the parameters"
+    )
+    error: Share | None = Field(default=None, description="error of the simulator with the calibrated values")
+    simulated_steps: int = Field(
+        default=0, ge=0, description="number of simulated steps that the prior was learned from"
+    )
 
 
 class PriorView(Reply):
     """The prior of a surrogate, if it has one, and what it was made from."""
 
     awaited: bool = Field(description="whether the design waits for a prior")
-    created_at: float | None = Field(default=None, description="when it was set, in seconds since 1970; null: never")
-    about: PriorAbout | None = Field(default=None, description="what it was made from; null: there is none")
+    created_at: float | None = Field(
+        default=None, description="when the prior was stored, in seconds since 1970; null without a prior"
+    )
+    about: PriorAbout | None = Field(default=None, description="what the prior was made from; null without a prior")

@@ -31,36 +31,40 @@ ActionSequence = Annotated[list[Vector], Field(min_length=1, max_length=MAX_ROLL
 class ClaimQueries(Request):
     """Request of a sampler for queries, which it holds under leases."""
 
-    sampler: Key = Field(description="name of the sampler, shown in the ledger")
-    max_queries: Annotated[int, Field(ge=1, le=MAX_CLAIM)] = Field(default=1, description="most queries to lease")
+    sampler: Key = Field(description="name of the sampler, which people see with its queries and samples")
+    max_queries: Annotated[int, Field(ge=1, le=MAX_CLAIM)] = Field(
+        default=1, description="largest number of queries to lease"
+    )
     wait_seconds: Annotated[float, Field(ge=0, le=60)] = Field(
         default=0.0, description="seconds that the reply may wait for a query; 0: reply at once"
     )
     lease_seconds: Annotated[float, Field(gt=0, le=86_400)] = Field(
-        default=LEASE_SECONDS, description="seconds until the leases end, unless they are renewed"
+        default=LEASE_SECONDS, description="seconds until the leases end, unless the sampler renews them"
     )
 
 
 class LeasedQuery(Reply):
     """Base class of the queries that a sampler has claimed, with the fields that all kinds of queries have."""
 
-    id: int = Field(description="id of the query; its samples name it as ``query_id``")
-    number: int = Field(description="number of the surrogate's earlier queries")
-    purpose: Purpose = Field(description="why the real step is wanted")
-    attempt: int = Field(description="1 for the first lease of this query")
+    id: int = Field(description="id of the query, which its samples have as ``query_id``")
+    number: int = Field(description="how many queries of the surrogate are older than this query")
+    purpose: Purpose = Field(description="why the server requests the real steps")
+    attempt: int = Field(description="number of this lease among the leases of the query: 1, 2, ...")
     lease_token: str = Field(
-        description="token of the lease; it is sent with the samples, and to renew or return the query"
+        description="token of the lease, to be sent with the samples, with a renewal, and with the report of a failure"
     )
-    lease_seconds: float = Field(description="seconds from this reply until the lease ends, unless it is renewed")
+    lease_seconds: float = Field(
+        description="seconds from this reply until the lease ends, unless the sampler renews the lease"
+    )
 
 
 class StepQuery(LeasedQuery):
     """Query of one step: set the original environment to ``coordinates``, apply ``action``, report one sample."""
 
     kind: Literal["step"] = "step"
-    coordinates: list[float] = Field(description="(C,) state to set")
+    coordinates: list[float] = Field(description="(C,) coordinates of the state to set")
     action: list[float] = Field(
-        description="(F,) action to apply: continuous values, or the number of each discrete action"
+        description="(F,) action to apply: continuous values, or the number of the choice for each discrete entry"
     )
 
 
@@ -72,7 +76,9 @@ class RolloutQuery(LeasedQuery):
     """
 
     kind: Literal["rollout"] = "rollout"
-    actions: list[list[float]] = Field(description="(T, F) actions to apply from there, in this order")
+    actions: list[list[float]] = Field(
+        description="(T, F) actions of F entries to apply in T steps, one after the other"
+    )
     snapshot: str | None = Field(default=None, description="name of the snapshot to begin at; null: begin at a reset")
 
 
@@ -84,11 +90,11 @@ class ClaimedQueries(Reply):
 
     queries: list[Query] = Field(description="leased queries")
     phase: Phase = Field(description="present phase of the design")
-    paused: bool = Field(description="whether the design is paused; then nobody gets queries")
+    paused: bool = Field(description="whether the design is paused; no sampler gets queries then")
 
 
 class RenewLease(Request):
-    """Heartbeat of a sampler. It renews the lease of a query for ``lease_seconds``."""
+    """Request of a sampler to extend the lease of a query to ``lease_seconds`` from now."""
 
     lease_token: Key = Field(description="token of the lease")
     lease_seconds: Annotated[float, Field(gt=0, le=86_400)] = Field(
@@ -101,16 +107,17 @@ class FailQuery(Request):
 
     lease_token: Key = Field(description="token of the lease")
     error: Annotated[str, Field(min_length=1, max_length=4_000)] = Field(
-        description="why there is no answer, shown to people"
+        description="why the sampler could not answer the query, for people"
     )
     begun: bool = Field(
         default=True,
-        description="whether a real step may have been taken; if so, it counts as an attempt and as unresolved",
+        description="whether real steps may have been taken; if so, the lease counts as an attempt, and the steps of "
+        "the query count as unresolved",
     )
     refused: bool = Field(
         default=False,
-        description="whether the original environment refused the query before a real step; then nobody claims it "
-        "again, it counts neither as an attempt nor towards the budget, and ``begun`` is ignored",
+        description="whether the original environment refused the query before a real step. The query is then not "
+        "leased again and does not count towards the budget, and ``begun`` is ignored",
     )
 
 
@@ -118,32 +125,34 @@ class QueryView(Reply):
     """A query as people see it."""
 
     id: int = Field(description="id of the query")
-    purpose: Purpose = Field(description="why the real step is wanted")
+    purpose: Purpose = Field(description="why the server requests the real steps")
     status: QueryStatus = Field(
         description="pending, leased by a sampler, answered, set aside after its last attempt, or refused by the "
         "original environment"
     )
-    round: int = Field(description="number of fits before the query was made")
-    kind: QueryKind = Field(description="one step, or a rollout from a reset or a snapshot")
-    coordinates: list[float] | None = Field(description="(C,) state to set for a step; null for a rollout")
-    actions: list[list[float]] = Field(description="(T, F) actions; T = 1 for a step")
+    round: int = Field(description="number of rounds of the design before the query was chosen")
+    kind: QueryKind = Field(
+        description="``step``: one step from a state; ``rollout``: an action sequence from a reset or a snapshot"
+    )
+    coordinates: list[float] | None = Field(description="(C,) coordinates to set for a step; null for a rollout")
+    actions: list[list[float]] = Field(description="(T, F) actions to apply in T steps; T is 1 for a query of one step")
     snapshot: str | None = Field(
         default=None, description="name of the snapshot at which a rollout begins; null for a step, and for a reset"
     )
-    attempts: int = Field(description="number of leases so far")
-    sampler: str | None = Field(description="name of the last sampler that claimed it")
-    error: str | None = Field(description="error of the last attempt that failed")
+    attempts: int = Field(description="how often the query has been leased so far")
+    sampler: str | None = Field(description="name of the sampler that claimed the query last; null if none has")
+    error: str | None = Field(description="error of the last lease that ended without an answer; null if there is none")
     lease_seconds_left: float | None = Field(
         default=None,
-        description="seconds left of the lease that a sampler holds, by the server's clock; negative if it has "
-        "ended; null without a lease",
+        description="seconds until the lease of a sampler ends, by the server's clock; negative after its end; null if "
+        "the query is not leased",
     )
 
 
 class QueryList(Reply):
     """Queries of a surrogate."""
 
-    queries: list[QueryView] = Field(description="the queries")
+    queries: list[QueryView] = Field(description="the listed or added queries, oldest first")
 
 
 class AddQueries(Request):
@@ -152,8 +161,10 @@ class AddQueries(Request):
     Give either ``coordinates`` with ``action``, for single steps, or ``rollouts``.
     """
 
-    coordinates: Matrix | None = Field(default=None, description="(m, C) states to set")
-    action: Matrix | None = Field(default=None, description="(m, F) the action to apply in each of them")
+    coordinates: Matrix | None = Field(
+        default=None, description="(m, C) states to set, one for each of m queries of one step"
+    )
+    action: Matrix | None = Field(default=None, description="(m, F) action to apply in each of the m states")
     rollouts: Annotated[list[ActionSequence], Field(min_length=1, max_length=MAX_CLAIM)] | None = Field(
         default=None, description="action sequences, each (T, F), to apply after a reset"
     )
@@ -187,16 +198,17 @@ class NewSample(Request):
     """Result of one real step. ``coordinates`` and ``action`` are the achieved values, not the requested ones."""
 
     query_id: Annotated[int, Field(ge=1)] | None = Field(
-        default=None, description="id of the query that this sample answers; null for a step without a query"
+        default=None, description="id of the query that the sample answers; null for a step without a query"
     )
     lease_token: Key | None = Field(
         default=None, description="token of the query's lease; null for a step without a query"
     )
     step: Annotated[int, Field(ge=0, lt=MAX_ROLLOUT_QUERY)] = Field(
-        default=0, description="place in the rollout, from 0; each step begins where the one before ended"
+        default=0,
+        description="index of the step in its rollout, from 0; each step begins where the step before ended",
     )
     coordinates: Vector = Field(description="(C,) state before the step")
-    action: Vector = Field(description="(F,) action")
+    action: Vector = Field(description="(F,) action that was applied")
     next_coordinates: Vector = Field(description="(C,) state after the step")
     reward: Measured = Field(description="reward of the step")
     terminated: bool = Field(description="whether the step ended the episode in a terminal state")
@@ -204,12 +216,16 @@ class NewSample(Request):
         default=False, description="whether the step ended the episode for another reason, such as a time limit"
     )
     observation: Vector | None = Field(
-        default=None, description="(D,) the environment's own observation before the step; stored with the sample"
+        default=None,
+        description="(D,) the environment's own observation before the step, to be stored; null if it was not measured",
     )
-    next_observation: Vector | None = Field(default=None, description="(D,) the same after the step")
+    next_observation: Vector | None = Field(
+        default=None, description="(D,) the environment's own observation after the step; null if it was not measured"
+    )
     snapshot: Key | None = Field(
         default=None,
-        description="name under which the sampler saved the state after the step; queries may begin there",
+        description="name under which the sampler saved the state after the step (snapshot), where queries may begin; "
+        "null if it saved none",
     )
 
 
@@ -217,24 +233,26 @@ class AddSamples(Request):
     """Samples to store: answers to queries, real steps without a query, or recorded steps of a log."""
 
     sampler: Key = Field(description="name of the sampler, shown with the samples")
-    samples: Annotated[list[NewSample], Field(min_length=1, max_length=4_096)] = Field(description="the samples")
+    samples: Annotated[list[NewSample], Field(min_length=1, max_length=4_096)] = Field(
+        description="samples to store, all or none"
+    )
     purpose: Literal["manual", "logged"] = Field(
         default="manual",
         description="purpose of the samples that answer no query. ``manual``: they count towards the budget. "
-        "``logged``: they were recorded before and don't. Each is identified by its numbers and by all samples "
-        "of its log before it, so the same log again changes nothing",
+        "``logged``: they were recorded before, and don't count. A logged sample is identified by its numbers and "
+        "by all earlier samples of its log, so sending a log again changes nothing",
     )
     after: Key | None = Field(
         default=None,
-        description="for logged samples: ``digest`` of the reply to the part of the log before; null: the log begins "
-        "here. Another text begins a log that differs from logs with the same numbers",
+        description="for logged samples: ``digest`` from the reply to the previous part of the log; null: this is the "
+        "first part. Any other text begins a log that is distinct from logs with the same numbers",
     )
     complete: bool = Field(
-        default=True, description="false: more of the same log follows, so no fit becomes due for this part"
+        default=True, description="whether the log is complete; false: more parts follow, and no fit becomes due yet"
     )
     idempotency_key: Key | None = Field(
         default=None,
-        description="needed for samples without a query, but not for logged ones: a repeat with it is harmless",
+        description="required if samples without a query are not logged: a repeat with the same key adds nothing",
     )
 
 
@@ -243,42 +261,43 @@ class AddedSamples(Reply):
 
     sample_ids: list[int] = Field(description="id of each sample, in the order of the request")
     duplicates: int = Field(description="number of samples that were stored before")
-    ledger: Ledger = Field(description="real steps so far")
+    ledger: Ledger = Field(description="counts of all real steps so far, by purpose")
     digest: str | None = Field(
-        default=None, description="identifies the log up to here; give it as ``after`` with the next part"
+        default=None,
+        description="hash of the log up to here, to be sent as ``after`` with the next part; null without a log",
     )
     restart: str | None = Field(
         default=None,
-        description="not null: nothing was stored, because the log differs here from a stored one that begins in the "
-        "same way; send it again from its beginning, with this as ``after``",
+        description="null: the samples were stored. Otherwise nothing was stored, because a stored log begins in the "
+        "same way and differs here: send the log again from its first part, with this text as ``after``",
     )
 
 
 class SnapshotView(Reply):
-    """A snapshot that a sampler holds."""
+    """A snapshot: a saved state of the original environment, to which a sampler can return."""
 
-    name: str = Field(description="name that the sampler gave it")
-    coordinates: list[float] = Field(description="(C,) state to which it returns")
+    name: str = Field(description="name that the sampler gave the snapshot")
+    coordinates: list[float] = Field(description="(C,) coordinates of the saved state")
 
 
 class SnapshotList(Reply):
-    """Snapshots that samplers hold."""
+    """Snapshots (saved states) of a surrogate's samplers."""
 
-    snapshots: list[SnapshotView] = Field(description="every snapshot that is known, oldest first")
+    snapshots: list[SnapshotView] = Field(description="all stored snapshots, oldest first")
 
 
 class DropSnapshots(Request):
-    """Request to forget snapshots that no sampler holds any more."""
+    """Request to remove snapshots to which no sampler can return any more."""
 
     snapshots: Annotated[list[Key], Field(min_length=1, max_length=4_096)] = Field(
-        description="name of each snapshot that is gone"
+        description="names of the snapshots to remove"
     )
 
 
 class DroppedSnapshots(Reply):
-    """Reply after the snapshots were forgotten."""
+    """Reply after snapshots were removed."""
 
-    dropped: int = Field(description="number of them that were known")
+    dropped: int = Field(description="number of removed snapshots; unknown names don't count")
 
 
 class SampleView(Reply):
@@ -286,28 +305,32 @@ class SampleView(Reply):
 
     id: int = Field(description="id of the sample")
     purpose: SamplePurpose = Field(description="why the real step was taken")
-    query_id: int | None = Field(description="id of the query that it answers; null without one")
-    sampler: str = Field(description="name of the sampler that sent it")
-    attempt: int = Field(description="number of the query's lease under which it was taken; 0 without a query")
-    late: bool = Field(description="whether the lease had ended when the sample came")
-    trajectory: int | None = Field(description="number shared by the samples of one rollout; null for others")
-    step: int = Field(description="place in the rollout, from 0")
-    requested_coordinates: list[float] | None = Field(
-        description="(C,) state that the query wanted; null without a query, and in a rollout"
+    query_id: int | None = Field(description="id of the query that the sample answers; null without a query")
+    sampler: str = Field(description="name of the sampler that sent the sample")
+    attempt: int = Field(
+        description="number of the query's lease under which the step was taken, from 1; 0 without a query"
     )
-    coordinates: list[float] = Field(description="(C,) achieved state before the step")
-    action: list[float] = Field(description="(F,) achieved action")
+    late: bool = Field(description="whether the query's lease had ended when the sample came")
+    trajectory: int | None = Field(
+        description="number that all samples of one rollout share; null if the sample belongs to no rollout"
+    )
+    step: int = Field(description="index of the step in its rollout, from 0")
+    requested_coordinates: list[float] | None = Field(
+        description="(C,) state that the query requested; null without a query, and in a rollout"
+    )
+    coordinates: list[float] = Field(description="(C,) state before the step, as achieved")
+    action: list[float] = Field(description="(F,) action, as applied")
     next_coordinates: list[float] = Field(description="(C,) state after the step")
     reward: float = Field(description="reward of the step")
     terminated: bool = Field(description="whether the step ended the episode in a terminal state")
     truncated: bool = Field(description="whether the step ended the episode for another reason")
-    created_at: float = Field(description="when it was stored, in seconds since 1970, by the server's clock")
+    created_at: float = Field(description="when the sample was stored, in seconds since 1970, by the server's clock")
 
 
 class SamplePage(Reply):
     """One page of a surrogate's samples."""
 
-    samples: list[SampleView] = Field(description="samples, oldest first")
+    samples: list[SampleView] = Field(description="samples of this page, oldest first")
     next_after: int | None = Field(description="value of ``after`` for the next page; null on the last page")
 
 
@@ -315,9 +338,9 @@ class ReportSteps(Request):
     """Report of the number of real steps that an evaluation took. They don't count towards the budget."""
 
     purpose: Literal["evaluation"] = "evaluation"
-    steps: Annotated[int, Field(ge=1, le=1_000_000_000)] = Field(description="number of real steps")
+    steps: Annotated[int, Field(ge=1, le=1_000_000_000)] = Field(description="number of real steps that were taken")
     episodes: Annotated[int, Field(ge=0, le=1_000_000_000)] = Field(
-        default=0, description="number of episodes that they belong to"
+        default=0, description="number of episodes in which the steps were taken"
     )
     note: Annotated[str, Field(max_length=1_000)] = Field(
         default="", description="remark for people, stored with the report"
@@ -331,9 +354,15 @@ class Improve(Request):
     The budget must have enough real steps left. With a token of role ``admin``, it is raised as needed.
     """
 
-    queries: Annotated[int, Field(ge=1, le=10_000, description="number of real steps; each step of a rollout counts")]
+    queries: Annotated[
+        int,
+        Field(
+            ge=1, le=10_000, description="number of real steps of the further queries; each step of a rollout counts"
+        ),
+    ]
     checkpoint: Key | None = Field(
         default=None,
-        description="name of submitted occupancy that weighs the queries; null: the latest, if there is any",
+        description="name of the submitted occupancy (states that policies visited) near which to choose the queries; "
+        "null: the latest one, if there is any",
     )
     idempotency_key: Key | None = Field(default=None, description="a repeat with the same key adds nothing")

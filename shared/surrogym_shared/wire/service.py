@@ -15,29 +15,31 @@ class Health(Reply):
 
     status: Literal["ok"] = "ok"
     version: str = Field(description="version of Surrogym")
-    protocol: int = Field(default=PROTOCOL, description="version of the protocol; a client needs the same")
+    protocol: int = Field(
+        default=PROTOCOL, description="version of the HTTP protocol, which must be equal in the client"
+    )
 
 
 class Ready(Reply):
     """Reply that says whether the server can store data."""
 
     status: Literal["ready", "not_ready"] = Field(
-        description="``ready``: the tables exist, and a small write was durable"
+        description="``ready``: all tables of the database exist, and a test write succeeded"
     )
     storage: str = Field(description="``ok`` if the storage works")
 
 
 class Access(Reply):
-    """Role of the caller, and what it may do."""
+    """Role of the caller's token."""
 
     role: Role = Field(description="role of the caller's token")
-    tokens: bool = Field(description="whether the server has tokens; without any, everybody is admin")
+    tokens: bool = Field(description="whether the server has tokens; if it has none, every caller has the role admin")
 
 
 class Event(Reply):
     """Server-sent event of a surrogate. Its ``id`` increases, so that a reader can continue with Last-Event-ID."""
 
-    id: int = Field(description="number of the event")
+    id: int = Field(description="id of the event, which is higher than those of earlier events")
     kind: EventKind = Field(description="kind of the event")
-    created_at: float = Field(description="when it happened, in seconds since 1970, by the server's clock")
-    body: dict[str, Any] = Field(description="fields of this kind of event")
+    created_at: float = Field(description="when the event happened, in seconds since 1970, by the server's clock")
+    body: dict[str, Any] = Field(description="further fields, which depend on the kind of the event")

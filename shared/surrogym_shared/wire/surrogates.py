@@ -15,7 +15,8 @@ from surrogym_shared.wire.base import Phase, Reply, Request, SurrogateName
 class CreateSurrogate(Request):
     """Request to register a surrogate."""
 
-    model_config = ConfigDict(extra="forbid", strict=False)  # the specification checks its own types strictly
+    # Not strict here, because ``EnvironmentSpec`` checks the types of its fields.
+    model_config = ConfigDict(extra="forbid", strict=False)
 
     name: SurrogateName = Field(description="name of the surrogate")
     spec: EnvironmentSpec = Field(
@@ -28,8 +29,8 @@ class PatchSurrogate(Request):
 
     paused: bool | None = Field(
         default=None,
-        description="true pauses the design, false continues it and puts queries that were set aside back into the "
-        "queue",
+        description="true: pause the design; false: continue it, and queue the queries again that were set aside or "
+        "refused",
     )
     budget: Annotated[int, Field(ge=0, le=100_000)] | None = Field(
         default=None, description="real steps that the design may take; 0: none, so all samples come from a log"
@@ -37,19 +38,24 @@ class PatchSurrogate(Request):
     target: Annotated[float, Field(gt=0.5, lt=1)] | None = Field(default=None, description="confidence index to reach")
     tolerances: dict[str, Positive | None] | None = Field(
         default=None,
-        description="tolerance of each named output, in its own unit; null removes a tolerance that was set "
-        "before; outputs without an entry stay as they are",
+        description="tolerance of each named output, in the output's unit; null restores its default. Outputs without "
+        "an entry stay as they are",
     )
 
 
 class DoubtfulRegion(Reply):
     """A range of one coordinate or action entry in which the model is uncertain about an output."""
 
-    input: str = Field(description="name of the coordinate; ``action``, or ``action 1``, ``action 2``...")
-    low: float | None = Field(description="lower end of the range; null: none")
-    high: float | None = Field(description="upper end of the range; null: none")
-    outside: bool = Field(description="whether the doubt is outside of the range")
-    share: float = Field(description="share of the output's doubt over the Monte Carlo set that lies there")
+    input: str = Field(
+        description="name of the coordinate, or of the action entry: ``action``, or ``action 1``, ``action 2``..."
+    )
+    low: float | None = Field(description="lower end of the range; null: no lower end")
+    high: float | None = Field(description="upper end of the range; null: no upper end")
+    outside: bool = Field(description="whether the model is uncertain outside of the range instead of inside")
+    share: float = Field(
+        description="share of the output's total uncertainty, summed over random points of the sampling ranges, that "
+        "lies there"
+    )
 
 
 class PrequentialScores(Reply):
@@ -63,9 +69,15 @@ class PrequentialScores(Reply):
     """
 
     predictions: int = Field(description="number of samples that were predicted")
-    within_50: float = Field(description="share of them in the central 50 % interval, or within the tolerance")
-    within_80: float = Field(description="the same for the 80 % interval")
-    within_90: float = Field(description="the same for the 90 % interval")
+    within_50: float = Field(
+        description="share of the predictions whose error is in the central 50 % interval or within the tolerance"
+    )
+    within_80: float = Field(
+        description="share of the predictions whose error is in the central 80 % interval or within the tolerance"
+    )
+    within_90: float = Field(
+        description="share of the predictions whose error is in the central 90 % interval or within the tolerance"
+    )
     interval_score: float = Field(
         description="mean interval score (Gneiting and Raftery 2007, eq. 43) of the 90 % intervals, which are at least "
         "as wide as the tolerance, divided by the tolerance; lower is better, and 2 is the least"
@@ -76,14 +88,19 @@ class OutputFidelity(Reply):
     """How well the model predicts one output."""
 
     name: str = Field(description="name of the output")
-    structure: str = Field(description="inputs and kernel that were chosen, in words")
+    structure: str = Field(description="inputs and kernel that the fit has chosen, in words")
     confidence_index: float = Field(
-        description="mean Phi(tolerance / standard deviation) over the Monte Carlo set (eq. 8, 9); a noisy output "
-        "has a wider tolerance there: 1.5 standard deviations of its noise"
+        description="mean of Phi(tolerance / standard deviation) over random points of the sampling ranges (eq. 8, 9); "
+        "the tolerance of a noisy output is at least 1.5 standard deviations of its noise"
     )
-    confidence_index_paper: float = Field(description="mean Phi(1 / standard deviation): the paper's, in raw units")
+    confidence_index_paper: float = Field(
+        description="mean of Phi(1 / standard deviation), the paper's definition in raw units"
+    )
     tolerance: float = Field(description="error that is too small to matter, in the output's unit")
-    coverage: float = Field(description="share of the Monte Carlo set whose standard deviation is below the tolerance")
+    coverage: float = Field(
+        description="share of random points of the sampling ranges at which the standard deviation is below the "
+        "tolerance"
+    )
     leave_one_out_error: float | None = Field(
         description="root mean square error of each sample's prediction from all others, in the output's unit; "
         "null if the family of models can't compute it"
@@ -91,11 +108,13 @@ class OutputFidelity(Reply):
     leave_one_out_within_one: float | None = Field(
         default=None,
         description="share of the samples that are predicted from all others with an error below one predicted "
-        "standard deviation: near 0.68 if these are right; null if the family can't compute it, or if "
-        "the model is older than this field",
+        "standard deviation: near 0.68 if the deviations are right; null if the family of models can't "
+        "compute it, or if the model is older than this field",
     )
     leave_one_out_within_two: float | None = Field(
-        default=None, description="the same below two predicted standard deviations: near 0.95"
+        default=None,
+        description="share of the samples that are predicted from all others with an error below two predicted "
+        "standard deviations: near 0.95 if the deviations are right; null as ``leave_one_out_within_one``",
     )
     noise: float = Field(
         default=0.0,
@@ -105,15 +124,16 @@ class OutputFidelity(Reply):
     sensor_noise: float = Field(
         default=0.0,
         description="standard deviation of one measurement's error, in the output's unit, if consecutive steps of an "
-        "episode show that most of ``noise`` is the sensor's; 0: it is the process's, or can't be told",
+        "episode show that most of ``noise`` is measurement error; 0: it is process noise, or this is unknown",
     )
     past: float = Field(
         default=0.0,
-        description="share of the squared errors that the action and the change of the step before explain, if it is "
-        "most of them: the sign of a dead time or of a state that is not measured; no noise is confirmed then",
+        description="share of the squared errors that the action and the change of the previous step explain; 0 unless "
+        "it is most of them. It indicates a dead time or an unmeasured state, and no noise is confirmed then",
     )
     region: DoubtfulRegion | None = Field(
-        default=None, description="where most of the doubt is; null if no range of a single input has most of it"
+        default=None,
+        description="where the model is most uncertain about the output; null if no range of a single input stands out",
     )
     prequential: PrequentialScores | None = Field(
         default=None,
@@ -127,21 +147,23 @@ class ReachedLimit(Reply):
     coordinate: str = Field(description="name of the coordinate")
     side: Side
     value: float = Field(description="the limit, in the coordinate's unit")
-    share: float = Field(description="share of the samples that end there")
+    share: float = Field(description="share of the samples whose next state is at the limit")
 
 
 class Fidelity(Reply):
     """How well a model predicts: the smallest confidence index of its outputs, and the values of each output."""
 
-    confidence_index: float = Field(description="smallest confidence index of the outputs, with their tolerances")
+    confidence_index: float = Field(
+        description="smallest confidence index of the outputs, computed with their tolerances"
+    )
     confidence_index_paper: float = Field(
         description="smallest confidence index as the paper defines it, with a tolerance of 1 in raw units"
     )
-    target: float = Field(description="confidence index to reach")
+    target: float = Field(description="confidence index that the design should reach")
     samples: int = Field(description="number of samples that the model was fitted to")
-    outputs: list[OutputFidelity] = Field(description="values of each output")
+    outputs: list[OutputFidelity] = Field(description="how well the model predicts each output")
     limits: list[ReachedLimit] = Field(
-        default=[], description="declared limits at which many samples end, which says little about the dynamics"
+        default=[], description="declared limits at which many samples end; such samples say little about the dynamics"
     )
 
 
@@ -154,25 +176,29 @@ class Ledger(Reply):
     these, ``failed`` steps were returned by a sampler with an error; the leases of the others expired.
     """
 
-    initial: int = Field(default=0, description="steps of the first queries, before any model")
+    initial: int = Field(default=0, description="steps of the initial queries, before the first model")
     adaptive: int = Field(default=0, description="steps of queries that the acquisition chose")
-    manual: int = Field(default=0, description="steps of queries by hand, and steps without a query")
+    manual: int = Field(default=0, description="steps of queries that a person added, and steps without a query")
     audit: int = Field(default=0, description="steps of audits")
-    logged: int = Field(default=0, description="steps that were recorded before")
+    logged: int = Field(default=0, description="steps from logs, which were recorded before")
     total: int = Field(default=0, description="initial + adaptive + manual, which the budget limits")
-    evaluation: int = Field(default=0, description="steps of evaluations, as reported")
-    unresolved: int = Field(default=0, description="steps that may have been taken, but were not reported")
-    failed: int = Field(default=0, description="those of the unresolved steps that a sampler returned with an error")
+    evaluation: int = Field(default=0, description="steps of evaluations, as clients reported them")
+    unresolved: int = Field(default=0, description="steps that may have been taken, but whose samples did not come")
+    failed: int = Field(
+        default=0, description="part of ``unresolved``: steps of queries for which a sampler reported an error"
+    )
 
 
 class QueryCounts(Reply):
     """Numbers of a surrogate's queries, by status."""
 
-    pending: int = Field(default=0, description="no sampler has them")
-    leased: int = Field(default=0, description="a sampler has them")
-    answered: int = Field(default=0, description="with samples")
-    set_aside: int = Field(default=0, description="failed in all their attempts")
-    refused: int = Field(default=0, description="refused by the original environment before a real step")
+    pending: int = Field(default=0, description="number of queries that wait for a sampler")
+    leased: int = Field(default=0, description="number of queries that a sampler has claimed")
+    answered: int = Field(default=0, description="number of queries that samples have answered")
+    set_aside: int = Field(default=0, description="number of queries that failed in all attempts")
+    refused: int = Field(
+        default=0, description="number of queries that the original environment refused before a real step"
+    )
 
 
 class SurrogateSummary(Reply):
@@ -181,28 +207,32 @@ class SurrogateSummary(Reply):
     name: str = Field(description="name of the surrogate")
     environment: str = Field(description="name of the original environment")
     phase: Phase = Field(description="present phase of the design")
-    paused: bool = Field(description="whether the design is paused; then no sampler gets queries")
-    round: int = Field(description="number of fits so far")
+    paused: bool = Field(description="whether the design is paused; no sampler gets queries then")
+    round: int = Field(description="number of rounds (fits) of the design so far")
     samples: int = Field(description="number of samples")
     model_version: int | None = Field(description="version of the newest model; null without a model")
     confidence_index: float | None = Field(
         description="smallest confidence index of the newest model's outputs; null without a model"
     )
-    target: float = Field(description="confidence index to reach")
-    budget: int = Field(description="real steps that the design may take")
-    ledger: Ledger = Field(description="real steps so far, by purpose")
+    target: float = Field(description="confidence index that the design should reach")
+    budget: int = Field(description="number of real steps that the design may take")
+    ledger: Ledger = Field(description="counts of real steps so far, by purpose")
     queries: QueryCounts = Field(description="numbers of queries, by status")
     samplers: list[str] = Field(
         default=[], description="names of the samplers that sent a request within the last minute"
     )
     sessions: int = Field(default=0, description="number of open sessions")
-    created_at: float = Field(description="when it was registered, in seconds since 1970, by the server's clock")
+    created_at: float = Field(
+        description="when the surrogate was registered, in seconds since 1970, by the server's clock"
+    )
 
 
 class SurrogateView(SurrogateSummary):
     """A surrogate with its specification and the fidelity of its newest model."""
 
-    spec: EnvironmentSpec = Field(description="what was declared of the original environment")
+    spec: EnvironmentSpec = Field(
+        description="what was declared about the original environment, with the settings of the design"
+    )
     budget_left: int = Field(
         description="real steps of the budget that are neither taken, nor requested by a query, nor reserved for a "
         "request of more queries"
@@ -220,25 +250,31 @@ class SurrogateView(SurrogateSummary):
 class CreatedSurrogate(SurrogateView):
     """Reply to a registration: the surrogate, and whether it is new."""
 
-    created: bool = Field(description="whether this request created it; false: it existed, with the same specification")
+    created: bool = Field(
+        description="whether this request created the surrogate; false: it existed with the same specification"
+    )
 
 
 class CheckedSurrogate(Reply):
     """Reply to the check of a registration: what it would store. Nothing was stored."""
 
     name: str = Field(description="name of the surrogate")
-    spec: EnvironmentSpec = Field(description="with the default of every field that the request left out")
+    spec: EnvironmentSpec = Field(
+        description="complete specification, with the default of each field that the request left out"
+    )
     budget: int = Field(description="real steps that the design would be allowed to take")
-    target: float = Field(description="confidence index to reach")
-    initial: int = Field(description="real steps of the initial queries")
-    outputs: list[str] = Field(description="quantities that the model would predict")
+    target: float = Field(description="confidence index that the design should reach")
+    initial: int = Field(description="number of real steps of the initial queries")
+    outputs: list[str] = Field(description="names of the quantities that the model would predict")
     exists: bool = Field(description="whether there is a surrogate of this name and specification")
 
 
 class ImprovedSurrogate(SurrogateView):
     """Reply to a request for more queries: the surrogate, and by how much its budget was raised."""
 
-    budget_raised_by: int = Field(description="real steps that the request added to the budget; 0: it had enough left")
+    budget_raised_by: int = Field(
+        description="number of real steps that the request added to the budget; 0: the budget had enough left"
+    )
 
 
 class SurrogateList(Reply):
