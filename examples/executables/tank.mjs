@@ -20,9 +20,14 @@ const SPEC = {
   action: { kind: "box", low: [0], high: [1] },
   start: { level: { kind: "uniform", low: 0.2, high: 0.8 } },
   time_limit: 50,
+  sampling_period: 1,
+  limits: {
+    keep: [{ name: "brim", term: level, high: 1.8, margin: 0.6, unit: "m" }],
+    fallback: [{ parts: [{ function: "one", coefficient: 0, weights: {} }] }], // close the inflow
+  },
 };
 
-let h = 0.5;
+let h = 0.5, closed = false;
 
 class Invalid extends Error {}
 
@@ -58,7 +63,10 @@ const METHODS = {
     go(Math.min(HIGHEST, Math.max(0, h + (inflow - OUTFLOW * Math.sqrt(h)) / AREA)));
     return { state: [h], reward: -((h - WANTED) ** 2), terminated: false, truncated: false };
   },
-  close: () => ({}),
+  close: () => {
+    closed = true;
+    return {};
+  },
 };
 
 for await (const line of createInterface({ input: process.stdin })) {
@@ -75,6 +83,15 @@ for await (const line of createInterface({ input: process.stdin })) {
     Object.assign(answer, { error: error.message, code: invalid ? "invalid" : "failed" });
   }
   process.stdout.write(`${JSON.stringify(answer)}\n`);
-  if (method === "close") break;
+  if (closed) break;
 }
 process.stdin.destroy(); // or Node waits for further lines
+if (!closed) { // the sampler was killed, so nobody else closes the inflow
+  let steps = 0, before;
+  do {
+    before = h;
+    METHODS.step({ action: [0] });
+    steps += 1;
+  } while (before - h > 1e-3 && steps < 200);
+  process.stdout.write(`${JSON.stringify({ fallback: steps })}\n`);
+}

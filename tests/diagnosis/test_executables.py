@@ -9,17 +9,18 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from support.programs import program
+from support.programs import FALLS_BACK, KEEPS_LIMITS, program
 from surrogym.cli import build
 from surrogym_sampler.diagnosis.executables import FIRST, conformance
 
 SHELL = Path(__file__).parents[2] / "examples" / "executables" / "rail.sh"
 SEEDED = 'random.Random(request["seed"]).uniform(-0.5, 0.5)'
+FALLS = "without input the fallback of limits acts"
 SAME = "a program that was started anew is the same"
 
 
-def failures(command: str) -> dict[str, str]:
-    return {outcome.name: outcome.failure for outcome in conformance(command, 10.0) if outcome.failure}
+def failures(command: str, seconds: float = 10.0) -> dict[str, str]:
+    return {outcome.name: outcome.failure for outcome in conformance(command, seconds) if outcome.failure}
 
 
 @pytest.mark.parametrize(
@@ -76,6 +77,49 @@ def test_program_check_errors_name_fields_without_python_terms(tmp_path: Path):
     assert "expected a text for 'snapshot' in the program's answer, got nothing" in no_snapshot
 
 
+def test_a_program_with_limits_that_falls_back_when_its_input_ends_passes_every_check(tmp_path: Path):
+    checked = list(conformance(program(tmp_path, KEEPS_LIMITS, FALLS_BACK), 10.0))
+    assert {outcome.name: outcome.failure for outcome in checked if outcome.failure} == {}
+    assert FALLS in {outcome.name for outcome in checked if outcome.left_out is None}
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "said"),
+    [
+        (
+            "    print(json.dumps({'fallback': steps}), flush=True)",
+            "    pass",
+            "got none from a program that ended with",
+        ),
+        ("    steps, before = 0, None", "    time.sleep(3600)", "got none from a program that still ran after 4 s"),
+        ("json.dumps({'fallback': steps})", "'done'", "with 1 to 200 steps, got done;"),
+        ("{'fallback': steps}", "{'fallback': 0}", 'got {"fallback": 0};'),
+        (
+            "{'fallback': steps}), flush=True)",
+            "{'fallback': steps}), flush=True)\n    time.sleep(3600)",
+            "after this line",
+        ),
+    ],
+)
+def test_a_program_with_limits_that_does_not_report_its_fallback_fails_that_check(
+    tmp_path: Path, before: str, after: str, said: str
+):
+    faulty = (FALLS_BACK[0], FALLS_BACK[1].replace('"', "'").replace(before, after))
+    assert faulty[1] != FALLS_BACK[1].replace('"', "'")
+    failed = failures(program(tmp_path, KEEPS_LIMITS, faulty), 3.0 if "ran" in said else 10.0)
+    assert said in failed.pop(FALLS)
+    assert failed.keys() <= {"the end of its input ends the program"}
+
+
+def test_a_program_with_limits_that_only_ends_is_told_what_to_do(tmp_path: Path):
+    said = failures(program(tmp_path, KEEPS_LIMITS))
+    assert said.keys() == {FALLS}
+    assert said[FALLS].startswith(
+        'expected a line such as {"fallback": 12}, got none from a program that ended with exit'
+    )
+    assert "apply the fallback of its limits until the machine rests, then print this line" in said[FALLS]
+
+
 def test_a_program_that_supports_only_rollouts_need_not_support_set(tmp_path: Path):
     command = program(tmp_path, ('"query":"step"', '"query":"rollout"'), ('"set": put, "get": get, ', ""))
     left_out = {outcome.name for outcome in conformance(command, 10.0) if outcome.left_out}
@@ -84,6 +128,7 @@ def test_a_program_that_supports_only_rollouts_need_not_support_set(tmp_path: Pa
         "set reaches the state",
         "get gives the state that was set",
         "a step depends on nothing but state and action",
+        FALLS,
     }
 
 
@@ -109,5 +154,5 @@ def test_the_program_check_command_lists_each_check_and_its_exit_code_tells_fail
     passed = run("--exec", f"sh {shlex.quote(str(SHELL))}")
     failed = run("--exec", program(tmp_path, (SEEDED, "0.25")), "--json")
     assert (passed.exit_code, failed.exit_code) == (0, 1)
-    assert passed.stdout.endswith("17 of 17 checks passed, 1 left out\n")
+    assert passed.stdout.endswith("17 of 17 checks passed, 2 left out\n")
     assert json.loads(failed.stdout)["failed"].keys() == {"other seeds give other starts"}

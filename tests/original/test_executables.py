@@ -10,12 +10,13 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from subprocess import PIPE
 
 import numpy as np
 import pytest
 
 from support.noting import until
-from support.programs import HANGS, NOTES_ITSELF, UNTERMINABLE, left_behind, program
+from support.programs import FALLS_BACK, HANGS, KEEPS_LIMITS, NOTES_ITSELF, UNTERMINABLE, left_behind, program
 from surrogym_sampler import original
 from surrogym_sampler.original.errors import EnvironmentDied, StepFailed, StepTimedOut, UnknownEnvironment
 from surrogym_sampler.original.executables.messages import CHECK, decode
@@ -201,6 +202,19 @@ def test_an_environment_program_ends_if_its_client_is_killed(tmp_path):
         process.kill()
         process.wait()
     assert left_behind(tmp_path) == []
+
+
+def test_the_fallback_of_a_program_with_limits_acts_longer_than_a_step_after_its_client_is_killed(tmp_path):
+    slow = (FALLS_BACK[0], FALLS_BACK[1].replace("steps, before", "time.sleep(3); steps, before"))
+    notes = ('print(json.dumps({"fallback": steps}), flush=True)', "open(os.path.dirname(__file__) + '/rests', 'x')")
+    name = f"exec:{program(tmp_path, NOTES_ITSELF, KEEPS_LIMITS, ('0.005', '0.05'), slow, notes)}"
+    client = f"from surrogym_sampler import original; original.make({name!r}, step_limit=0.01); print(1, flush=True); "
+    with subprocess.Popen([sys.executable, "-c", f"{client}input()"], stdin=PIPE, stdout=PIPE) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == b"1\n"
+        process.kill()
+    assert left_behind(tmp_path) == []
+    assert (tmp_path / "rests").exists()
 
 
 def test_a_hanging_environment_program_ends_if_its_client_is_killed(tmp_path):

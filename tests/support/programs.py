@@ -74,6 +74,24 @@ NOTES_ITSELF = (
     "x = last = 0.0",
     "x = last = 0.0\nopen(os.path.dirname(__file__) + '/pids', 'a').write(f'{os.getpid()}\\n')",
 )
+LIMITS = """SPEC |= {"sampling_period": 0.005, "limits": {
+    "keep": [{"name": "end", "high": 0.9, "margin": 0.2,
+              "term": {"parts": [{"function": "linear", "weights": {"x": 1}}]}}],
+    "fallback": [{"parts": [{"function": "linear", "weights": {"x": -5}}]}],
+}}
+"""
+KEEPS_LIMITS = "x = last = 0.0\n", f"{LIMITS}x = last = 0.0\n"
+FALLS_BACK = (
+    "        break\n",
+    """        break
+else:  # the input has ended
+    steps, before = 0, None
+    while before is None or abs(before - x) > 1e-3:
+        before, steps = x, steps + 1
+        step({"action": [-5 * x]})
+    print(json.dumps({"fallback": steps}), flush=True)
+""",
+)
 HANGS = "    global last\n", "    time.sleep(3600)\n"
 UNTERMINABLE = "import json", "import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN)\nimport json"
 

@@ -21,6 +21,7 @@ from surrogym_sampler.original.executables.messages import (
 )
 from surrogym_sampler.original.executables.program import Program
 from surrogym_sampler.original.gymnasium import wrapped
+from surrogym_sampler.original.limits.guard import rest_seconds
 from surrogym_sampler.original.protocol import Array, RealStep
 from surrogym_shared.spec import EnvironmentSpec
 
@@ -180,6 +181,8 @@ def open_executable(
     try:
         own = _specification(program)
         chosen = choose(spec or own)
+        if chosen.limits is not None:
+            program.grant(rest_seconds(chosen))
     except StepFailed as error:
         program.end()
         raise UnknownEnvironment(f"expected a specification from {command!r}, got none: {error}") from error

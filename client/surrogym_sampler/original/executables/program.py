@@ -71,6 +71,14 @@ class Program:
         """Whether the process exists and has not ended."""
         return self._process is not None and self._process.poll() is None
 
+    def grant(self, seconds: float) -> None:
+        """Let the program run some seconds longer after this process was killed, because the fallback of its limits
+        acts then. This also holds after the program is started again."""
+        self._grace += seconds
+        if self._guard is not None and self._process is not None:
+            self._guard.dismiss()
+            self._guard = Guard(self._process.pid, self._grace)
+
     def start(self) -> None:
         """Start the program; one that still runs is ended first.
 

@@ -24,6 +24,12 @@ MOST_ERRORS = 5  # number of errors of the environment in a row after which the 
 STILL = 1e-3  # a machine rests if no coordinate changes by more than this share of its largest change in the episode
 
 
+def rest_seconds(spec: EnvironmentSpec) -> float:
+    """Return the longest time in seconds that the fallback of a specification's limits takes, besides its last step; 0
+    without limits."""
+    return 0.0 if spec.limits is None else MOST_STEPS * (spec.sampling_period or 0.0)
+
+
 class Guard:
     """Chooses the action of each step of an episode: the requested one or, shortly before a limit would be left, that
     of the specification's fallback controller.
@@ -101,7 +107,7 @@ class Watchdog:
 
     def __init__(self, spec: EnvironmentSpec, guard: Guard, step: Callable[[Array], bool], *, waits: bool) -> None:
         assert spec.sampling_period is not None
-        self._period = spec.sampling_period
+        self._spec, self._period = spec, spec.sampling_period
         self._waits = waits
         self._guard = guard
         self._step = step
@@ -127,7 +133,7 @@ class Watchdog:
     @property
     def rest_seconds(self) -> float:
         """Longest time in seconds that the fallback takes, besides its last step."""
-        return 0.0 if self._waits else MOST_STEPS * self._period
+        return 0.0 if self._waits else rest_seconds(self._spec)
 
     def check(self) -> None:
         """Raise ``StepFailed`` if the watchdog has ended the episode."""
