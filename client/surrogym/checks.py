@@ -24,10 +24,10 @@ from surrogym_shared.spec import EnvironmentSpec
 
 Floats = NDArray[np.float64]
 
-MOST_STEPS = 100_000  # largest budget of real steps, the same as in a specification
+MOST_STEPS = 100_000  # largest number of real steps that a budget may have, as in a specification
 MOST_THREADS = 1_024
-FARTHEST = 1e6  # largest distance of a state from its sampling range, in widths of the range; a fit loses digits beyond
-SHOWN = 80  # most characters of a wrong value that an error message shows
+FARTHEST = 1e6  # a state may be this number of widths of its range outside the range; beyond, a fit loses digits
+SHOWN = 80  # an error message shows at most this number of characters of a wrong value
 
 
 def require_specification(given: object) -> None:

@@ -13,7 +13,7 @@ from surrogym.cli.options import (
     read_tolerances,
 )
 
-USUAL = "=usual"  # ending of an option that returns an output to its default tolerance
+USUAL = "=usual"  # --tolerance OUTPUT=usual gives an output its default tolerance again
 
 
 def register(app: typer.Typer) -> None:

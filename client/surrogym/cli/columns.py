@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from itertools import groupby
 from textwrap import fill, wrap
 
-ENDLESS = 10_000  # characters in a line of output that is not a terminal
+ENDLESS = 10_000  # number of characters in a line if the output does not go to a terminal, so that no line is broken
 GAP = "  "
 
 
@@ -34,7 +34,8 @@ def columns(rows: Sequence[Sequence[object]], width: int | None = None) -> str:
 def fitted(markdown: str, width: int | None = None) -> str:
     """Format Markdown for a terminal: tables by ``columns``, prose in lines of ``width`` characters.
 
-    Where standard output is not a terminal, the text is returned unchanged.
+    Without ``width``, lines have the width of the terminal. If standard output is not a terminal then, the text is
+    returned unchanged.
     """
     width = width or screen_width()
     if width == ENDLESS:

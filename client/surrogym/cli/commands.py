@@ -18,8 +18,8 @@ GROUPS: Mapping[str, tuple[str, ...]] = {
     ),
     "Operate": ("watch", "work", "jobs", "conformance"),
 }
-REST = "More"  # heading, in the help, of commands that belong to no group, such as those of other packages
-ADVANCED: Mapping[str, frozenset[str]] = {  # options for experts, which the help lists last, by command
+REST = "More"  # heading, in the help, over the commands that belong to no group, such as those of other packages
+ADVANCED: Mapping[str, frozenset[str]] = {  # for each command, the options for experts, which its help lists last
     "deploy": frozenset({"--algorithm", "--trust-policy", "--spec", "--episodes"}),
     "evaluate": frozenset(
         {"--wide", "--start-scale", "--perturb", "--explore", "--parallel", "--algorithm", "--where", "--learn"}
@@ -76,7 +76,8 @@ class Commands(TyperGroup):
         try:
             return super().invoke(ctx)
         except Exception as error:
-            option = getattr(error, "option_name", None)  # only NoSuchOption has it, which typer hides
+            # only NoSuchOption, a class that typer hides, has this attribute
+            option = getattr(error, "option_name", None)
             if option is not None and (said := remark(f"option of {ctx.invoked_subcommand}", option)):
                 error.message += said  # type: ignore[attr-defined]
                 error.possibilities = None  # type: ignore[attr-defined]

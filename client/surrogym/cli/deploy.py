@@ -45,7 +45,8 @@ class Faults:
     timeout: Annotated[
         float | None,
         typer.Option(
-            help="Largest age of a measurement in seconds. [default: two sampling periods, if the period is declared]"
+            help="Largest age of a measurement in seconds; an older one is a fault. [default: two sampling periods, if "
+            "the period is declared]"
         ),
     ] = None
     ranges: Annotated[

@@ -40,7 +40,7 @@ def command(
     from surrogym.cli.printing import prints_aside, unregistered
     from surrogym_shared.terminal import say
 
-    del as_json  # the output is always JSON
+    del as_json  # the output is JSON with and without --json
     with unregistered(lambda: 0, "nothing was described or registered"), prints_aside():
         from surrogym_sampler.original.describing import describe  # this import may take seconds
 

@@ -39,8 +39,8 @@ class Differences:
         int,
         typer.Option(
             min=0,
-            help="Maximum number of differing steps to add to the surrogate's samples. They were taken already, so "
-            "they cost no real step and none of the budget.",
+            help="Maximum number of steps to add to the surrogate's samples: those that differ most from the model. "
+            "They were taken already, so they cost no further real step and none of the budget.",
         ),
     ] = 0
     learn_all: Annotated[
@@ -168,7 +168,7 @@ def missed(promise: Promise | None, result: Evaluation) -> bool:
 
 @dataclass(frozen=True)
 class Imagining:
-    """Policy, card, token and seed with which episodes of the evaluated policy are imagined."""
+    """What virtual episodes of the evaluated policy need: the policy, its card, the server's token and a seed."""
 
     load: Callable[[], Predict]
     card: PolicyCard
@@ -176,7 +176,7 @@ class Imagining:
     seed: int = 0
 
     def changes(self, api: Api, view: SurrogateView, shifted: Systematic, weights: Any) -> Any:
-        """Return by how much systematic errors of the surrogate's model change the return of imagined episodes.
+        """Return the changes (K,) of the mean return of virtual episodes that K errors of the surrogate's model cause.
         ``shifted`` and ``weights`` describe the errors, as in ``changes_of``."""
         from surrogym.cli.audit import session_of
         from surrogym_client.transport import HttpSurrogate
@@ -207,7 +207,8 @@ def _compare(api: Api, surrogate: str, result: Evaluation, first_seed: int, imag
     if not steps:
         return Differing(Disagreements(0, (), {}), first_seed, changed=result.varied, left_out=left_out)
     beside = compared(api, view.spec, view, steps)
-    takes_residual = view.spec.preset.moves == "coordinates"  # the server adds no residual to observations
+    # the server can add errors to a model of coordinates only, not to one of observations
+    takes_residual = view.spec.preset.moves == "coordinates"
     changes = partial(imagining.changes, api, view) if takes_residual else None
     effects, share = effects_of(view.spec, beside, changes)
     explaining = tuple(steps[i] for i in np.argsort(-share).tolist() if share[i] > 0)

@@ -6,7 +6,8 @@ import errno
 
 from surrogym_client.runtime.ways_out import missing
 
-FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # errors of writing to an open file, which don't have its name
+# numbers of errors that writing to an open file raises, such as a full disk; they do not name the file
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 class CommandError(Exception):

@@ -251,7 +251,7 @@ def _repeated(result: Evaluation) -> list[str]:
 
 
 def _judges(episodes: int) -> bool:
-    """Whether this number of episodes is enough to tell whether a promised return was reached."""
+    """Whether this number of episodes is enough to tell if the mean return reached the promised interval."""
     from surrogym_shared.wire import FEWEST_TO_JUDGE
 
     return episodes >= FEWEST_TO_JUDGE

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from surrogym_shared.spec import EnvironmentSpec
     from surrogym_shared.wire import SurrogateView
 
-SHOWN = 5  # most rejected rows to print; the file of rejected rows has all of them
+SHOWN = 5  # at most this number of rejected rows is printed; a file has all of them
 
 
 @dataclass(frozen=True)

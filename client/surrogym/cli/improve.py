@@ -22,7 +22,8 @@ def command(
     checkpoint: Annotated[
         str | None,
         typer.Option(
-            help="Name of the occupancy whose states the queries are chosen near. [default: the latest one, if any]"
+            help="Name of a stored set of states that a policy visited. The queries are chosen near them. [default: "
+            "the latest set, if any]"
         ),
     ] = None,
     *,

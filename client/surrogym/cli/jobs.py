@@ -1,4 +1,4 @@
-"""``surrogym jobs``: what people asked trainer workers for."""
+"""``surrogym jobs``: list or cancel the trainings and evaluations that people requested from trainer workers."""
 
 from __future__ import annotations
 

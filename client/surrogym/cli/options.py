@@ -21,11 +21,11 @@ SHOWN = (
     "warning: --token shows the token in the list of processes; SURROGYM_TOKEN, --token-file or SURROGYM_TOKEN_FILE "
     "keep it out of there"
 )
-NAMES = (  # forms of names of environments, in the help of every command that opens one
+NAMES = (  # forms of an environment's name, for the help of every command that opens an environment
     "a Gymnasium id, package:Id-v0, dm_control:DOMAIN-TASK, pcgym:MODEL, pcgym:FILE.json, fmu:PLANT.fmu or "
     "package.module:factory"
 )
-QUICK = 1.0  # longest time in seconds to wait for a server that may not be running
+QUICK = 1.0  # seconds to wait for a server in the first attempt, because it may not be running
 
 
 def names_of_surrogates(ctx: typer.Context, incomplete: str) -> list[str]:
@@ -88,7 +88,8 @@ Tolerances = Annotated[
     ),
 ]
 StepLimit = Annotated[float, typer.Option(min=0.001, help="Seconds that one real step, or one reset, may take.")]
-DESCRIBED = ("real_steps", "resets", "found", "asked", "specification")  # entries in the output of surrogym describe
+# the entries at the top level of a file that surrogym describe writes
+DESCRIBED = ("real_steps", "resets", "found", "asked", "specification")
 
 
 def connect(server: str | None, token: str | None, wait: float = 0.0, *, quiet: bool = False) -> Api:

@@ -1,4 +1,4 @@
-"""``surrogym policies``: what the server keeps of policies."""
+"""``surrogym policies``: list the policies that the server stores."""
 
 from __future__ import annotations
 

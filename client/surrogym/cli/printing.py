@@ -36,7 +36,8 @@ def unregistered(steps: Callable[[], int], what: str) -> Iterator[None]:
     took, and raises ``KeyboardInterrupt`` again.
 
     Args:
-        steps: returns the number of real steps of a draft that is complete.
+        steps: returns the number of real steps that a finished draft took. It is used if the interruption does not tell
+            how many steps the draft had taken.
         what: end of the printed sentence, such as "nothing was registered".
     """
     from surrogym_shared.terminal import say

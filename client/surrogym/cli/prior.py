@@ -22,9 +22,10 @@ if TYPE_CHECKING:
     from surrogym_shared.wire.priors import PriorAbout, PriorView
 
 LOOK_SECONDS = 1.0
-OTHER = "surrogate:"  # prefix of the name of another surrogate
-LEAST = 2  # least number of real steps from which a prior is calibrated
-LACKING = 0.01  # error of a simulator, as a share of the changes, above which calibrated values may be wrong
+OTHER = "surrogate:"  # an argument that begins with this prefix names another surrogate, not a simulator
+LEAST = 2  # a prior is calibrated on at least this number of real steps
+# if a calibrated simulator's error exceeds this share of the changes of state, its calibrated values may be wrong
+LACKING = 0.01
 
 
 def register(app: typer.Typer) -> None:
@@ -92,9 +93,13 @@ def command(
             return
         target = _Target(api, calls, view)
         if simulator == OTHER + surrogate:
-            raise CommandError(f"expected another surrogate as the prior, got {surrogate} itself: name another")
+            raise CommandError(
+                f"expected another surrogate as the prior of {surrogate}, got {surrogate} itself: name another one"
+            )
         if _is_model(simulator) and (parameter or steps):
-            raise CommandError(f"expected no --parameter and no --steps with {simulator}: a model has no parameters")
+            raise CommandError(
+                f"--parameter and --steps are for a simulator, and {simulator} is a learned model: leave them out"
+            )
         if (file := _file_of(api, simulator)) is not None:
             stored = calls.put(surrogate, file)
             with progress("prior", quiet=output.quiet) as update:
@@ -243,7 +248,7 @@ def words_of_prior(about: PriorAbout) -> list[str]:
 
 
 def _uses(view: SurrogateView) -> list[str]:
-    """Return a line that lists which outputs use the prior; empty without a model."""
+    """Return a line that lists the outputs whose model uses the prior; empty if there is no model yet."""
     if view.fidelity is None:
         return []
     uses = [one.name for one in view.fidelity.outputs if one.structure.startswith("prior + ")]

@@ -36,7 +36,7 @@ def register(app: typer.Typer) -> None:
 
 @dataclass(frozen=True)
 class DesignChoices:
-    """Options that replace entries of the environment's own specification; None keeps an entry."""
+    """Options that replace entries of the environment's own specification. An option that is None keeps the entry."""
 
     preset: Annotated[
         PresetName | None,
@@ -268,7 +268,8 @@ def _opened_by(environment: str, spec: EnvironmentSpec) -> EnvironmentSpec:
     from surrogym_sampler.original.executables import is_executable
     from surrogym_shared.environments import is_name
 
-    if is_name(spec.environment) or is_executable(environment):  # a command line stays on this machine
+    # the command line of a program is not sent to the server
+    if is_name(spec.environment) or is_executable(environment):
         return spec
     return spec.model_copy(update={"environment": environment})
 
@@ -290,8 +291,9 @@ def _words(view: SurrogateView, environment: str, file: Path | None) -> str:
     if awaits_log(view):
         return f"{registered}; {words_of_no_log(view.name)}"
     start = sample_command(view.name, view.environment)
-    if environment:  # the user gave its name on the command line
+    if environment:  # the suggested command repeats the name that the user gave, if a sampler needs it
         start = f"surrogym sample {view.name}" + ("" if is_known(environment) else f" --env {shlex.quote(environment)}")
-    if file is not None and view.spec.limits is not None:  # the sampler reads limits from its own specification
+    # a sampler runs only with a specification of its own that declares the same limits
+    if file is not None and view.spec.limits is not None:
         start += f" --spec {shlex.quote(str(file))}"
     return f"{registered}, budget of {view.budget} real steps, target {view.target:g}; next: {start}"

@@ -54,7 +54,8 @@ def command(
         from surrogym_trainer.report.known import collect, cuts_of
 
         known = collect(api, surrogate, policy, controller)
-        shown, lacking = cuts_of(api, known)  # maps of the model, and the reason if they can't be computed
+        # maps of the model's uncertainty; if they can't be computed, none and the reason
+        shown, lacking = cuts_of(api, known)
         update(0.3, "drawing")
         from surrogym_trainer.report.files import write
         from surrogym_trainer.report.page import page

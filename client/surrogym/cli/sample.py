@@ -39,8 +39,8 @@ if TYPE_CHECKING:
 Environment = Annotated[
     str | None,
     typer.Option(
-        help=f"Environment to take real steps in: {NAMES}. [default: the surrogate's, if its name can run no file of "
-        "yours]"
+        help=f"Environment to take real steps in: {NAMES}. [default: the environment that the surrogate names, if "
+        "opening it runs no file of yours]"
     ),
 ]
 Command = Annotated[
@@ -99,7 +99,9 @@ class CautionOptions:
         from surrogym.cli.errors import CommandError
 
         if self.approve and (cluster.on_ray is not None or output.quiet or not sys.stdin.isatty()):
-            raise CommandError("--approve asks for each query: expected a terminal, without --quiet and --on-ray")
+            raise CommandError(
+                "--approve asks a person before each query: expected a terminal, without --quiet and --on-ray"
+            )
 
 
 def register(app: typer.Typer) -> None:
@@ -224,7 +226,7 @@ def _sample_here(
                 tell(Line(line_of(query, outcome, error), bool(error)))
 
         def ended(phase: Phase) -> None:
-            if not plan.settings.until_done:  # otherwise the command ends and prints its result
+            if not plan.settings.until_done:  # with --until-done, the command ends and prints its result instead
                 say(_words_of_end(plan.surrogate, phase), quiet=output.quiet)
 
         sampler = Sampler(api, plan.surrogate, environment, plan.settings, report, ended, approve)
@@ -242,7 +244,9 @@ def _require_shared(asked: EnvironmentSpec, settings: SamplerSettings) -> None:
     from surrogym.cli.errors import CommandError
 
     if asked.snapshots and settings.snapshots is None:
-        raise CommandError("expected --snapshots FOLDER that all samplers see, got several samplers without one")
+        raise CommandError(
+            "several samplers share their snapshots: expected --snapshots with a folder that all of them can reach"
+        )
 
 
 def _sample_on_ray(api: Api, plan: SamplerPlan, cluster: RayOptions, output: Output) -> None:
@@ -323,7 +327,8 @@ def _telling(api: Api, surrogate: str, *, quiet: bool, plain: bool = False) -> I
         def tell(line: Line) -> None:
             if line.is_error:
                 say(line.text)
-            with suppress(SurrogymClientError):  # the sampler itself retries while the server does not answer
+            # if the server does not answer, only the progress bar is not updated; the sampler retries
+            with suppress(SurrogymClientError):
                 view = api.surrogate(surrogate)
                 update(share_of_design(view), words_of_design(view))
 

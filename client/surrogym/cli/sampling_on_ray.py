@@ -15,7 +15,7 @@ from surrogym.cli.errors import CommandError
 if TYPE_CHECKING:
     from surrogym_sampler.queries.on_ray import Line, RaySamplers, SamplerPlan
 
-ROOM_SECONDS = 30.0  # time after which a remark mentions samplers that have not started
+ROOM_SECONDS = 30.0  # if samplers have not started after this number of seconds, a remark says so
 
 
 @dataclass(frozen=True)

@@ -57,7 +57,8 @@ def command(
     form: Form = "json" if as_json else "short" if quiet else "words"
     with service.connect(context) as api:
         look = partial(_all, api, form) if surrogate is None else partial(_one, api, surrogate, form)
-        seen = look()  # an unknown name or a wrong address is an error here, also with --watch
+        # an unknown name or a wrong address is an error here; later, --watch tries again if the server does not answer
+        seen = look()
         if watching:
             watch(partial(_patiently, look, as_json))
         else:

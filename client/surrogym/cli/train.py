@@ -180,7 +180,7 @@ def _trainable(
 ) -> tuple[EnvironmentSpec, str]:
     """Return the specification of a surrogate that has a model, and the server's URL.
 
-    If ``wait`` is above 0, wait up to so many seconds for the server, the surrogate and the end of its design, and
+    If ``wait`` is above 0, wait at most that many seconds for the server, the surrogate and the end of its design, and
     import the packages of the policy search in the meantime.
 
     Raises:

@@ -37,12 +37,15 @@ class SearchOptions:
         int | None,
         typer.Option(
             min=1,
-            help="Virtual steps to train for, summed over all rounds of --improve. The steps that collect each "
-            "round's occupancy are not included. [default: from the algorithm]",
+            help="Virtual steps to train for, summed over all rounds of --improve. Steps in which a round only "
+            "collects the states that the policy visits are not included. [default: from the algorithm]",
         ),
     ] = None
     num_envs: Annotated[
-        int | None, typer.Option(min=1, help="Number of lanes to train on. [default: from the specification]")
+        int | None,
+        typer.Option(
+            min=1, help="Number of virtual environments that step together. [default: from the specification]"
+        ),
     ] = None
     chosen: Annotated[
         list[str] | None,
@@ -79,7 +82,8 @@ class SessionOptions:
         ),
     ] = None
     particles: Annotated[
-        int | None, typer.Option(min=1, help="Number of particles of each lane, for variant probabilistic.")
+        int | None,
+        typer.Option(min=1, help="Number of particles of each virtual environment, for variant probabilistic."),
     ] = None
     propagation: Annotated[
         Propagation | None,
@@ -119,8 +123,9 @@ class SessionOptions:
         float | None,
         typer.Option(
             min=0,
-            help="Subtract CAUTION times the model's doubt from each reward. The doubt is the largest ratio that "
-            "--trust looks at, times the reward's standard deviation in the samples. [default: 0]",
+            help="Subtract CAUTION times the model's doubt from each reward. The doubt is the largest ratio, over the "
+            "outputs, of predicted standard deviation to that in the samples, times the reward's standard "
+            "deviation in the samples. [default: 0]",
         ),
     ] = None
     penalty: Annotated[

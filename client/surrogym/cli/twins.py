@@ -11,8 +11,9 @@ if TYPE_CHECKING:
 
     from surrogym.cli.groups import Service
 
-ENTRY_POINTS = "surrogym.twins"  # group of entry points with which the server's package writes a surrogate as an FMU
-FILE = ".surrogate"  # suffix of a surrogate's file
+# the server's package registers its function that writes a surrogate as an FMU under this entry point group
+ENTRY_POINTS = "surrogym.twins"
+FILE = ".surrogate"  # suffix of the file of an exported surrogate
 
 
 def is_surrogate(name: str) -> bool:

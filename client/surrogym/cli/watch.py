@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from surrogym_trainer.evaluation.comparing import StepOfEpisode
     from surrogym_trainer.watching.watcher import Alarm, Watcher
 
-SHOWN = 8  # most unusable rows to print
+SHOWN = 8  # at most this number of unusable rows is printed
 
 
 def register(app: typer.Typer) -> None:
@@ -118,13 +118,13 @@ class _Seen:
     """Rows of a log that is read repeatedly: the usable steps of the last reading, and all unusable rows so far."""
 
     def __init__(self) -> None:
-        self.steps: list[StepOfEpisode] = []  # usable steps of the last reading
-        self.rejected: dict[int, str] = {}  # reason for each unusable row so far, by its line
+        self.steps: list[StepOfEpisode] = []  # usable steps that the last reading of the log added
+        self.rejected: dict[int, str] = {}  # for each unusable row so far, the reason, by the row's line number
         self.notes: tuple[str, ...] = ()
         self._line = 0
 
     def add(self, read: ReadLog) -> None:
-        """Add the rows of a reading of the log that come after the rows of the readings before."""
+        """Add a reading of the log. Rows that earlier readings had are left out."""
         from surrogym_shared.words import has
         from surrogym_trainer.watching.logs import impossible, steps_after
 

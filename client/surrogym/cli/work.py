@@ -40,8 +40,8 @@ def command(
     env: Annotated[
         str | None,
         typer.Option(
-            help=f"Environment to evaluate in: {NAMES}. [default: the surrogate's, if its name can run no file of "
-            "yours; otherwise the worker only trains]"
+            help=f"Environment to evaluate in: {NAMES}. [default: the environment that the surrogate names, if "
+            "opening it runs no file of yours; otherwise the worker only trains]"
         ),
     ] = None,
     spec: SpecFile = None,

@@ -21,7 +21,7 @@ from surrogym_trainer.evaluation.uncontrolled import baseline, default_baseline
 from surrogym_trainer.policies.card import read_card
 from surrogym_trainer.policies.files import load_policy
 
-COMPARED = 20  # number of starts that are also run without the policy
+COMPARED = 20  # number of the policy's starts from which episodes without the policy run as well
 
 
 @dataclass(frozen=True)

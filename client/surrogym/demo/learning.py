@@ -138,7 +138,8 @@ class SurrogateRun:
         if steps := self._settings.description_steps:
             self._api.report_steps(self._settings.task, steps, note="description")
         named = self._settings.demo_task.environment
-        own = ["--env", named] if ":" in named else []  # a sampler imports a module only if --env names it
+        # a sampler imports a user's module only if --env names the module
+        own = ["--env", named] if ":" in named else []
         self._children.start("sampler", "surrogym", ["sample", *self._common, *own])
 
     def _employ_trainer(self) -> Child:
@@ -214,6 +215,6 @@ def later_imports(settings: DemoSettings) -> tuple[str, ...]:
 
 def _warm_up(modules: Sequence[str]) -> None:
     """Import modules in advance, while the program waits for the training."""
-    with suppress(ImportError):  # the code that uses the module reports the error
+    with suppress(ImportError):  # if a module is missing, the code that uses it later reports the error
         for module in modules:
             import_module(module)

@@ -23,7 +23,7 @@ class DemoSettings:
     task: str = "pendulum"
     seed: int = 0
     budget: int | None = None  # most real steps of the design and the rounds together
-    steps: int | None = None  # virtual steps of all rounds of training together
+    steps: int | None = None  # number of virtual steps of all rounds of training together
     episodes: int = 100
     pictures: bool = True
     keep: bool = False
@@ -110,7 +110,8 @@ class DemoSettings:
         """Return all settings that a result depends on, except the seed, as values that JSON can represent."""
         spec = self.spec().model_dump(mode="json")
         spec["design"].pop("seed")
-        if not spec["snapshots"]:  # so that older results, whose settings lack this field, stay valid
+        # a result without snapshots has no such field, so that its settings equal those of older results
+        if not spec["snapshots"]:
             del spec["snapshots"]
         names = ["task", "real_steps", "virtual_steps", "prolong", "episodes"]
         search = {} if self.search == REFERENCE else {"algorithm": self.search.lower()}
