@@ -34,6 +34,7 @@ PLANTS = {
     "history": (plant(**HISTORY), (64, 64), None),
     "linear": (plant(), 0, None),
     "limits": (limited(plant(**HISTORY)), (16,), None),
+    "rates": (limited(plant(**HISTORY, rate=(20.0, None))), (16,), None),
     "choices": (plant(MultiDiscreteAction(nvec=(2, 5)), actions=1), (16,), (1.0, 3.0)),
 }
 

@@ -49,8 +49,8 @@ def test_the_structured_text_controller_equals_the_reference_for_lags_limits_and
 
 @pytest.mark.slow
 @pytest.mark.parametrize("real", ["LREAL", "REAL"])
-def test_the_structured_text_controller_keeps_limits_as_the_reference_does(tmp_path: Path, real: str):
-    controller = controller_of(network(tmp_path, limited(plant(**PAST)), (3,)))
+def test_the_structured_text_controller_keeps_limits_and_rates_as_the_reference_does(tmp_path: Path, real: str):
+    controller = controller_of(network(tmp_path, limited(plant(**PAST, rate=(20.0, None))), (3,)))
     assert max(decided(controller, real)) <= (1e-6 if real == "LREAL" else 1e-4)
     assert "status := 16" in source_of(controller, real, "arm")
 

@@ -137,6 +137,12 @@ def test_the_how_to_program_for_a_policy_with_lagged_inputs_runs(tmp_path: Path)
     run(tmp_path, "-c", f"{own_program}\nassert abs(reading - 1) < 0.1, reading")
 
 
+def test_the_how_to_program_for_actions_that_change_slowly_declares_their_largest_change(tmp_path: Path) -> None:
+    (program,) = programs("limits.md")
+    said = run(tmp_path, "-c", f"{program}\nfrom surrogym_shared.rates import rates\nprint(rates(smooth)[0].change)")
+    assert float(said) == pytest.approx(0.2)
+
+
 def test_the_how_to_program_for_a_simulator_prior_runs(tmp_path: Path) -> None:
     plant, program = programs("priors.md")
     (tmp_path / "arm.py").write_text(plant)

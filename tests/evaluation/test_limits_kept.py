@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from support.limited import SPEC, PatientCart, with_limits
+from support.rated import RATED, RatedRail
 from surrogym_sampler.original.episodes import open_episode
 from surrogym_trainer.evaluation.evaluator import Evaluation, EvaluationSettings, evaluate
 from surrogym_trainer.evaluation.limits import LimitsKept, limits_kept
@@ -40,6 +41,17 @@ def test_the_trace_of_an_evaluation_has_the_actions_that_were_applied() -> None:
     applied = np.concatenate([trace.action for trace in result.traces])
     assert result.limits is not None
     assert int((applied != 1.0).sum()) == result.limits.fallbacks
+
+
+def test_the_trace_of_an_evaluation_under_a_rate_has_the_actions_that_were_applied() -> None:
+    result = evaluate(
+        lambda shown: np.where(shown[:, :1] > 0, -1.0, 1.0),
+        lambda: open_episode("rail:Rail", RATED, RatedRail),
+        EvaluationSettings(episodes=2),
+    )
+    for trace in result.traces:
+        assert np.abs(np.diff(trace.action[:, 0], prepend=0.0)).max() <= 0.5 + 1e-6
+        np.testing.assert_allclose(trace.coordinates[1:, -1], trace.action[:, 0])
 
 
 def test_an_environment_without_limits_reports_none_and_leaves_the_rail() -> None:

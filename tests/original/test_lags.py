@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from support.rail import SPEC, Rail
-from surrogym_sampler.original.errors import StepFailed
+from support.rated import RATED, RatedRail
+from surrogym_sampler.original.errors import StepFailed, UnknownEnvironment
 from surrogym_sampler.original.protocol import RolloutEnvironment
 from surrogym_sampler.original.rollouts import FromReset, answering
 from surrogym_shared.spec import (
@@ -191,3 +192,32 @@ def test_a_too_short_snapshot_with_lags_is_refused():
         environment.restore(b"3.0")
     with pytest.raises(StepFailed, match="got none: reset"):
         environment.save()
+
+
+def test_a_machine_gets_the_nearest_action_that_keeps_the_rate_and_the_step_has_it():
+    rail = RatedRail()
+    environment = answering(rail)
+    environment.begin(0)
+    steps = [environment.act(np.array([asked])) for asked in (1.0, 1.0, -1.0, -0.2)]
+    assert rail.pushes == pytest.approx([0.5, 1.0, 0.5, 0.0])
+    assert [float(step.action[0]) for step in steps] == pytest.approx(rail.pushes)
+    environment.begin(0)
+    assert environment.act(np.array([-1.0])).action == pytest.approx([-0.5]), "a reset forgets the last action"
+
+
+def test_an_environment_that_takes_its_steps_itself_can_not_have_a_rate():
+    class Stepping:
+        def spec(self):
+            return RATED
+
+        def begin(self, seed=None):
+            raise AssertionError
+
+        def act(self, action):
+            raise AssertionError
+
+        def close(self):
+            pass
+
+    with pytest.raises(UnknownEnvironment, match="reset, step and coordinates"):
+        answering(Stepping())

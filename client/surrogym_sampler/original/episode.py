@@ -24,7 +24,8 @@ class Moment:
     terminated: bool
     coordinates: Array  # (C,) state after the step
     truncated: bool = False  # whether the environment itself ended the episode without termination
-    fallback: Array | None = None  # (F,) applied action, if the limits' fallback replaced the requested one
+    applied: Array | None = None  # (F,) applied action, if it may differ from the requested one
+    fell_back: bool = False  # whether the limits' fallback replaced the requested action
 
 
 class Episode(ABC):

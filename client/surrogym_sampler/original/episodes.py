@@ -5,6 +5,7 @@ Shapes: C coordinates, D observation entries, F action entries.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from surrogym_sampler.original.protocol import (
 )
 from surrogym_sampler.original.rollouts import answering
 from surrogym_sampler.original.simulator import Simulated, random_factor
+from surrogym_shared.rates import rates
 from surrogym_shared.spec import EnvironmentSpec, Fixed, Normal, Uniform, limits
 
 
@@ -158,6 +160,7 @@ class RolloutEpisode(OwnEpisode):
     def __init__(self, environment: RolloutEnvironment) -> None:
         super().__init__(environment)
         self._environment = environment
+        self._rated = bool(rates(environment.spec()))  # whether the environment may apply another action than requested
 
     def reset(self, seed: int) -> Moment:
         return self._started(self._environment.begin(seed))
@@ -172,7 +175,9 @@ class RolloutEpisode(OwnEpisode):
             self._environment.resume(coordinates)
 
     def step(self, action: Array) -> Moment:
-        return self._stepped(self._environment.act(action))
+        step = self._environment.act(action)
+        moment = self._stepped(step)
+        return replace(moment, applied=np.asarray(step.action)) if self._rated else moment
 
     def close(self) -> None:
         self._environment.close()

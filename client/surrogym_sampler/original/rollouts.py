@@ -19,6 +19,7 @@ from surrogym_sampler.original.protocol import (
     SnapshotEnvironment,
     runs_in_parallel,
 )
+from surrogym_shared.rates import rates, within_rates
 from surrogym_shared.spec import EnvironmentSpec
 
 # Methods that each of the two kinds of environment needs.
@@ -60,7 +61,7 @@ class FromReset:
         return self._at
 
     def act(self, action: Array) -> RealStep:
-        """Apply an action (F,), and return the real step.
+        """Apply an action (F,), or the nearest one that keeps the declared rates, and return the real step.
 
         Raises:
             StepFailed: no episode is running, or ``coordinates`` does not return an array (R,).
@@ -70,7 +71,7 @@ class FromReset:
                 "expected an action in a running episode, got one after its end or before a reset: reset first"
             )
         before, self._at = self._at, None
-        native = native_action(self._spec.action, action)
+        native = native_action(self._spec.action, within_rates(self._spec, before, action))
         observation, reward, terminated, truncated, _ = self._environment.step(native)
         taken = np.atleast_1d(np.asarray(native, dtype=np.float64))
         reached = followed(self._spec, before, taken, self._read(observation))
@@ -167,6 +168,11 @@ def answering(environment: object) -> Environment:
         raise UnknownEnvironment(
             "expected an object with spec, step_from and close, or with spec, reset, step, coordinates and close, "
             f"got a {type(environment).__name__} without {_missing(environment)}"
+        )
+    if rates(environment.spec()) and not isinstance(environment, FromReset):
+        raise UnknownEnvironment(
+            "the action has a rate, which Surrogym keeps in an environment with reset, step and coordinates: expected "
+            f"these methods, got a {type(environment).__name__} that takes steps itself"
         )
     query = environment.spec().query
     needed, methods = (

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from surrogym_client.errors import SurrogymClientError
 from surrogym_shared.kinds import Function, LagKind
+from surrogym_shared.rates import Rate, rates
 from surrogym_shared.spec import BoxAction, Coordinate, EnvironmentSpec, Lag, Term, limits
 from surrogym_shared.spec.actions import Action
 
@@ -193,6 +194,7 @@ class Controller:
         period: seconds between decisions; None if it is not declared.
         digests: SHA-256 of policy and specification and, if the card has it, the hash of the model's samples.
         guard: the limits that it keeps; None without limits.
+        rates: largest changes of entries of the action in one step. A larger change is cut off, also of a fallback.
     """
 
     name: str
@@ -208,6 +210,7 @@ class Controller:
     period: float | None
     digests: dict[str, str]
     guard: Guard | None = None
+    rates: tuple[Rate, ...] = ()
 
     @property
     def counts(self) -> tuple[int, ...]:
@@ -278,6 +281,7 @@ def controller_from(
         period=period,
         digests=digests,
         guard=_guard(spec, low, high),
+        rates=rates(spec),
     )
     _require_in_float("a specification", [number for number in _numbers(made) if np.isfinite(number)])
     return made
@@ -294,6 +298,7 @@ def _numbers(controller: Controller) -> Iterator[float]:
     for part in (part for entry in controller.observation for part in entry.parts):
         yield from (part.coefficient, *(weight for _, weight in part.weights))
     yield from (*controller.low, *controller.high, *controller.fallback)
+    yield from (rate.change for rate in controller.rates)
     for limit in controller.guard.limits if controller.guard else ():
         yield from (limit.low, limit.high, limit.margin, *_constants(limit.term))
     for term in controller.guard.fallback if controller.guard else ():

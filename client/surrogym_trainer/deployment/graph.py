@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from surrogym_trainer.deployment.c.files import prefix_of
 from surrogym_trainer.deployment.controller import Array, Controller, Guard, Observed, Remembered
-from surrogym_trainer.deployment.reference import begin, decide, observe
+from surrogym_trainer.deployment.reference import begin, decide, observe, within_rates
 from surrogym_trainer.deployment.running import Running
 from surrogym_trainer.policies.onnx_files import INPUT, OUTPUT
 
@@ -66,6 +66,7 @@ def description(controller: Controller) -> dict[str, Any]:
         "[-pi, pi); another measurement is clipped to low and high; lags follow from earlier steps",
         "scaling": "inside: give observations in their units; actions come in theirs, within low and high",
         **({} if controller.guard is None else _limits(controller.guard, names)),
+        **({} if not controller.rates else _rates(controller)),
         "sampling_period": controller.period,
         "timeout": _finite(controller.timeout),
         "sha256": controller.digests,
@@ -83,6 +84,14 @@ def _limits(guard: Guard, names: tuple[str, ...]) -> dict[str, Any]:
         "fallback": [_term(term, names) for term in guard.fallback],
         "keeping": "not inside: apply the fallback if the distance to an end of a limit is below its margin, now or "
         "after one more step with the same change",
+    }
+
+
+def _rates(controller: Controller) -> dict[str, Any]:
+    """Return the rates of the action, which the network does not keep by itself, as a JSON object."""
+    return {
+        "rates": [{"entry": rate.entry, "largest_change": rate.change} for rate in controller.rates],
+        "keeping_rates": "not inside: an entry of the action may change by at most largest_change in a step",
     }
 
 
@@ -108,7 +117,7 @@ class RunningGraph(Running):
         self._memory, action, (status,) = decide(self._controller, self._memory, measurement[None], age)
         if status == 0:
             shown = observe(self._controller, self._memory.coordinates).astype(np.float32)
-            action = self._act(shown).astype(np.float64)
+            action = within_rates(self._controller, self._memory.coordinates, self._act(shown).astype(np.float64))
             self._memory = replace(self._memory, action=action.astype(np.float32).astype(np.float64))
         return int(status), action[0]
 

@@ -77,8 +77,18 @@ def decide(controller: Controller, memory: Memory, measurements: Array, age: Arr
         acts = measured & _falls_back(controller.guard, memory, coordinates)
         safe = np.stack([_entry(term, coordinates) for term in controller.guard.fallback], axis=1)
         action, status = np.where(acts[:, None], safe, action), np.where(acts, LIMITED, status)
+    action = within_rates(controller, coordinates, action)
     remembered = action.astype(np.float32).astype(np.float64)
     return Decided(Memory(coordinates, remembered, np.ones_like(wrong), measured), action, status)
+
+
+def within_rates(controller: Controller, coordinates: Array, action: Array) -> Array:
+    """Return the actions that keep the rates at coordinates (N, C) and are nearest to ``action`` (N, F)."""
+    kept = action.copy()
+    for rate in controller.rates:
+        last = coordinates[:, rate.last]
+        kept[:, rate.entry] = np.clip(kept[:, rate.entry], last - rate.change, last + rate.change)
+    return kept
 
 
 def _falls_back(guard: Guard, memory: Memory, coordinates: Array) -> Bools:

@@ -272,8 +272,8 @@ class _Tally:
         self.length += 1
         self.held = self.held + 1 if _holds(self.episode.spec, moment.coordinates) else 0
         self.path.append(moment.coordinates)
-        self.fallbacks += moment.fallback is not None
-        self.actions.append(action if moment.fallback is None else moment.fallback)
+        self.fallbacks += moment.fell_back
+        self.actions.append(action if moment.applied is None else moment.applied)
         self.rewards.append(moment.reward)
 
 

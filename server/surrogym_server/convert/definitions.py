@@ -12,6 +12,7 @@ from surrogym_server.models.registry import GAUSSIAN_PROCESS, in_full, learner_o
 from surrogym_server.plugins import Choice
 from surrogym_server.sampling.acquisition import check_acquisition
 from surrogym_shared import spec as wire
+from surrogym_shared.rates import rates
 
 MONTE_CARLO = 1024  # number of points that estimate the confidence index, if the specification gives no number
 LONGEST_ROLLOUT = 200  # largest number of steps of a requested rollout, if the specification gives no number
@@ -58,6 +59,7 @@ def stored_definition(spec: wire.EnvironmentSpec) -> core.EnvironmentDefinition:
         starts=spec.starts,
         outside_reward=spec.outside_reward,
         limits=None if spec.limits is None else _limits(spec.limits, names),
+        rates=tuple(core.RateDefinition(rate.entry, rate.last, rate.change) for rate in rates(spec)),
     )
     if definition.moves_observation:
         ObservationInverse.of(definition)

@@ -54,6 +54,11 @@ def twin_of(file: SurrogateFile, period: float | None = None) -> Block:
         InvalidInput: the model can't be written in C, or the period is missing or not above 0.
     """
     definition = stored_definition(file.spec)
+    if definition.rates:
+        raise InvalidInput(
+            "expected an action without rate, which the FMU of a surrogate does not keep, got one with rate: register "
+            "the surrogate without it, and limit the change of the input outside of the FMU"
+        )
     model = from_bytes(definition, file.model)
     seconds = _period(file.spec.sampling_period if period is None else period)
     source = _source_of(model)

@@ -143,6 +143,15 @@ class DesignDefinition:
 
 
 @dataclass(frozen=True)
+class RateDefinition:
+    """Largest change of one entry of the action in one step; ``surrogym_shared.rates`` explains it."""
+
+    entry: int  # index of the entry in the action
+    last: int  # index of the coordinate that has the entry's value in the last step
+    change: float  # largest change in one step
+
+
+@dataclass(frozen=True)
 class EnvironmentDefinition:
     """One environment, with C coordinates, D observation entries and F action entries."""
 
@@ -172,6 +181,7 @@ class EnvironmentDefinition:
     # None: leaving the range does not end an episode.
     outside_reward: float | None = None
     limits: LimitsDefinition | None = None  # declared limits within which the original environment has to stay
+    rates: tuple[RateDefinition, ...] = ()  # rates of the action's entries; empty if all may change at once
     device: torch.device = CPU  # device of the definition's tensors, and of states and actions that are passed to it
 
     def on(self, device: torch.device) -> EnvironmentDefinition:
@@ -318,6 +328,16 @@ class EnvironmentDefinition:
         if not self.termination_groups:
             return torch.zeros(q.shape[:-1], dtype=torch.bool, device=q.device)
         return self._termination(q).any(-1)
+
+    def within_rates(self, q: Tensor, u: Tensor) -> Tensor:
+        """Return the actions (n, F) that keep the rates at states q (n, C) and are nearest to actions u (n, F)."""
+        if not self.rates:
+            return u
+        kept = u.to(q.dtype, copy=True)
+        for rate in self.rates:
+            last = q[:, rate.last]
+            kept[:, rate.entry] = torch.clamp(kept[:, rate.entry], last - rate.change, last + rate.change)
+        return kept
 
     def falls_back(self, q: Tensor, q_next: Tensor) -> Tensor:
         """Return whether the fallback action that the limits declare takes over after a step from q (..., C) to q_next

@@ -205,7 +205,8 @@ def predict_paths(model: DynamicsModel, starts: Tensor, actions: Tensor) -> Path
     q, running, going = starts, starts.new_ones(len(starts)), starts.new_ones(len(starts))
     drift, variance = starts.new_zeros(len(starts)), starts.new_zeros(len(starts), len(spread))
     steps: list[tuple[Tensor, ...]] = []
-    for u in actions.unbind(1):
+    for asked in actions.unbind(1):
+        u = definition.within_rates(q, asked)
         step = model.transition(q, u, stds=True)
         assert step.std is not None
         going = going * ~model.terminated(step.q_next)

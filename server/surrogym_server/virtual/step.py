@@ -5,6 +5,8 @@ from __future__ import annotations
 import logging
 from dataclasses import replace
 
+import torch
+
 from surrogym_server.models.abilities import ArraySteps, CompiledSteps, offers
 from surrogym_server.models.draws import function_draws
 from surrogym_server.models.port import DynamicsModel
@@ -57,6 +59,9 @@ def step(
         InvalidInput: the mask has a wrong length.
         NotReset: a lane was never reset, or its episode has ended and autoreset does not reset it in this step.
     """
+    if model.definition.rates:
+        asked = torch.as_tensor(u, dtype=lanes.q.dtype, device=lanes.q.device)
+        u = model.definition.within_rates(lanes.q, asked).cpu().numpy()
     move = _array_steps(model, settings)
     if move is None or settings.variant == "probabilistic":
         return environment.step(model, settings, lanes, u, mask, stds, particle_steps=move)

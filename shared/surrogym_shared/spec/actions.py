@@ -6,7 +6,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from surrogym_shared.checks import Number, require, require_range
+from surrogym_shared.checks import Number, Positive, require, require_range
 from surrogym_shared.spec.base import MAX_DIMENSIONS, MAX_DISCRETE_ACTIONS, Frozen
 
 
@@ -15,12 +15,17 @@ class BoxAction(Frozen):
 
     ``bins`` is the number of equally spaced values in each dimension from which a policy chooses (the paper's
     discretised control); None for a continuous policy. The model and the sampler always get the continuous value.
+
+    ``rate`` is the largest change of each entry per second, or None for an entry that may change at once. If more is
+    asked for, the nearest action that keeps the rate is taken. A rate needs a ``sampling_period``, and the last action
+    among the coordinates: ``with_history(spec, actions=1, rate=...)`` declares both.
     """
 
     kind: Literal["box"] = "box"
     low: tuple[Number, ...] = Field(min_length=1, max_length=MAX_DIMENSIONS)
     high: tuple[Number, ...] = Field(min_length=1, max_length=MAX_DIMENSIONS)
     bins: tuple[Annotated[int, Field(ge=2, le=MAX_DISCRETE_ACTIONS, strict=True)], ...] | None = None
+    rate: tuple[Positive | None, ...] | None = None
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
@@ -32,6 +37,12 @@ class BoxAction(Frozen):
             require_range(f"action {i}", low, high)
         if self.bins is not None:
             require(len(self.bins) == len(self.low), f"expected {len(self.low)} bins, got {len(self.bins)}")
+        if self.rate is not None:
+            require(
+                len(self.rate) == len(self.low),
+                f"action: expected {len(self.low)} entries in rate, one for each entry of the action, got "
+                f"{len(self.rate)}",
+            )
         return self
 
     @property

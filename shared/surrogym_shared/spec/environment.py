@@ -11,7 +11,7 @@ from pydantic import BeforeValidator, Field, StrictBool, StrictFloat, StrictInt,
 from surrogym_shared.checks import SHOWN, Number, Positive, require, require_known, require_unique
 from surrogym_shared.patterns import VISIBLE
 from surrogym_shared.presets import PRESETS, Preset, PresetName, Tolerance
-from surrogym_shared.spec.actions import Action
+from surrogym_shared.spec.actions import Action, BoxAction
 from surrogym_shared.spec.base import MAX_DIMENSIONS, MAX_ROLLOUT_QUERY, MAX_STARTS, REWARD, Frozen, Name
 from surrogym_shared.spec.coordinates import Coordinate, StartDistribution, limits
 from surrogym_shared.spec.rewards import AnyReward, DeclaredReward, Reward, Success
@@ -228,6 +228,10 @@ class EnvironmentSpec(Frozen):
                 self.design.initial <= self.design.budget,
                 f"design: initial {self.design.initial} exceeds the budget {self.design.budget}",
             )
+        if isinstance(self.action, BoxAction) and self.action.rate is not None:
+            from surrogym_shared.rates import rates
+
+            rates(self)
         if self.limits is not None:
             from surrogym_shared.limits import check_limits
 

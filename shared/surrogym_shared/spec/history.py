@@ -3,10 +3,10 @@ determine the next state."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
 from surrogym_shared.checks import require, require_known
-from surrogym_shared.spec.actions import BoxAction
+from surrogym_shared.spec.actions import Action, BoxAction
 from surrogym_shared.spec.coordinates import Bounds, Coordinate, Fixed, Lag, StartDistribution, Uniform
 from surrogym_shared.spec.environment import EnvironmentSpec
 from surrogym_shared.spec.terms import ObservationEntry, Term
@@ -21,6 +21,7 @@ def with_history(
     actions: int = 0,
     largest: Mapping[str, float] | None = None,
     at_start: Mapping[str, float] | None = None,
+    rate: Sequence[float | None] | None = None,
 ) -> EnvironmentSpec:
     """Add lags (past actions, and past changes of coordinates) to the coordinates and to the observation.
 
@@ -32,6 +33,8 @@ def with_history(
         largest: largest change of each moving coordinate in one step, in its unit; needed for ``changes``.
         at_start: largest change of a coordinate in the step before a reset, if the environment may move at a reset.
             This change is unknown, so a model does not learn from the first steps of each episode.
+        rate: largest change of each entry of a continuous action per second, None for an entry without a limit; needs
+            ``actions`` of 1 or more.
 
     Raises:
         ValueError: the environment can be set to states, or ``largest`` does not fit the moving coordinates.
@@ -64,8 +67,15 @@ def with_history(
             "observation": (*spec.observation, *entries),
             "start": {**spec.start, **starts},
             "starts": tuple((*start, *(_at_rest(lag) for lag in lags)) for start in spec.starts),
+            "action": spec.action if rate is None else _limited(spec.action, rate),
         }
     )
+
+
+def _limited(action: Action, rate: Sequence[float | None]) -> BoxAction:
+    """Return a continuous action with a rate. Raises ``ValueError`` for a discrete one, whose numbers have no order."""
+    require(isinstance(action, BoxAction), "history: expected a continuous action (BoxAction) for a rate, got discrete")
+    return BoxAction(**{**dict(action), "rate": tuple(rate)})
 
 
 def _of_changes(coordinate: Coordinate, count: int, largest: float) -> Iterable[Coordinate]:

@@ -32,7 +32,7 @@ class GuardedEpisode(Episode):
 
     def step(self, action: Array) -> Moment:
         """Apply the action (F,), or the fallback controller's shortly before a limit would be left. In that case,
-        ``fallback`` of the result is the applied action.
+        ``fell_back`` of the result is true and ``applied`` is the applied action.
 
         Raises:
             StepFailed: the watchdog has ended the episode.
@@ -47,7 +47,8 @@ class GuardedEpisode(Episode):
                 self._watchdog.over()
             else:
                 self._watchdog.running()
-            return replace(moment, fallback=chosen) if fallen else moment
+            applied = chosen if moment.applied is None else moment.applied
+            return replace(moment, applied=applied, fell_back=True) if fallen else moment
 
     def perturb(self, rng: np.random.Generator, sigma: float) -> None:
         self._episode.perturb(rng, sigma)

@@ -86,6 +86,7 @@ def parts_of(controller: Controller, prefix: str) -> dict[str, str]:
         "decide": _decide(controller),
         "judge": _judge(controller),
         "in_time": _in_time(controller),
+        "rates": _rates(controller),
         "fallback_lines": _lines(8, (f"action[{i}] = {real(a)};" for i, a in enumerate(controller.fallback))),
     }
     body |= _guard(controller, prefix)
@@ -128,6 +129,16 @@ def _guard(controller: Controller, prefix: str) -> dict[str, str]:
         "guard": f"        if (limited(controller, known, action))\n            status = {limited};\n",
         "not_limited": f"status & ~{limited}",
     }
+
+
+def _rates(controller: Controller) -> str:
+    """Return the lines that cut off what an entry of the action changes by too much in one step."""
+    lines = []
+    for rate in controller.rates:
+        last = f"controller->coordinates[{rate.last}]"
+        ends = f"{last} - {real(rate.change)}, {last} + {real(rate.change)}"
+        lines.append(f"action[{rate.entry}] = clipped(action[{rate.entry}], {ends});")
+    return _lines(4, lines) + "\n" if lines else ""
 
 
 def _clipped(term: Observed) -> str:

@@ -167,9 +167,26 @@ def source_of(controller: Controller, real: str, name: str) -> str:
         network=_indented(4, "\n".join(_layers(decision.layers))),
         y=outputs,
         **_guard(controller, real),
+        rates="".join(Template(RATED).substitute(rate) for rate in _rates(controller, real)),
         decide=_indented(4, squash + decide.substitute(last=last["F"] - 1, y=outputs, real=real)),
         rounded_command=rounded("command[i]"),
     )
+
+
+RATED = """\
+(* A command changes by at most $change in a step. *)
+IF command[$entry] < q[$last] - $change THEN
+    command[$entry] := q[$last] - $change;
+ELSIF command[$entry] > q[$last] + $change THEN
+    command[$entry] := q[$last] + $change;
+END_IF
+"""
+
+
+def _rates(controller: Controller, real: str) -> Iterable[dict[str, str]]:
+    """Yield what the template ``RATED`` needs for each entry of the action with a rate."""
+    for rate in controller.rates:
+        yield {"entry": str(rate.entry), "last": str(rate.last), "change": _number(rate.change, real)}
 
 
 GUARDED = """\
