@@ -87,7 +87,7 @@ def test_jitter_is_raised_tenfold_only_until_the_covariance_can_be_factored():
 
 def test_a_covariance_that_no_jitter_repairs_raises_a_numerical_error():
     hopeless = torch.diag(torch.tensor([1.0, -2 * MAX_JITTER], dtype=torch.float64))
-    with pytest.raises(NumericalFailure, match="covariance of 2 points"):
+    with pytest.raises(NumericalFailure, match="covariance matrix of 2 samples"):
         factorise(hopeless)
     with pytest.raises(NumericalFailure):
         factorise(torch.full((2, 2), torch.nan, dtype=torch.float64))
