@@ -11,6 +11,7 @@ import pytest
 import typer
 
 from support.limited import SPEC
+from support.programs import FALLS_BACK, KEEPS_LIMITS, program
 from surrogym.cli import sample
 from surrogym_shared.wire import Query
 
@@ -95,6 +96,16 @@ def test_sampling_with_approve_is_refused_without_a_terminal(on_server: Any, car
     said = on_server("sample", cart, *CART, "--approve")
     assert said.code != 0
     assert "expected a terminal" in said.err
+
+
+def test_sampling_a_program_with_limits_warns_before_it_starts_that_only_the_program_falls_back_after_a_kill(
+    on_server: Any, name: str, cart: str, tmp_path: Path
+) -> None:
+    command = program(tmp_path, KEEPS_LIMITS, FALLS_BACK)
+    on_server("register", f"exec:{command}", "--name", name + "-program")
+    said = on_server("sample", name + "-program", "--exec", command, "--max-queries", "1").err
+    assert said.index("only the program itself can fall back") < said.index("answered")
+    assert "kill" not in on_server("sample", cart, *CART, "--max-queries", "1").err
 
 
 def test_the_status_command_shows_how_the_real_steps_kept_each_limit(on_server: Any, cart: str) -> None:

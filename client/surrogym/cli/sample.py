@@ -59,8 +59,8 @@ TimeLimit = Annotated[
 
 
 UNWATCHED = (
-    "limits: this sampler falls back when no action comes, but not after kill -9; then the program itself has to fall "
-    "back when its input closes"
+    "limits: if the sampler is killed (kill -9), only the program itself can fall back, when its input closes; "
+    "surrogym conformance --exec COMMAND checks that it does"
 )
 
 
@@ -173,6 +173,7 @@ def command(
             _sample_here(api, plan, output, approved if caution.approve else None)
         else:
             _require_shared(view.spec, settings)
+            _warn_of_kill(name, view.spec, output)
             _sample_on_ray(api, plan, cluster, output)
 
 
@@ -207,7 +208,6 @@ def _sample_here(
     api: Api, plan: SamplerPlan, output: Output, ask: Callable[[EnvironmentSpec, Query], bool] | None = None
 ) -> None:
     from surrogym_client.runtime.lifetime import terminations
-    from surrogym_sampler.original.executables import is_executable
     from surrogym_sampler.original.loading import for_queries
     from surrogym_sampler.queries.on_ray import Line, line_of
     from surrogym_sampler.queries.worker import Sampler
@@ -218,8 +218,7 @@ def _sample_here(
         _telling(api, plan.surrogate, quiet=output.quiet, plain=ask is not None) as tell,
     ):
         approve = None if ask is None else partial(ask, environment.spec())
-        if environment.spec().limits is not None and is_executable(plan.environment):
-            say(UNWATCHED, quiet=output.quiet)
+        _warn_of_kill(plan.environment, environment.spec(), output)
 
         def report(query: Query, outcome: Outcome, error: str) -> None:
             if tell is not None:
@@ -237,6 +236,16 @@ def _sample_here(
     output.give(asdict(result), lambda: _words(plan.surrogate, result))
     if result.phase == "failed":
         raise typer.Exit(1)
+
+
+def _warn_of_kill(name: str, spec: EnvironmentSpec, output: Output) -> None:
+    """Print a warning if limits hold after ``kill -9`` of the sampler only if the environment's program keeps them.
+    Other environments are in a process that survives the sampler until the machine rests."""
+    from surrogym_sampler.original.executables import is_executable
+    from surrogym_shared.terminal import say
+
+    if spec.limits is not None and is_executable(name):
+        say(UNWATCHED, quiet=output.quiet)
 
 
 def _require_shared(asked: EnvironmentSpec, settings: SamplerSettings) -> None:
