@@ -1,1 +1,2 @@
-"""The trainer: policy searches, the promise and its audit, evaluations, policies, the report, the worker of jobs."""
+"""The trainer: it searches for policies, predicts their real return, audits, evaluates, stores and deploys them, writes
+reports, and runs the jobs that people request."""

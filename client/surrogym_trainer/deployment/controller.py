@@ -163,7 +163,7 @@ class KeptLimit:
 
 @dataclass(frozen=True)
 class Guard:
-    """Limits that the controller keeps. ``fallback`` (F terms of the coordinates) gives the action instead of the
+    """Limits that the controller keeps. ``fallback`` (F functions of the coordinates) gives the action instead of the
     policy if a limit would be left soon, as ``surrogym_shared.limits.falls_back`` defines it."""
 
     limits: tuple[KeptLimit, ...]

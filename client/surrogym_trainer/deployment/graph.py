@@ -231,7 +231,7 @@ def _term(entry: Observed, names: tuple[str, ...]) -> str:
 
 
 def _lag(lag: Remembered, names: tuple[str, ...]) -> str:
-    """Return in words what a lag repeats."""
+    """Return in words which earlier value, change or action a lag repeats."""
     match lag.kind:
         case "action":
             return f"entry {lag.source} of the last action"

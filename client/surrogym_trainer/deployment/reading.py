@@ -286,7 +286,8 @@ def _check(controller: Controller, spec: EnvironmentSpec, predict: Predict) -> N
 
 
 def _close(y: Array, counts: tuple[int, ...]) -> NDArray[np.bool_]:
-    """Return whether (N, F) the two best choices of outputs (N, A) are equal up to rounding."""
+    """Return for each of F discrete action entries, (N, F), whether its two largest outputs of the network, among
+    (N, A), are equal up to rounding."""
     groups = np.split(y, np.cumsum(counts)[:-1], axis=1)
     best = [np.sort(group, axis=1)[:, -2:] for group in groups]
     return np.stack([b[:, 1] - b[:, 0] <= TOLERANCE * (1 + np.abs(b[:, 1])) for b in best], axis=1)

@@ -92,7 +92,8 @@ def within_rates(controller: Controller, coordinates: Array, action: Array) -> A
 
 
 def _falls_back(guard: Guard, memory: Memory, coordinates: Array) -> Bools:
-    """Whether (N,) the fallback of the limits acts at coordinates (N, C)."""
+    """Return for each of N controllers, (N,), whether it takes the fallback action at coordinates (N, C), because a
+    limit would be left soon."""
     now, before = (
         np.stack([_room(limit, q) for limit in guard.limits], axis=1) for q in (coordinates, memory.coordinates)
     )
@@ -124,7 +125,8 @@ def observe(controller: Controller, coordinates: Array) -> Array:
 
 
 def act(controller: Controller, observation: Array) -> tuple[Array, Bools]:
-    """Return actions (N, F) for observations (N, D), and whether (N,) the network's outputs are not finite."""
+    """Return actions (N, F) for observations (N, D), and for each row, (N,), whether an output of the network is not
+    finite."""
     y = scores(controller.decision, observation)
     wrong: Bools = np.logical_not(np.isfinite(y).all(1))
     y = np.where(wrong[:, None], 0.0, y)

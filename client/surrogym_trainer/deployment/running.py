@@ -45,8 +45,8 @@ class Running(ABC):
 class Checked:
     """The results of a controller and of its policy, from the same N starts."""
 
-    returns: Array  # (N,) returns of the controller
-    policy_returns: Array  # (N,) returns of the policy
+    returns: Array  # (N,) sum of rewards of the controller in each of N episodes
+    policy_returns: Array  # (N,) sum of rewards of the policy in each of N episodes
     steps: int  # number of steps of the controller
     # largest difference between an action of the controller and the policy's in the same state, as a share of the
     # action's range

@@ -81,7 +81,8 @@ class Compared:
 
     @property
     def claimed(self) -> Array:
-        """The standard deviation (n, O) that the model predicts for each error."""
+        """The standard deviation (n, O) that is allowed for each error: that of the prediction, and ``expected``, as
+        the square root of the sum of their squares."""
         scale: Array = np.sqrt(self.deviations**2 + self.expected**2)
         return scale
 
@@ -117,7 +118,7 @@ class Consequence:
         shifted: the test for such a shared part.
         changes: changes (K,) of the mean return, each caused by one sampled error that agrees with the steps.
         before: promise (interval of the return) before the errors were known.
-        slack: distance from the promised interval at which a return still counts as inside.
+        slack: distance from the promised interval up to which a return still counts as inside.
     """
 
     shifted: Systematic
@@ -183,7 +184,8 @@ def judge(
 
     An output is at fault in either of two cases:
 
-    - The sum of its squared errors, each divided by the predicted variance, is larger than chance explains. The bound
+    - The sum of its squared errors, each divided by the variance that is allowed for it, is larger than chance
+      explains. The bound
       is a quantile of the chi-squared distribution, which any output of a right model exceeds with a probability of
       about 1 %. Single errors within the tolerance are never a fault.
     - The errors have a part that all steps share, more than chance explains. If this part is added to the model, the

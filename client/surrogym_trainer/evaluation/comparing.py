@@ -133,8 +133,8 @@ def _step(trace: Trace, episode: int, t: int) -> StepOfEpisode:
 
 @dataclass(frozen=True)
 class Disagreement:
-    """A real step that contradicts the model: its worst output, the error of that output, and the error that the model
-    predicted."""
+    """A real step that contradicts the model: its worst output, the error of that output, and the standard deviation
+    that is allowed for the error."""
 
     step: StepOfEpisode
     output: str
@@ -149,7 +149,7 @@ class Disagreements:
     Attributes:
         compared: number of real steps that were compared.
         found: steps whose error exceeds the one that the model predicts, by more than chance; the worst first.
-        missing: real minus predicted reward over the compared steps of each episode, by the episode's number.
+        missing: sum of real minus predicted rewards over the compared steps of each episode, by the episode's number.
         shared: further steps that contribute most to an error that all steps share, the largest first.
     """
 

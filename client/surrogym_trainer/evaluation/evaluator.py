@@ -241,7 +241,7 @@ class _Tally:
     number: int  # number of the episode, from 0, in the order of the seeds
     episode: Episode
     moment: Moment
-    rng: np.random.Generator  # random numbers of the exploration
+    rng: np.random.Generator  # generator of the random changes of actions
     total: float = 0.0
     length: int = 0
     held: int = 0  # number of last steps in a row that met the success criterion

@@ -16,9 +16,10 @@ from surrogym_shared.acting import ActingPolicy
 from surrogym_shared.network import Network, bounds_of, counts_of
 from surrogym_shared.port import PolicyPort, PolicyRollout, StepResult, SurrogatePort
 
-DECLARED = {"start_box": 0.0, "start_visited": 0.0}  # session options with which all episodes begin as declared
-# session options of whole episodes, without a trust limit, because a shortened episode would earn more if rewards are
-# costs
+# session options with which every episode begins where the specification declares
+DECLARED = {"start_box": 0.0, "start_visited": 0.0}
+# session options of whole episodes; none ends where the model is unsure (trust), because a shortened episode would earn
+# more if rewards are costs
 WHOLE = {**DECLARED, "trust": None}
 # session options if the specification penalises leaving the trusted states: an episode that ends there
 # gets a penalty for its missing steps, so the trust limit stays
@@ -30,7 +31,7 @@ STEPS_AT_ONCE = 1_000
 
 @dataclass(frozen=True)
 class Imagined:
-    """The result of whole virtual episodes."""
+    """The returns and the penalties of whole virtual episodes."""
 
     returns: NDArray[np.float64]  # (episodes,) undiscounted returns, less any penalty
     penalty_share: float  # sum of the penalties as a share of the sum of absolute rewards
@@ -154,7 +155,7 @@ def _as_arrays(predict: Callable[[NDArray[Any]], NDArray[Any]], port: SurrogateP
     try:
         return ActingPolicy.of(predict)
     except ValueError:
-        return None  # the network contains several policies, or is larger than the surrogate accepts
+        return None  # ActingPolicy holds one network, no larger than a surrogate accepts
 
 
 def _added(sums: NDArray[np.float64], rows: NDArray[np.floating[Any]]) -> NDArray[np.float64]:

@@ -23,7 +23,7 @@ class UnusablePolicy(SurrogymClientError):
 
 
 class NotedAddress(RootModel[str]):
-    """The address of a server that a file contains.
+    """The address of a server, as read from a file.
 
     It is not a ``str``, so that no code connects to it by mistake: only a person chooses the address that receives a
     token.

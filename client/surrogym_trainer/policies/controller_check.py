@@ -22,7 +22,7 @@ class UnusableCheck(SurrogymClientError):
 
 
 class StoredCheck(BaseModel):
-    """The result of a controller and of its policy from the same starts."""
+    """The result of a check: a deployed controller and its policy, run from the same starts and compared."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=True)
 

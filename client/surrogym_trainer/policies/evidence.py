@@ -1,4 +1,5 @@
-"""The evidence for a policy that its card contains: a promise, and an audit."""
+"""The evidence that a policy's card has for its real return: the promise (a predicted interval) and the audit (real
+steps)."""
 
 from __future__ import annotations
 

@@ -204,7 +204,8 @@ def _settings(data: Mapping[str, Any], replaced: set[str]) -> PolicySettings:
 def _entry(entries: Mapping[str, bytes], name: str) -> bytes:
     if name not in entries:
         raise ValueError(
-            f"expected an entry {name!r} in the policy's file, got {', '.join(sorted(entries)[:5]) or 'none'}"
+            f"expected an entry {name!r} in the policy's file, got {', '.join(sorted(entries)[:5]) or 'none'}: "
+            "save the policy again"
         )
     return entries[name]
 

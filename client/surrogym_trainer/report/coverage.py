@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from surrogym_shared.spec import BoxAction, EnvironmentSpec, limits
 
 CELLS = 10  # number of cells along each side of a grid
-MOST_COLUMNS = 8  # largest number of columns with which a picture is readable
+MOST_COLUMNS = 8  # a picture shows at most this number of columns, so that it stays readable
 
 Array = NDArray[np.float64]
 

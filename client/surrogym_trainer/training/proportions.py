@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from surrogym_shared.spec import EnvironmentSpec
 
-BATCH = 1_024  # a large batch, because updates take most of the time, which depends on the number of batches
+BATCH = 1_024  # suggested size of a batch; large, because the time of an update depends mostly on the number of batches
 SHORTEST_SIGHT, LONGEST_SIGHT = 0.9, 0.999  # smallest and largest suggested discount factor
 
 

@@ -40,7 +40,7 @@ Progress = Callable[[TrainProgress], None]
 
 @dataclass(frozen=True)
 class SearchTask:
-    """The task of a policy search."""
+    """What a policy search has to do: in which surrogate, with which settings, and within how many virtual steps."""
 
     port: SurrogatePort
     settings: TrainSettings

@@ -25,7 +25,7 @@ from surrogym_trainer.evaluation.audit import Compared
 from surrogym_trainer.evaluation.comparing import StepOfEpisode, compared, steady
 from surrogym_trainer.watching.detector import FALSE_ALARM_STEPS, Detector
 
-BATCH = 500  # largest number of steps in one request
+BATCH = 500  # largest number of real steps that one request to the server contains
 KEPT = 2_000  # a drift is described from at most this number of latest steps
 QUARTERS = ("lowest", "second", "third", "highest")
 # if a quarter of an input's range adds more than this to the relative entropy (nats) between errors and visits, the

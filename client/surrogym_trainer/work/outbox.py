@@ -22,12 +22,12 @@ ENDING = ".waiting.json"
 REFUSED = ".refused.json"
 MAX_BYTES = 64 * 1024 * 1024
 AWAY = (ServerUnreachable, Unavailable)
-FILE_NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,199}$"  # name of a file in the folder
+FILE_NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,199}$"  # pattern of the name of a policy's file, without a folder
 VIDEO_NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,195}\.(mp4|gif)$"
 
 
 class Waiting(BaseModel):
-    """The result of a job that the server does not have yet."""
+    """The result of a job, as stored in a file until the server has it."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -36,9 +36,11 @@ class Waiting(BaseModel):
     lease_token: wire.Key
     status: wire.JobEnd
     error: str | None = None
-    policy: Annotated[str, Field(pattern=FILE_NAME)] | None = None  # file of a trained policy, in the same folder
-    version: int | None = None  # version of an evaluated policy
-    video: Annotated[str, Field(pattern=VIDEO_NAME)] | None = None  # file of the evaluation's video, in the same folder
+    # name of the trained policy's file, in the same folder as this result
+    policy: Annotated[str, Field(pattern=FILE_NAME)] | None = None
+    version: int | None = None  # version of the stored policy that was evaluated
+    # name of the evaluation's video, in the same folder as this result
+    video: Annotated[str, Field(pattern=VIDEO_NAME)] | None = None
     evaluations: tuple[wire.AddEvaluation, ...] = ()
     steps: tuple[wire.ReportSteps, ...] = ()  # real steps to be counted in the ledger
 

@@ -63,8 +63,8 @@ def _sources(controller: Controller) -> dict[str, str]:
 
 
 def _variables(controller: Controller) -> Iterator[Variable]:
-    """Yield all variables, in the order in which ``block.c.txt`` reads their values. If a name is already used, the
-    variable's kind is put before the name."""
+    """Yield all variables of a controller's FMU, in the order in which ``block.c.txt`` reads their values. If a name is
+    already used, the variable's kind is put before the name."""
     free = Names().free
     for one in controller.measurements:
         about = f"measurement, from {one.lowest:.6g} to {one.highest:.6g}"

@@ -232,7 +232,7 @@ def _guard(controller: Controller, real: str) -> dict[str, str]:
 
 
 def _rooms(limit: KeptLimit) -> Iterable[str]:
-    """Yield the distance of the value from each end of a limit."""
+    """Yield, as source, the distance of the variable ``value`` from each finite end of a limit."""
     if math.isfinite(limit.low):
         yield _sum([(1.0, "value"), (-limit.low, "")])
     if math.isfinite(limit.high):
@@ -240,7 +240,7 @@ def _rooms(limit: KeptLimit) -> Iterable[str]:
 
 
 def _value(term: Observed) -> Iterable[str]:
-    """Yield the lines that compute a clipped term."""
+    """Yield the source lines that compute a term, and clip it to its range, in the variable ``value``."""
     yield f"value := {_sum(map(_part, term.parts))};"
     for sign, limit in (("<", term.low), (">", term.high)):
         if math.isfinite(limit):

@@ -154,7 +154,7 @@ class Learner:
         log = self.distribution.log_probability(outputs, self.further, batch.actions)
         ratio = np.exp(log - batch.log_probabilities)
         clip = np.float32(objective.clip_range)
-        # where the ratio is not clipped; elsewhere the loss is flat
+        # 1 where the probability ratio is not clipped; 0 where it is, as the loss does not depend on it there
         free = np.where(advantages > 0, ratio <= 1 + clip, ratio >= 1 - clip)
         by = -(advantages * ratio * free) / np.float32(size)
         by_outputs, self._further_gradient[:] = self.distribution.slopes(outputs, self.further, batch.actions, by)
@@ -231,7 +231,7 @@ class Learner:
         self._updates = int(state["updates"])
 
     def require(self, headers: Mapping[str, Header]) -> None:
-        """Check that arrays, given by their headers, are a state of this network.
+        """Check that arrays, given by their headers (shape and type), are a saved state of this network.
 
         Raises:
             ValueError: an array is missing, or has another shape or type.

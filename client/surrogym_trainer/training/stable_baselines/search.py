@@ -75,7 +75,7 @@ class StableBaselinesSearch(PolicySearch):
         return {}
 
     def network(self, spec: EnvironmentSpec) -> dict[str, Any]:  # noqa: ARG002
-        """Return keywords of the policy network, except those of standardisation."""
+        """Return the keyword arguments that define the policy network, without those that standardise observations."""
         return {}
 
     @contextmanager
