@@ -198,7 +198,7 @@ def _settings(data: Mapping[str, Any], replaced: set[str]) -> PolicySettings:
     try:
         return PolicySettings.model_validate({name: value for name, value in data.items() if name not in replaced})
     except ValidationError as error:
-        raise ValueError(f"entry data of the file: {first_fault(error, got=True)}") from error
+        raise ValueError(f"in the file's entry data: {first_fault(error, got=True)}") from error
 
 
 def _entry(entries: Mapping[str, bytes], name: str) -> bytes:
