@@ -107,7 +107,9 @@ class SurrogateVecEnv(VecEnv):
 
     def step_wait(self) -> VecEnvStepReturn:
         if self._actions is None:
-            raise RuntimeError("step_wait: expected a step_async before it")
+            raise RuntimeError(
+                "expected a call of step_async before step_wait, got none: call step_async with the actions"
+            )
         step, self._actions = self._lanes.step(self._actions), None
         result = step.result
         done = result.terminated | result.truncated
@@ -155,7 +157,7 @@ class SurrogateVecEnv(VecEnv):
             return known[name]
         if name in ("observation_space", "action_space", "metadata"):
             return getattr(self, name)
-        raise AttributeError(f"a lane of a surrogate has no attribute {name!r}: set_attr adds one")
+        raise AttributeError(f"a lane of a surrogate has no attribute {name!r}: add it by set_attr")
 
 
 def _infos(step: LaneStep) -> list[dict[str, Any]]:

@@ -169,7 +169,7 @@ def test_importing_to_an_unknown_surrogate_or_with_conflicting_options_is_refuse
 ):
     with pytest.raises(UnknownSurrogate):
         import_log(log, to="nobody", url=server_process.url)
-    with pytest.raises(ValueError, match="expected to without register and spec"):
+    with pytest.raises(ValueError, match="expected the argument 'to' alone"):
         import_log(log, register="a", to="b")
 
 

@@ -117,11 +117,17 @@ TANK = {
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"a_space": [1, 2]}, r"expected a_space to be low and high as lists .* got \[1, 2\]"),
-        ({"a_space": {"low": [302], "high": [295]}}, "expected low of a_space to be below its high"),
-        ({"o_space": {"low": [0.0]}}, "expected o_space to be low and high"),
+        ({"a_space": [1, 2]}, r"expected a_space to be an object with low and high, .* got \[1, 2\]"),
+        (
+            {"a_space": {"low": [302], "high": [295]}},
+            "expected low of a_space to be below the corresponding high value",
+        ),
+        ({"o_space": {"low": [0.0]}}, "expected o_space to be an object with low and high"),
         ({"o_space": {"low": [0.0], "high": [float("inf")]}}, "expected o_space to be .* finite numbers"),
-        ({"o_space": {"low": [0.5], "high": [0.5]}}, "expected low of o_space to be below its high"),
+        (
+            {"o_space": {"low": [0.5], "high": [0.5]}},
+            "expected low of o_space to be below the corresponding high value",
+        ),
         ({"x0": "cold"}, 'expected x0 to be a list of finite numbers, got "cold"'),
         ({"x0": [float("nan")]}, "expected x0 to be a list of finite numbers"),
         ({"SP": {}}, "expected SP to be an object"),

@@ -166,7 +166,7 @@ def test_a_large_snapshot_of_an_environment_program_is_restored():
 def test_an_environment_program_that_does_not_read_its_input_is_killed():
     sleeper = Program("sleep 3600")
     sleeper.start()
-    with pytest.raises(StepTimedOut, match=r"read \d+ of 1048576 bytes of restore within 0.2 s and was ended"):
+    with pytest.raises(StepTimedOut, match=r"read only \d+ of 1048576 bytes of restore within 0.2 s and was ended"):
         sleeper.exchange(b"s" * 2**20, "restore", time.monotonic() + 0.2)
     assert not sleeper.running
 

@@ -152,7 +152,7 @@ def test_a_reward_array_of_one_entry_is_accepted(registered: Register) -> None:
 
 @pytest.mark.parametrize("reward", [float("inf"), float("nan")])
 def test_the_function_describe_refuses_rewards_that_are_not_finite_numbers(registered: Register, reward: float) -> None:
-    with pytest.raises(UnknownEnvironment, match="Fails-v0 paid infinite rewards or NaN"):
+    with pytest.raises(UnknownEnvironment, match="Fails-v0 gave infinite rewards or NaN"):
         describe(registered("Fails-v0", space={"step": paying(reward)}), STEPS)
 
 
@@ -223,7 +223,11 @@ def sized(size):
 @pytest.mark.parametrize(
     ("size", "message"),
     [
-        (0, "Fails-v0 shows no state and observes nothing: expected a state of 1 to 64 numbers; declare them in a"),
+        (
+            0,
+            "Fails-v0 has no state that can be read, and its observation is empty: expected a state of 1 to 64 "
+            "numbers; declare them in a",
+        ),
         (65, "Fails-v0 has 65 variables that move: expected at most 64; choose those .* in a class of your own"),
         (5_000, "Fails-v0 has 5000 variables that move: expected at most 64"),
     ],

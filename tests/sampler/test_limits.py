@@ -84,8 +84,11 @@ def test_a_server_that_returns_more_queries_than_requested_causes_no_real_step(s
 @pytest.mark.parametrize(
     ("change", "why"),
     [
-        ({"coordinates": [1e6]}, r"coordinate 'x': expected a value in the environment's range \[-1, 1\], got 1e\+06"),
-        ({"action": [500.0]}, r"action 0: expected a value in the environment's range \[-1, 1\], got 500"),
+        (
+            {"coordinates": [1e6]},
+            r"coordinate 'x' of the query: expected a value in the environment's range \[-1, 1\], got 1e\+06",
+        ),
+        ({"action": [500.0]}, r"action 0 of the query: expected a value in the environment's range \[-1, 1\], got 500"),
         ({"coordinates": [0.0, 0.0]}, "coordinates of the query: expected 1 numbers, .* got 2: .*"),
     ],
 )

@@ -81,7 +81,10 @@ def test_a_session_may_fall_back_to_an_earlier_step_again_while_requests_are_rep
 
 @pytest.mark.parametrize(
     ("kept", "replay", "said"),
-    [(2, (), "request 1, which this client no longer keeps"), (10, (step(1, 9.0),), "in another way")],
+    [
+        (2, (), "from number 1 on again, which this client no longer keeps"),
+        (10, (step(1, 9.0),), "gives another answer to"),
+    ],
 )
 def test_a_session_that_cannot_be_restored_exactly_is_reported_lost(kept: int, replay: tuple[Answer, ...], said: str):
     script = (step(1), step(2), step(3), back_to(1), *replay, reply(""))

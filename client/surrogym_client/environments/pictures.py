@@ -66,7 +66,9 @@ class Pictures:
             ResetNeeded: there is no observation yet.
         """
         if observation is None:
-            raise gymnasium.error.ResetNeeded("expected reset() before render(), got render() first")
+            raise gymnasium.error.ResetNeeded(
+                "expected a call of reset() before render(), got render() first: call reset()"
+            )
         return self._renderer.draw(self._read(np.asarray(observation, dtype=np.float64)))
 
     def close(self) -> None:
@@ -97,7 +99,8 @@ def coordinates_from_observation(spec: EnvironmentSpec) -> Callable[[Array], Arr
     reads = [read_of(spec, name) for name in spec.coordinate_names]
     if missing := [name for name, read in zip(spec.coordinate_names, reads, strict=True) if read is None]:
         raise NotRenderable(
-            f"expected observations from which every coordinate can be computed, got none for {missing[0]!r}"
+            f"expected observations from which every coordinate can be computed, got none for "
+            f"{missing[0]!r}: observe it, or leave render_mode out"
         )
     known = [read for read in reads if read is not None]
     return lambda observation: np.array([read(observation) for read in known])

@@ -36,6 +36,6 @@ def words_of_rounds(api: Api, name: str, queries: int, rounds: int) -> str:
             f"{budget}"
         )
     raise BudgetTooSmall(
-        f"{rounds} rounds of {queries} queries need up to {needed} more real steps, and {left}: use fewer by "
-        f"--improve and --rounds, or have a token of role admin raise it (surrogym change {name} --budget {budget})"
+        f"{rounds} rounds of {queries} queries need up to {needed} more real steps, and {left}: lower "
+        f"--improve or --rounds, or let an admin raise the budget (surrogym change {name} --budget {budget})"
     )

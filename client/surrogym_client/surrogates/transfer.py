@@ -61,7 +61,7 @@ def import_surrogate(
     """
     name = name or file.name
     if not _created(api, name, file):
-        raise NotImportable(f"a surrogate named {name!r} exists already: give another name by --name")
+        raise NotImportable(f"a surrogate named {name!r} exists already on the server: give another name by --name")
     try:
         api.patch_surrogate(name, paused=True, tolerances=file.tolerances or None)
         api.import_model(name, file.model)

@@ -201,7 +201,8 @@ class Api:
         )
         if len(claimed.queries) > max_queries:
             raise ProtocolMismatch(
-                f"expected at most {max_queries} queries in the reply to a claim, got {len(claimed.queries)}"
+                f"expected at most {max_queries} queries in the reply to a claim, got {len(claimed.queries)}: upgrade "
+                "the server"
             )
         return claimed
 
@@ -475,7 +476,7 @@ class Api:
         """Evaluate a model at any number of points, in requests that are small enough for the server."""
         if len(coordinates) != len(action):
             raise ValueError(
-                f"expected as many actions as coordinates, got {len(action)} actions and {len(coordinates)} coordinates"
+                f"expected one action for each state, got {len(action)} actions and {len(coordinates)} states"
             )
         parts: list[P] = []
         size = max(1, _NUMBERS // max(1, len([*coordinates[0], *action[0]]))) if coordinates else 1

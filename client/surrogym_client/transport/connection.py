@@ -303,7 +303,9 @@ def _body(response: httpx.Response) -> bytes:
         problem = Problem.model_validate_json(response.content)
     except ValidationError:
         if response.status_code in _GATEWAY_STATUSES:
-            raise httpx.RemoteProtocolError(f"a gateway answered {response.status_code}") from None
+            raise httpx.RemoteProtocolError(
+                f"expected an answer of the server, got status {response.status_code} from a gateway in front of it"
+            ) from None
         raise ProtocolMismatch(
             f"expected a Surrogym server at {response.url}, got an answer with status {response.status_code} and "
             f"content type {kind or 'unknown'!r}: check the address"

@@ -82,7 +82,7 @@ class Stream:
                 return self._receive(connected)
             except (WebSocketException, ConnectionError) as error:
                 self.close()
-                raise StreamLost(f"the stream broke: {error}") from error
+                raise StreamLost(f"the connection broke before the reply: {error}") from error
             except BaseException:
                 self.close()
                 raise

@@ -68,7 +68,7 @@ def require_shapes(path: Path, shapes: Mapping[str, tuple[int, ...]]) -> None:
     """Raise ``UnusableLog`` if a file has too many arrays or too large ones, before any of them is read."""
     if len(shapes) > MOST_COLUMNS:
         raise UnusableLog(
-            f"expected at most {MOST_COLUMNS:,} arrays in {path}, got {len(shapes):,}: save only those of the log"
+            f"expected at most {MOST_COLUMNS:,} arrays in {path}, got {len(shapes):,}: save only the arrays of the log"
         )
     require_sizes(
         path, max((shape[0] for shape in shapes.values() if shape), default=0), sum(map(prod, shapes.values()))
@@ -97,7 +97,7 @@ def _flat(path: Path, columns: Mapping[str, dict[str, Cells]]) -> dict[str, Cell
             if column in flat:
                 raise UnusableLog(
                     f"expected one array for the column {column!r} in {path}, got two, {source[column]} and "
-                    f"{array}: drop one"
+                    f"{array}: remove one of them"
                 )
             flat[column], source[column] = cells, array
     return flat

@@ -191,7 +191,10 @@ def import_log(
 
 def _require_one_name(register: str | None, to: str | None, spec: EnvironmentSpec | None) -> None:
     if to is not None and (register is not None or spec is not None):
-        raise ValueError("expected to without register and spec, got it together with one of them: leave one out")
+        raise ValueError(
+            "expected the argument 'to' alone, got it with 'register' or 'spec': give 'register' for a new surrogate, "
+            "or 'to' for an existing one, whose specification is used"
+        )
     if register is not None:
         _require_name(register)
 

@@ -92,5 +92,5 @@ def _require_writable(words: str, file: Path) -> None:
         raise UnusableLog(f"{words}: expected a file in a folder that exists, got {file}: make the folder first")
     if not os.access(file if file.exists() else file.parent, os.W_OK):
         raise UnusableLog(
-            f"{words}: expected a file that can be written, got {file}, which is write-protected: give another"
+            f"{words}: expected a file that can be written, got {file}, which is write-protected: give another file"
         )

@@ -294,7 +294,9 @@ def _episodes(path: Path, data: Any, width: int) -> list[dict[str, Cells]]:
             f"expected a Minari data set in {path}, got one with an episode that can't be read: record it again"
         ) from error
     if not episodes:
-        raise UnusableLog(f"expected a Minari data set with episodes in {path}, got one without: record some")
+        raise UnusableLog(
+            f"expected a Minari data set with episodes in {path}, got a data set without episodes: record episodes"
+        )
     for number, arrays in enumerate(episodes):
         rows = {name: len(array) for name, array in arrays.items()}
         if len(set(rows.values())) > 1:
@@ -308,7 +310,7 @@ def _episodes(path: Path, data: Any, width: int) -> list[dict[str, Cells]]:
 def _of_episode(episode: Any, width: int) -> dict[str, Cells]:
     seen = np.asarray(episode.observations)
     if prod(seen.shape[1:]) != width:
-        raise ValueError(f"observations of {seen.shape}")
+        raise ValueError(f"expected observations of {width} numbers, got an array of shape {seen.shape}")
     return {
         "observations": seen[:-1].reshape(-1, width),
         "actions": _rows(np.asarray(episode.actions)),
@@ -352,7 +354,7 @@ def _declared(path: Path, space: Any) -> dict[str, Any]:
         return {"discrete": True, "limits": {"0": (0.0, float(space.n - 1))}}
     if not isinstance(space, Box) or len(space.shape) > 1:
         raise UnusableLog(
-            f"expected actions of a Box (n,) or of a Discrete from 0 in {path}, got {space}: convert them"
+            f"expected actions of a Box (n,) or of a Discrete from 0 in {path}, got {space}: convert the actions"
         )
     ends = zip(space.low.reshape(-1).tolist(), space.high.reshape(-1).tolist(), strict=True)
     return {"discrete": False, "limits": {str(i): pair for i, pair in enumerate(ends) if np.isfinite(pair).all()}}

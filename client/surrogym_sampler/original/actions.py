@@ -34,7 +34,8 @@ def decode_actions(spec: EnvironmentSpec, raw: NDArray[Any], num_envs: int) -> A
     counts = np.array(_counts(spec.action))
     if not ((rows >= 0) & (rows < counts) & (rows == np.round(rows))).all():
         raise ValueError(
-            f"expected actions that are whole numbers from 0 to below {counts.tolist()}, got {rows.tolist()}"
+            f"expected actions that are whole numbers from 0 to below {counts.tolist()}, got {rows.tolist()}: correct "
+            "the policy"
         )
     if not isinstance(spec.action, BoxAction):
         return rows

@@ -107,7 +107,8 @@ class SimulatedEpisode(Episode):
     def place(self, coordinates: Array) -> Moment:
         if not self._environment.simulator.settable:
             raise NotSettable(
-                f"this environment can't be set to {coordinates.tolist()}: it can only be reset, so use its own starts"
+                f"this environment can't be set to the state {coordinates.tolist()}: it can only be reset, so begin "
+                "episodes at its own starts, without --wide and --start-scale"
             )
         self._environment.simulator.reset(0)
         self._environment.place(coordinates)
@@ -167,7 +168,8 @@ class RolloutEpisode(OwnEpisode):
 
     def place(self, coordinates: Array) -> Moment:
         raise NotSettable(
-            f"this environment can't be set to {coordinates.tolist()}: it can only be reset, so use its own starts"
+            f"this environment can't be set to the state {coordinates.tolist()}: it can only be reset, so begin "
+            "episodes at its own starts, without --wide and --start-scale"
         )
 
     def resume(self, coordinates: Array) -> None:

@@ -59,7 +59,8 @@ def check_policy(trained: EnvironmentSpec, own: EnvironmentSpec) -> None:
     if trained.limits is not None and trained.limits != own.limits:
         raise PolicyMisfit(
             f"{misfit}: expected the limits that the policy was trained with, got {'other' if own.limits else 'no'} "
-            "limits: declare them in the environment's specification, or give that with --spec FILE"
+            "limits: declare them in the environment's specification, or give a specification that has them with "
+            "--spec FILE"
         )
     expected, got = _observation_in_words(trained), _observation_in_words(own)
     if len(trained.observation) != len(own.observation):

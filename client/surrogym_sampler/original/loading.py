@@ -267,7 +267,7 @@ def _known(name: str, spec: EnvironmentSpec | None, choose: Choose, preset: str,
         if name not in TASKS:
             raise
         raise UnknownEnvironment(
-            f"{error}; or describe the task of Surrogym, whose coordinates are "
+            f"{error}; or give a specification with the coordinates of Surrogym's built-in task, "
             f"{', '.join(TASKS[name].spec().coordinate_names)}, in this order"
         ) from error
     except BaseException:

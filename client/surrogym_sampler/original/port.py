@@ -64,7 +64,7 @@ class OriginalPort:
         """
         if request.autoreset_mode != "same_step":
             raise ValueError(
-                "autoreset_mode: expected same_step, the only one of an original environment, got "
+                "autoreset_mode: expected same_step, the only mode of an original environment, got "
                 f"{request.autoreset_mode}"
             )
         name, seed = f"original-{next(self._names)}", request.seed or 0
@@ -164,8 +164,9 @@ class OriginalPort:
     def _check_alone(self, others: int) -> None:
         if others and not self._parallel:
             raise NotParallel(
-                f"expected one lane in one session, as the environment runs one instance at a time, got {others} more "
-                "(a simulator that runs several declares it by an attribute parallel = True)"
+                f"expected one lane in one session, as the environment runs one instance at a time, got {others} "
+                "further lanes: use one lane, or set the attribute parallel = True of a simulator that can "
+                "run several times"
             )
 
     def _lanes(self, session: str) -> list[_Lane]:

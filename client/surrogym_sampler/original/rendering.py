@@ -47,7 +47,8 @@ def renderer_of(spec: EnvironmentSpec, original: str | None = None) -> Renderer:
     name = original or spec.environment
     if not is_drawn_by_gymnasium(name):
         raise NotRenderable(
-            f"expected original='package.module:factory' to render the environment {name!r}, got none: give it"
+            f"expected original='package.module:factory' to render the environment {name!r}, got none: give "
+            "the class that draws it"
         )
     return _Native(name, spec)
 
@@ -61,7 +62,8 @@ class _Own:
         made = load_factory(name)()
         if not isinstance(made, Drawable):
             raise NotRenderable(
-                f"expected {name} to have a method picture(coordinates), got a {type(made).__name__} without: add it"
+                f"expected {name} to have a method picture(coordinates), got a {type(made).__name__} without it: "
+                "add the method"
             )
         self._environment = made
         self.frames_per_second = int(getattr(made, "frames_per_second", FRAMES_PER_SECOND))

@@ -68,7 +68,8 @@ class FromReset:
         """
         if self._at is None:
             raise StepFailed(
-                "expected an action in a running episode, got one after its end or before a reset: reset first"
+                "expected a running episode, got an action before a reset or after the episode's end: reset the "
+                "environment first"
             )
         before, self._at = self._at, None
         native = native_action(self._spec.action, within_rates(self._spec, before, action))
@@ -104,8 +105,8 @@ class FromReset:
             return snapshot
         if self._at is None:
             raise StepFailed(
-                "expected a running episode, whose earlier states are saved as well, got none: reset the "
-                "environment first"
+                "expected a running episode, because a snapshot contains its earlier values (lags), got none: reset "
+                "the environment first"
             )
         return self._at.astype("<f8").tobytes() + snapshot
 
@@ -119,8 +120,8 @@ class FromReset:
         self._at = None
         if len(snapshot) < self._prefix:
             raise StepFailed(
-                f"expected a snapshot of at least {self._prefix} bytes, the size of its coordinates with lags, got "
-                f"{len(snapshot)}: delete the snapshots of this environment"
+                f"expected a snapshot of at least {self._prefix} bytes, the size of the coordinates in it, got "
+                f"{len(snapshot)} bytes: delete the snapshots of this environment"
             )
         read = self._read(_saving(self._environment).restore(snapshot[self._prefix :]))
         before = np.frombuffer(snapshot[: self._prefix], dtype="<f8") if self._prefix else np.zeros(len(read))
@@ -135,7 +136,8 @@ class FromReset:
         names = read_names(self._spec)
         if read.shape != (len(names),):
             raise StepFailed(
-                f"expected coordinates() to return ({', '.join(names)}), got an array of shape {read.shape}: correct it"
+                f"expected coordinates() to return ({', '.join(names)}), got an array of shape {read.shape}: "
+                "correct the method"
             )
         return read
 
@@ -144,7 +146,7 @@ def _saving(environment: object) -> SnapshotEnvironment:
     """Return the environment if it has ``save`` and ``restore``. Raises ``StepFailed`` otherwise."""
     if not isinstance(environment, SnapshotEnvironment):
         raise StepFailed(
-            "expected the methods save and restore for snapshots, got an environment without them: add them"
+            "expected the methods save and restore for snapshots, got an environment without them: add both"
         )
     return environment
 

@@ -107,17 +107,17 @@ def calibrate(
             with its own values.
     """
     if len(real) < FEWEST:
-        raise NotCalibrated(f"expected at least {FEWEST} real steps for a calibration, got {len(real)}: take some more")
+        raise NotCalibrated(f"expected at least {FEWEST} real steps for a calibration, got {len(real)}: take more")
     errors = _Errors(spec, real, step)
     if errors.measured <= len(parameters):
         raise NotCalibrated(
             f"expected at least {len(parameters) // errors.moving + 1} real steps to calibrate {len(parameters)} "
-            f"parameters, got {len(real)}: calibrate fewer, or register the plant with --initial and more steps"
+            f"parameters, got {len(real)}: calibrate fewer parameters, or register the plant with a larger --initial"
         )
     before = errors(own)
     if (np.abs(before) >= FAR).all(1).mean() > 0.5:
         raise NotCalibrated(
-            f"expected a simulator that can take the real steps, got one that fails in most of {len(real)}"
+            f"expected a simulator that can repeat the real steps, got a simulator that fails in most of {len(real)}"
             f"{errors.failure}: check its coordinates, units and actions"
         )
     if not parameters:

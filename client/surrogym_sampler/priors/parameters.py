@@ -110,7 +110,8 @@ def adjustable(simulator: Any) -> Adjustable:
             return plant
     if getattr(simulator, "step_from", None) is None:
         raise UnknownEnvironment(
-            "expected a simulator in this process, got one in another, whose parameters can't be reached: write a class"
+            "expected a simulator in this process, got a simulator in another process, whose parameters can't be "
+            "changed from here: write a class that runs the simulator in this process (docs/how-to/priors.md)"
         )
     return Attributes(_layers(simulator)[-1])
 

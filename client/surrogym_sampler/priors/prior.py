@@ -55,9 +55,9 @@ class Careful:
             step = self._simulator.step_from(coordinates, action)
             numbers = [*np.ravel(step.coordinates), *np.ravel(step.next_coordinates), step.reward]
         except Exception as error:  # a user's code may raise anything
-            raise StepRefused(f"{type(error).__name__}: {error}") from error
+            raise StepRefused(f"the simulator failed: {type(error).__name__}: {error}") from error
         if not np.isfinite(numbers).all():
-            raise StepRefused("expected finite numbers from the simulator, got some that are not")
+            raise StepRefused("expected finite numbers from the simulator, got infinite numbers or NaN")
         return step
 
     def close(self) -> None:
@@ -92,8 +92,8 @@ class SimulatorPrior(ABC):
     ) -> None:
         if any(coordinate.lag is not None for coordinate in spec.coordinates):
             raise UnknownEnvironment(
-                "expected a plant without lags, because a simulator can't be set to earlier states, got one with lags: "
-                "do without a prior"
+                "expected a plant without lags (coordinates that repeat earlier values), because a simulator can't be "
+                "set to earlier values, got a plant with lags: learn it without a prior"
             )
         size = len(spec.coordinates) + spec.action.size
         self.steps = min(MOST, max(FEWEST, BY_INPUT * size)) if steps is None else steps
@@ -190,7 +190,7 @@ def _opened(simulator: str | OriginalEnvironment, spec: EnvironmentSpec) -> Orig
             _require_alike(spec, opened.spec())
             if not callable(getattr(opened, "step_from", None)):
                 raise UnknownEnvironment(
-                    "expected a simulator with a method step_from, which sets it to a state, got one without: add it"
+                    "expected a simulator with a method step_from, which sets it to a state, got none: add it"
                 )
         environment: OriginalEnvironment = _respecified(simulator, opened, spec)
         _require_steps(environment, spec)
@@ -216,7 +216,8 @@ def _require_alike(spec: EnvironmentSpec, own: EnvironmentSpec) -> None:
     ):
         if expected != got:
             raise UnknownEnvironment(
-                f"expected a simulator with the plant's {what}, {expected}, got {got}: give the simulator the same"
+                f"expected a simulator with the plant's {what}, {expected}, got {got}: give the simulator the same "
+                f"{what}"
             )
 
 
@@ -238,8 +239,8 @@ def _require_steps(environment: OriginalEnvironment, spec: EnvironmentSpec) -> N
         except Exception as error:  # a user's code may raise anything
             why = f"{type(error).__name__}: {str(error)[:200]}"
     raise UnknownEnvironment(
-        f"expected a simulator that steps from its sampling range to {len(spec.coordinates)} finite coordinates, "
-        f"got one that took none of {TRIALS}: {why}"
+        f"expected a simulator that steps from states in its sampling ranges to {len(spec.coordinates)} finite "
+        f"coordinates, got a simulator that failed in all {TRIALS} trials: {why}"
     )
 
 

@@ -90,7 +90,9 @@ class Leases:
         if self._left(query) <= NEARLY_OVER * self._lease_seconds:
             self._renew(query)
         if self._left(query) <= 0:
-            raise LeaseEnded("the query's lease has ended, so another sampler may have answered it")
+            raise LeaseEnded(
+                "the query's lease has ended, so another sampler may have answered it; no further step is taken"
+            )
 
     def _left(self, query: Query) -> float:
         with self._lock:

@@ -28,18 +28,19 @@ def check_environment(surrogate: str, asked: EnvironmentSpec, own: EnvironmentSp
     expected, got = _shape(asked), _shape(own)
     if expected != got:
         raise UnknownEnvironment(
-            f"the environment does not fit surrogate {surrogate!r}: expected {expected}, got {got}; register it anew"
+            f"the environment does not fit surrogate {surrogate!r}: expected {expected}, got {got}; "
+            "register the environment under another name"
         )
     if is_other(asked.sampling_period, own.sampling_period):
         raise UnknownEnvironment(
             f"the environment does not fit surrogate {surrogate!r}: expected a step every {asked.sampling_period:g} s "
-            f"(sampling_period), got {own.sampling_period:g} s; register it anew"
+            f"(sampling_period), got {own.sampling_period:g} s; register the environment under another name"
         )
     if asked.limits is not None and asked.limits != own.limits:
         raise UnknownEnvironment(
             f"the environment does not fit surrogate {surrogate!r}: expected a specification with the surrogate's "
             "limits, which the sampler keeps at the machine, got other limits or none; declare them in the "
-            "environment's specification, or give that with --spec FILE"
+            "environment's specification, or give a specification that has them with --spec FILE"
         )
     _check_ranges("actions", action_ranges(asked), action_ranges(own))
     _check_ranges("coordinates", [sampled(c.sampling) for c in asked.coordinates], _coordinate_ranges(own))
@@ -64,12 +65,14 @@ def check_query(own: EnvironmentSpec, query: Query) -> None:
         return
     if query.snapshot is not None and not own.snapshots:
         raise QueryRefused(
-            "expected a query that begins at a reset, as the environment has no snapshots, got one at a snapshot"
+            "expected a query that begins at a reset, as the environment has no snapshots, got a query that begins at "
+            "a snapshot: register the environment under another name"
         )
     longest = own.max_rollout or own.time_limit or MAX_ROLLOUT_QUERY
     if not 1 <= len(query.actions) <= longest:
         raise QueryRefused(
-            f"expected a query of 1 to {longest} actions, got {len(query.actions)}: register with --max-rollout"
+            f"expected a query of 1 to {longest} actions, got {len(query.actions)}: register the "
+            f"environment under another name with --max-rollout {longest}"
         )
     for action in query.actions:
         _check_action(own, action)
@@ -93,7 +96,8 @@ def _check_values(what: str, names: Sequence[str], values: Sequence[float], rang
     for name, value, allowed in zip(names, values, ranges, strict=True):
         if not is_within((value, value), allowed):
             raise QueryRefused(
-                f"{name}: expected a value in the environment's range [{allowed[0]:g}, {allowed[1]:g}], got {value:g}"
+                f"{name} of the query: expected a value in the environment's range [{allowed[0]:g}, {allowed[1]:g}], "
+                f"got {value:g}"
             )
 
 

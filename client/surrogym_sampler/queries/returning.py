@@ -25,7 +25,7 @@ from surrogym_sampler.queries.settings import SamplerSettings
 from surrogym_sampler.queries.snapshots import SnapshotFolder
 from surrogym_shared.spec import EnvironmentSpec, limits
 
-SKIPPED = "the design takes another state, and surrogym doctor --env ENVIRONMENT checks save and restore"
+SKIPPED = "the design chooses another query, and surrogym doctor --env ENVIRONMENT checks save and restore"
 MOST_HANGS = 2  # number of time-outs of `save` in a row after which no state is saved; a single one may be chance
 ELSEWHERE = 0.01  # share of a sampling range; a restored state that differs by more is reported
 
@@ -134,7 +134,7 @@ class Returning:
             raise SnapshotNotKept(sentence(error)) from error
         if not isinstance(state, bytes):
             raise SnapshotNotKept(
-                f"expected bytes from save, got a {type(state).__name__}: let it return the state as bytes"
+                f"expected bytes from save, got a {type(state).__name__}: let save return the state as bytes"
             )
         return state
 

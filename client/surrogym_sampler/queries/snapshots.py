@@ -131,7 +131,7 @@ class SnapshotFolder:
                 "samplers the same --snapshots folder"
             ) from error
         except (OSError, ValueError, KeyError, TypeError) as error:
-            raise SnapshotGone(f"snapshot {name} can't be read: {error}; the design takes another state") from error
+            raise SnapshotGone(f"snapshot {name} can't be read: {error}; the design chooses another query") from error
         if (form, made_by, list(coordinates)) != (FORM, self._environment, self._names):
             raise SnapshotGone(
                 f"expected a snapshot of {self._environment!r} in form {FORM}, got {name} of {made_by!r} in "
@@ -139,7 +139,8 @@ class SnapshotFolder:
             )
         if hashlib.sha256(state).hexdigest() != digest:
             raise SnapshotGone(
-                f"snapshot {name} is damaged: its bytes are not those that were written; the design takes another state"
+                f"snapshot {name} is damaged: its bytes are not those that were written; the design chooses another "
+                "query"
             )
         return tuple(map(float, coordinates.values())), state
 

@@ -50,7 +50,7 @@ def _exit_code(subject: Subject, more_seconds: float = 0.0) -> int:
     code = subject.program.wait(seconds)
     subject.program.end()
     if code is None:
-        raise Mismatch(f"expected the program to end within {seconds:g} s, got one that still runs")
+        raise Mismatch(f"expected the program to end within {seconds:g} s, got a program that still runs")
     return code
 
 

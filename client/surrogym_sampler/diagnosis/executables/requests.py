@@ -38,9 +38,11 @@ def a_line_that_is_no_request_gets_an_error(subject: Subject) -> None:
     try:
         answer = json.loads(line)
     except ValueError as error:
-        raise Mismatch(f"expected one line of JSON, got {line[:80]!r}") from error
+        raise Mismatch(f"expected one line of JSON from the program, got {line[:80]!r}") from error
     if not isinstance(answer, dict) or answer.get("id", 0) is not None or "error" not in answer:
-        raise Mismatch(f"expected an error whose id is null, got {line[:80]!r}")
+        raise Mismatch(
+            f"expected the answer to a line without a request to be an error whose id is null, got {line[:80]!r}"
+        )
     subject.reset(0)
 
 
@@ -62,7 +64,7 @@ def nothing_but_answers_is_printed(subject: Subject) -> None:
     surplus = subject.program.surplus(SURPLUS_SECONDS)
     if surplus:
         subject.program.end()
-        raise Mismatch(f"expected one line for each request, got another one: {surplus[:80]!r}")
+        raise Mismatch(f"expected one printed line for each request, got a further line: {surplus[:80]!r}")
 
 
 CHECKS = (

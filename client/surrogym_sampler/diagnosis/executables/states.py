@@ -36,10 +36,12 @@ def a_seed_repeats_its_start(subject: Subject) -> None:
 def other_seeds_give_other_starts(subject: Subject) -> None:
     spec = subject.spec
     if len(spec.starts) == 1 or (not spec.starts and all(isinstance(start, Fixed) for start in spec.start.values())):
-        raise LeftOut("its specification declares one start")
+        raise LeftOut("the program's specification declares a single start state, so all seeds give the same start")
     starts = {tuple(subject.reset(seed).tolist()) for seed in range(SEEDS)}
     if len(starts) == 1:
-        raise Mismatch(f"expected several starts with {SEEDS} seeds, got {list(*starts)} each time")
+        raise Mismatch(
+            f"expected different start states after resets with {SEEDS} different seeds, got {list(*starts)} each time"
+        )
 
 
 def set_reaches_the_state(subject: Subject) -> None:
@@ -62,7 +64,9 @@ def a_step_depends_on_nothing_but_state_and_action(subject: Subject) -> None:
         state, action = subject.random_state(), subject.random_action()
         _, first, again = (_step_from(subject, state, action) for _ in range(3))
         if _difference(subject, first, again) > EXACT:
-            raise LeftOut(f"equal steps from {state.tolist()} differ, so the plant is noisy")
+            raise LeftOut(
+                f"the same step from {state.tolist()}, taken twice, gave two results, so the environment is noisy"
+            )
         _wander(subject)
         _expect_same(subject, "step after other steps", first, _step_from(subject, state, action))
 

@@ -101,7 +101,7 @@ class Subject:
             result = self.ask(method, **fields)
         except RequestRefused as error:
             return error
-        raise Mismatch(f"expected an error for {method}, got the result {result}")
+        raise Mismatch(f"expected an error for the request {method}, got the result {result}")
 
     def reset(self, seed: int | None) -> Array:
         """Reset the program with a seed, and return the coordinates (C,) of the start."""
@@ -114,7 +114,7 @@ class Subject:
             LeftOut: the program declares rollout queries, so its state can't be set.
         """
         if self.spec.query == "rollout":
-            raise LeftOut("its specification declares rollout queries")
+            raise LeftOut("the program's specification declares rollout queries, so its state can't be set")
         return self.state(self.ask("set", state=[float(entry) for entry in state]))
 
     def begin(self) -> None:

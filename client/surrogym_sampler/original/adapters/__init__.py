@@ -90,8 +90,8 @@ def open_simulator(name: str) -> Simulator:
     adapter = adapter_of(name)
     if adapter is None and WITH_SPECIFICATION.fullmatch(name):
         raise UnknownEnvironment(
-            f"{name} is a factory or a program, which gives its own specification: there is nothing to describe. A "
-            "Gymnasium class without one is described by its id: register it with Gymnasium, and give package:Id-v0"
+            f"{name} is a factory or a program, which gives its own specification: there is nothing to describe. To "
+            "describe a Gymnasium class without a specification, register it with Gymnasium, and give package:Id-v0"
         )
     if adapter is None:
         raise UnknownEnvironment(

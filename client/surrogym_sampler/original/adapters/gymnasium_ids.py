@@ -43,8 +43,8 @@ def open_simulator(name: str) -> Simulator:
     env = make(name)
     if type(env.observation_space).__name__ in SYMBOLS:
         raise UnknownEnvironment(
-            f"{name} shows {env.observation_space}, a symbol out of several: expected numbers that change gradually; "
-            "write a class that gives such numbers (docs/how-to/own-environment.md)"
+            f"{name} observes {env.observation_space}, a symbol out of several: expected numbers that change "
+            "gradually; write a class that gives such numbers (docs/how-to/own-environment.md)"
         )
     limit = env.spec.max_episode_steps
     # wrappers may change observations and rewards, so the unwrapped environment is not used
@@ -196,7 +196,8 @@ def _entries(given: Any, whose: str, expected: tuple[str, ...]) -> tuple[Any, ..
         return given
     came = f"{len(given)} values" if isinstance(given, tuple) else f"a {type(given).__name__}"
     raise StepFailed(
-        f"expected {whose} to return {len(expected)} values ({', '.join(expected)}), got {came}: correct it"
+        f"expected {whose} to return {len(expected)} values ({', '.join(expected)}), got {came}: correct the "
+        "environment"
     )
 
 

@@ -84,8 +84,8 @@ class Counted:
         state, expected = self.simulator.read(), len(self.simulator.variables)
         if len(state) != expected:
             raise StepFailed(
-                f"expected the state to have {expected} numbers, as after the first reset, got {len(state)}: declare a "
-                "fixed number"
+                f"expected the state to have {expected} numbers, as after the first reset, got {len(state)}: let "
+                "the environment always have a state of the same size"
             )
         return state
 

@@ -22,8 +22,8 @@ def require_variables(name: str, variables: Sequence[Variable]) -> None:
     """Raise ``UnknownEnvironment`` if the state of an environment has no variables."""
     if not variables:
         raise UnknownEnvironment(
-            f"{name} shows no state and observes nothing: expected a state of 1 to {MAX_DIMENSIONS} numbers; declare "
-            f"them {OWN_CLASS}"
+            f"{name} has no state that can be read, and its observation is empty: expected a state of 1 to "
+            f"{MAX_DIMENSIONS} numbers; declare them {OWN_CLASS}"
         )
 
 
@@ -41,12 +41,12 @@ def require_numbers(name: str, states: Sequence[Array], rewards: Array) -> None:
     """Raise ``UnknownEnvironment`` if states, each (n, V), or rewards (n,) are infinite or NaN."""
     if not all(np.isfinite(some).all() for some in states):
         raise UnknownEnvironment(
-            f"{name} reached states with infinite values or NaN: expected finite numbers; narrow its actions, "
-            "or correct it"
+            f"{name} reached states with infinite values or NaN: expected finite numbers; narrow the "
+            "bounds of its actions, or correct the environment"
         )
     if not np.isfinite(rewards).all():
         raise UnknownEnvironment(
-            f"{name} paid infinite rewards or NaN under random actions: expected finite numbers; correct its reward"
+            f"{name} gave infinite rewards or NaN under random actions: expected finite numbers; correct its reward"
         )
 
 
@@ -60,8 +60,8 @@ def require_coordinates(name: str, count: int, steps: int) -> None:
     """
     if not count:
         raise UnknownEnvironment(
-            f"no variable of {name} differed between resets or moved in {steps} random steps: expected one at least; "
-            f"take more steps (--steps), or declare the coordinates {OWN_CLASS}"
+            f"no variable of {name} differed between resets or moved in {steps} random steps: expected at least one "
+            f"that does; take more steps (--steps), or declare the coordinates {OWN_CLASS}"
         )
     _require_at_most(name, count)
 
@@ -69,6 +69,6 @@ def require_coordinates(name: str, count: int, steps: int) -> None:
 def _require_at_most(name: str, count: int) -> None:
     if count > MAX_DIMENSIONS:
         raise UnknownEnvironment(
-            f"{name} has {count} variables that move: expected at most {MAX_DIMENSIONS}; choose those that decide what "
-            f"happens next, {OWN_CLASS}"
+            f"{name} has {count} variables that move: expected at most {MAX_DIMENSIONS}; choose those that "
+            f"the next state depends on, and declare them {OWN_CLASS}"
         )

@@ -68,7 +68,8 @@ class Executable:
         before, self._at = self._at, None
         if before is None:
             raise StepFailed(
-                "expected an action in a running episode, got one after its end or before a reset: reset first"
+                "expected a running episode, got an action before a reset or after the episode's end: reset the "
+                "environment first"
             )
         step = self._stepped(before, action, self._deadline())
         if not (step.terminated or step.truncated):

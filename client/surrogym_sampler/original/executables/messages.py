@@ -43,11 +43,11 @@ def encode(number: int, method: str, **fields: object) -> bytes:
         line = json.dumps({"id": number, "method": method, **fields}, allow_nan=False).encode()
     except ValueError as error:
         raise StepFailed(
-            f"expected finite numbers in the request {method}, got {fields}: correct them at their source"
+            f"expected finite numbers in the request {method}, got {fields}: correct the code that computes them"
         ) from error
     if len(line) > LONGEST_LINE:
         raise StepFailed(
-            f"expected a request of at most {LONGEST_LINE} bytes, got {method} with {len(line)}: send less"
+            f"expected a request of at most {LONGEST_LINE} bytes, got {method} with {len(line)}: send fewer numbers"
         )
     return line + b"\n"
 

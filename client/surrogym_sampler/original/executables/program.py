@@ -57,7 +57,7 @@ class Program:
             )
         if os.name == "nt":
             raise UnknownEnvironment(
-                "expected Linux or macOS to start a program, got Windows: run the sampler there; the server "
+                "expected Linux or macOS to start a program, got Windows: run the sampler on one of these; the server "
                 "may run elsewhere"
             )
         self._process: subprocess.Popen[bytes] | None = None
@@ -209,14 +209,16 @@ class Program:
     def _write(self, line: bytes, method: str, deadline: float) -> None:
         process = self._process
         if process is None or process.stdin is None:
-            raise EnvironmentDied(f"expected a running program for the request {method}, got none: start it first")
+            raise EnvironmentDied(
+                f"expected a running program for the request {method}, got none: start the program first"
+            )
         begun, left = time.monotonic(), memoryview(line)
         with selectors.DefaultSelector() as selector:
             selector.register(process.stdin.fileno(), selectors.EVENT_WRITE)
             while left:
                 if not selector.select(max(0.0, deadline - time.monotonic())):
                     raise StepTimedOut(
-                        f"{self._called} read {len(line) - len(left)} of {len(line)} bytes of {method} within "
+                        f"{self._called} read only {len(line) - len(left)} of {len(line)} bytes of {method} within "
                         f"{max(0.0, deadline - begun):.3g} s and was ended{self._complaint()}"
                     )
                 try:

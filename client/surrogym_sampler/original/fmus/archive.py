@@ -135,7 +135,8 @@ def _names_in(path: Path) -> list[str]:
             names = file.namelist()
     except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError, RuntimeError) as error:
         raise UnknownEnvironment(
-            f"{path} is not a zip archive, or a broken one ({_first_line(error)}): copy or export the FMU anew"
+            f"{path} is not a zip archive, as an FMU is, or is a damaged one ({_first_line(error)}): copy or export "
+            "the FMU anew"
         ) from error
     if damaged is not None:
         raise UnknownEnvironment(f"{damaged} in {path} is damaged: copy or export the FMU anew")

@@ -45,14 +45,15 @@ class FmuEnvironment(Simulated):
     def __init__(self, simulator: SavingSimulator, spec: EnvironmentSpec) -> None:
         if spec.reward.kind != "declared":
             raise UnknownEnvironment(
-                f"expected a declared reward for {spec.environment or 'an FMU'}, which has none of its own, got a "
-                f"{spec.reward.kind} one: surrogym describe writes a specification; declare its reward there "
+                f"expected a declared reward for {spec.environment or 'an FMU'}, which has no reward of its own, got a "
+                f"{spec.reward.kind} reward: declare it in the specification that surrogym describe writes "
                 "(docs/how-to/fmus.md)"
             )
         if spec.action.kind != "box" or spec.action.size != simulator.action.size:
             raise UnknownEnvironment(
-                f"expected a continuous action of {simulator.action.size} entries, one for each driven input of the "
-                f"FMU, got a {spec.action.kind} one of {spec.action.size}: correct the specification's action"
+                f"expected a continuous action of {simulator.action.size} entries, one for each input of the FMU that "
+                f"an action sets, got a {spec.action.kind} action of {spec.action.size}: correct the specification's "
+                "action"
             )
         super().__init__(simulator, spec)
         self._saving = simulator
@@ -81,8 +82,8 @@ class FmuEnvironment(Simulated):
             return self._saving.snapshot()
         if not self._saving.settable:
             raise StepFailed(
-                "expected an FMU that can save its state or be set to one, got one that can only be reset: register it "
-                "with --access reset"
+                "expected an FMU that can save its state or be set to a state, got an FMU that can only be reset: "
+                "register it with --access reset"
             )
         return super().save()
 

@@ -53,7 +53,8 @@ class GuardedSteps:
             limit, left = nearest(self._spec, at[0])
             raise StepRefused(
                 f"expected a state whose distance from the limit {limit.name!r} is at least its margin of "
-                f"{limit.margin:g}, got a distance of {left:.4g}"
+                f"{limit.margin:g}, got a distance of {left:.4g}; no step was taken, and the design chooses another "
+                "query"
             )
         return self._environment.step_from(coordinates, action)
 

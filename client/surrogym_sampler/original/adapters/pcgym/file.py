@@ -39,7 +39,9 @@ def read_parameters(path: Path) -> dict[str, Any]:
     if given.get("disturbances") is not None:
         _check_schedule(path, "disturbances", given["disturbances"], given["N"])
         if "disturbance_bounds" not in given:
-            raise UnknownEnvironment(f"{path} has disturbances but no disturbance_bounds: add these with low and high")
+            raise UnknownEnvironment(
+                f"{path} has disturbances but no disturbance_bounds: add disturbance_bounds with low and high"
+            )
         count = len(given["disturbances"])
         _check_length(path, "low and high of disturbance_bounds", given["disturbance_bounds"]["low"], count, "")
     return given
@@ -84,9 +86,9 @@ def _check_times(path: Path, given: Mapping[str, Any]) -> None:
 def _check_range(path: Path, key: str, given: Any) -> None:
     low, high = (given.get("low"), given.get("high")) if isinstance(given, dict) else (None, None)
     if low is None or high is None or not _numbers(low) or not _numbers(high) or len(low) != len(high):
-        raise _expected(path, key, "low and high as lists of finite numbers, equally many", given)
+        raise _expected(path, key, "an object with low and high, two lists of finite numbers of the same length", given)
     if not all(a < b for a, b in zip(low, high, strict=True)):
-        raise _expected(path, f"low of {key}", "below its high", given)
+        raise _expected(path, f"low of {key}", "below the corresponding high value", given)
 
 
 def _check_schedule(path: Path, key: str, given: Any, count: int) -> None:
@@ -100,7 +102,7 @@ def _check_schedule(path: Path, key: str, given: Any, count: int) -> None:
         if len(values) < count:
             raise UnknownEnvironment(
                 f"{path}: expected {key} of {name} to have a value for each of the N = {count} samples, "
-                f"got {len(values)}: add the others"
+                f"got {len(values)}: add the missing values"
             )
 
 
