@@ -46,7 +46,7 @@ from surrogym_shared.codes import STATUS, Code, Problem
 class SurrogymClientError(Exception):
     """Base class of all errors of the client. ``str(error)`` is one sentence for a person."""
 
-    way_out = ""  # advice on what to do, which a traceback shows as a note
+    way_out = ""  # advice on what to do next; a traceback shows it as a note
 
     def __init__(self, *args: object) -> None:
         super().__init__(*args)

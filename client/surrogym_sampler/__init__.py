@@ -1,1 +1,1 @@
-"""The sampler: original environments, the queries that real steps answer, logs, and what is checked before them."""
+"""The sampler: it opens and checks original environments, answers a server's queries by real steps, and reads logs."""

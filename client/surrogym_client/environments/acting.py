@@ -43,7 +43,14 @@ class ActingLanes:
     def take(
         self, policy: ActingPolicy, steps: int, noise: NoiseKey | None = None, until: Bools | None = None
     ) -> Taken:
-        """Step all lanes ``steps`` times with a policy. The arguments are those of ``PolicyPort.rollout_policy``."""
+        """Step all lanes at most ``steps`` times with a policy, and return the record of the steps.
+
+        Args:
+            policy: the policy.
+            steps: largest number of steps.
+            noise: key of the actions' random noise; None takes the most probable actions.
+            until: mask (N,) of lanes; stepping stops once an episode has ended in each of them.
+        """
         first, done = self._observation, _Done([], [], [], [])
         waiting = np.ones(self.lanes.num_envs, dtype=bool) if until is None else until
         while len(done.results) < steps and waiting.any():

@@ -10,7 +10,8 @@ from surrogym_client.environments.env import RemoteEnv
 from surrogym_client.environments.vector import RemoteVectorEnv
 from surrogym_shared.port import SurrogatePort
 
-ENTRY_POINTS = "surrogym.ports"  # group of entry points with which the server's package steps a surrogate in process
+# Group of entry points by which the server's package offers to step a surrogate in this process.
+ENTRY_POINTS = "surrogym.ports"
 
 
 def open_file(path: str | Path) -> SurrogatePort:

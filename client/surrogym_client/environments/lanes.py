@@ -92,7 +92,7 @@ class Lanes:
         self._reason = ""
         lanes = request.num_envs
         self._observation: Floats = np.zeros((lanes, len(self.view.observation_space.low)), dtype=np.float32)
-        self._start = self._observation  # first observations of the episodes in a new session
+        self._start = self._observation  # (N, D) first observations of the lanes in the present session
         self._version: Ints = np.array(self.view.model_version, dtype=np.int64)
         self._running = _none(lanes)
         self._cut = _none(lanes)  # lanes whose episode was lost with a session, and is not yet reported as truncated
@@ -159,9 +159,15 @@ class Lanes:
     def rollout(
         self, policy: ActingPolicy, steps: int, noise: NoiseKey | None = None, until: Bools | None = None
     ) -> PolicyRollout | None:
-        """Step all lanes with a policy, in one request. Arguments are those of ``PolicyPort.rollout_policy``.
+        """Step all lanes at most ``steps`` times with a policy, in one request.
 
         Returns None if the server lost the session. Then no step was taken, and the next ``step`` ends the episodes.
+
+        Args:
+            policy: the policy.
+            steps: largest number of steps.
+            noise: key of the actions' random noise; None takes the most probable actions.
+            until: mask (N,) of lanes; the rollout stops once an episode has ended in each of them.
         """
         assert isinstance(self.port, PolicyPort)
         if not self._cut.any():
@@ -201,7 +207,8 @@ class Lanes:
         return self.port.step(self.view.id, action, mask=mask, deviations=self._deviations)
 
     def _standing(self) -> StepResult:
-        """Return the result of a step in which no lane moves: each lane repeats its last observation."""
+        """Return the result of a step in which no lane moves: each lane repeats its last observation, or the first one
+        of a new session that has reset the lane."""
         lanes, size = self._observation.shape
         return StepResult(
             observation=np.where(self._held[:, None], self._start, self._observation),

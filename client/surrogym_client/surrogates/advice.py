@@ -11,14 +11,16 @@ from surrogym_client.surrogates.phases import COMPLETED
 from surrogym_shared.environments import is_name
 from surrogym_shared.wire import DoubtfulRegion, ModelView, OutputFidelity, ReachedLimit, SurrogateView
 
-NEARLY = 0.9  # share of the target that counts as nearly reached
-MOST_STEPS = 10.0  # most real steps that a forecast may need, as a multiple of the present samples
-NOTICEABLE = 0.9  # real steps helped if they multiplied the leave-one-out error by less than this factor
-FEWEST_MODELS = 4  # fewest models from which the speed of learning is estimated
-NOISY_SLACK = 1.25  # factor on the allowed leave-one-out error once noise is confirmed
-NOISE_BAND = 1.5  # standard deviations of the noise that the server adds to a tolerance in the confidence index
-MOSTLY_NOISE = 0.8  # share of noise in the squared leave-one-out error from which more real steps hardly help
-TOLERABLE = 1e-6  # share of the leave-one-out error; if a tolerance is smaller, all initial samples had the same value
+NEARLY = 0.9  # the target counts as nearly reached if the confidence index has reached this share of it
+MOST_STEPS = 10.0  # a forecast of more real steps than this multiple of the present samples is not given
+NOTICEABLE = 0.9  # real steps helped if they lowered the leave-one-out error to less than this share of it
+FEWEST_MODELS = 4  # the speed of learning is estimated from at least this number of successive models
+NOISY_SLACK = 1.25  # if an output has confirmed noise, its leave-one-out error may be this multiple of its tolerance
+# For the confidence index, the server widens a tolerance by this many standard deviations of the noise.
+NOISE_BAND = 1.5
+MOSTLY_NOISE = 0.8  # if noise is this share of the squared leave-one-out error, more real steps hardly help
+# If the tolerance of an output is below this share of its leave-one-out error, all initial samples had the same value.
+TOLERABLE = 1e-6
 
 
 def verdict(view: SurrogateView) -> str:

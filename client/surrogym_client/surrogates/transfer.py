@@ -14,7 +14,7 @@ from surrogym_client.transport.api import Api
 from surrogym_shared.surrogate_file import RealSamples, SurrogateFile
 from surrogym_shared.wire import NewSample, SurrogateView
 
-BATCH = 1_024  # most samples in one request
+BATCH = 1_024  # largest number of samples in one request
 PURPOSES = ("initial", "adaptive", "manual", "audit", "logged", "evaluation")
 
 

@@ -22,7 +22,8 @@ R = TypeVar("R", bound=wire.Reply)
 P = TypeVar("P", wire.Uncertainty, wire.Prediction)
 
 _EVENT_SILENCE_SECONDS = 60.0
-_NUMBERS = 2_000  # most numbers in a request: each has up to 25 characters, and the server accepts 64 KiB of JSON
+# Largest count of numbers in a request: each has up to 25 characters, and the server accepts 64 KiB of JSON.
+_NUMBERS = 2_000
 _OF_ALL_POINTS = ("model_version", "outputs")
 _MODEL_FILE = "application/octet-stream"
 _BATCH_BYTES = 96 * 1024  # most bytes of samples in one request; the server accepts 128 KiB of JSON

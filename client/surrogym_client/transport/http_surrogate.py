@@ -40,7 +40,7 @@ class _Live:
     shape: Shape
     seq: int
     stream: Stream
-    window: Window | None  # last requests; None: the server never restores an older checkpoint of the session
+    window: Window | None  # the last requests; None: the server never restores an older checkpoint of the session
 
 
 class HttpSurrogate:
@@ -238,7 +238,7 @@ class HttpSurrogate:
                 if behind is None or behind >= sent.seq or returns == _RETURNS:
                     raise
                 returns += 1
-                with suppress(SeqConflict):  # restored once more; the next attempt shows from where
+                with suppress(SeqConflict):  # the server restored a checkpoint again; the next attempt finds the number
                     self._send_again(live, window, behind)
 
     def _send_again(self, live: _Live, window: Window, behind: int) -> None:

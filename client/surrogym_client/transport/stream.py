@@ -133,7 +133,7 @@ class Stream:
                 return message
 
     def _gathered(self, parts: list[bytes]) -> bytes | None:
-        """Return the message that the earlier ``parts`` and the protocol's events complete; None if it lacks parts."""
+        """Return the message that the protocol's new events complete after its earlier ``parts``; None if incomplete."""
         for event in self._protocol.events_received():
             assert isinstance(event, Frame)
             if event.opcode is Opcode.CLOSE:
@@ -152,7 +152,7 @@ class Stream:
         raise self._closed()
 
     def _feed(self, connected: socket.socket) -> None:
-        """Pass the server's answer to the handshake to the protocol."""
+        """Read from the socket, and pass the server's answer to the handshake to the WebSocket protocol object."""
         if chunk := connected.recv(CHUNK_BYTES):
             self._protocol.receive_data(chunk)
         else:

@@ -20,9 +20,9 @@ from surrogym_sampler.original.simulator import Simulated
 from surrogym_shared.spec import BoxAction, EnvironmentSpec, limits
 
 PLACES = 3  # number of states to set, and of steps in each test episode
-EXACT = 1e-6  # share of a coordinate's range; a smaller difference is rounding
+EXACT = 1e-6  # a difference below this share of a coordinate's sampling range counts as rounding
 CLOSE = 1e-2  # a state counts as set if it is read back with an error of at most this share of a coordinate's range
-FEW = 3.0  # a difference may be this multiple of the noise, which is measured in few steps only
+FEW = 3.0  # two steps count as equal if they differ by at most this multiple of the noise measured in a few steps
 
 
 class CheckFailed(StepFailed):
@@ -78,8 +78,8 @@ class Access:
 
     @property
     def can_set(self) -> bool:
-        """Whether the environment can be set to a state completely: the state is read back as requested, and the next
-        step equals the original step from this state in an episode."""
+        """Whether the environment can be set to a state completely: the state is read back as requested, and a step
+        from it gives the same result as the step that an episode took from this state."""
         if self.set_error is None or self.set_error > CLOSE:
             return False
         return self.memory_error is None or self.memory_error <= self._allowed
@@ -157,7 +157,7 @@ class _Looking:
         except StepFailed:
             if self._spec.query == "rollout":
                 raise
-            return  # an environment of step queries need not have a reset
+            return  # no reset is needed, as the specification's queries set the state (query="step")
         self._note("reset_error", self._apart(starts[0], starts[1]))
         self._note("replay_error", self._between(*episodes))
         inside = [step for step in episodes[1] if self._is_inside(step)]

@@ -42,7 +42,8 @@ from surrogym_shared.wire import PROTOCOL, StepQuery
 
 ROUND_TRIPS = 20
 NEEDS = "see docs/how-to/own-environment.md for what an environment needs"
-# Entry point group to the registry that it extends. A registry is imported only where its packages are installed.
+# The registry that each group of plug-ins (entry points) extends, as module:name. It is imported only if its package
+# is installed.
 REGISTRIES = {
     "surrogym.policy_searches": "surrogym_trainer.training.search:SEARCHES",
     "surrogym.acquisitions": "surrogym_server.sampling.acquisition:ACQUISITIONS",

@@ -27,11 +27,13 @@ Bools = NDArray[np.bool_]
 LONGEST = 5  # largest number of earlier changes or actions that is tried
 EPISODE = 20  # largest number of steps in an episode
 HELD = 4  # largest number of steps for which a random action is held
-RIDGE = 1e-6  # ridge term of the regression, relative to the inputs' variance
-ENOUGH = 0.05  # share of a change's standard deviation; with a smaller error, the history need not be longer
-SLACK = 1.2  # a history is good enough if its error is below this multiple of the smallest error
-EXPLAINED = 0.5  # share of a change's standard deviation; a regression with a larger error shows nothing
-WIDER = 1.5  # factor on a coordinate's largest observed change, which gives the range to declare for its changes
+RIDGE = 1e-6  # ridge term of the linear regression, relative to the variance of its inputs
+ENOUGH = 0.05  # a history is good enough if its error is below this share of the standard deviation of the changes
+SLACK = 1.2  # a history is also good enough if its error is below this multiple of the smallest error of all histories
+# If the error exceeds this share of the standard deviation of the changes, the regression shows nothing about
+# histories.
+EXPLAINED = 0.5
+WIDER = 1.5  # the declared largest change of a coordinate is this multiple of its largest observed change
 
 
 @dataclass(frozen=True)
@@ -44,7 +46,7 @@ class History:
         actions: number of earlier actions in the history.
         error: prediction error with this history.
         error_without: prediction error without earlier changes or actions.
-        largest: for each moving coordinate, by name, its largest observed change times ``WIDER``.
+        largest: for each moving coordinate, by name, the change to declare: ``WIDER`` times the observed one.
     """
 
     steps: int

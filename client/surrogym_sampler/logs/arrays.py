@@ -1,5 +1,5 @@
-"""Conversion of a file's arrays to the columns of a log, with one row per step. Other arrays are ignored, with the
-reason."""
+"""Conversion of a file's arrays to the columns of a log, with one row per step. Other arrays are ignored, and the
+reason is kept."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ from surrogym_shared.words import listed
 MINARI_FILE = "main_data.hdf5"  # file of a Minari data set that contains its arrays
 Format = Literal["csv", "npz", "parquet", "hdf5", "minari", "surrogate"]
 
-MOST_BYTES = 1024**3  # largest total size of the arrays in an NPZ file
+MOST_BYTES = 1024**3  # largest total size of the arrays of a log, in bytes
 HDF5 = b"\x89HDF\r\n\x1a\n"
 # First entry of a zip file that is not an NPZ, and what the file is.
 OFFICE = {

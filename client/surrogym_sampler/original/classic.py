@@ -232,7 +232,7 @@ def _write_cartpole(env: Native, coordinates: Array) -> None:
 
 def _write_cartpole_of_the_paper(env: Native, coordinates: Array) -> None:
     _write_state(env, coordinates)
-    # with 1, Gymnasium counts the pole as fallen before, and pays 0 outside the limits, as in eq. 17 of the paper
+    # 1: the pole counts as fallen already, so that Gymnasium gives the reward 0 outside the limits (the paper's eq. 17)
     env.steps_beyond_terminated = 1
 
 

@@ -23,9 +23,10 @@ class Moment:
     reward: float
     terminated: bool
     coordinates: Array  # (C,) state after the step
-    truncated: bool = False  # whether the environment itself ended the episode without termination
+    # Whether the environment itself ended the episode before a terminal state, as by a time limit.
+    truncated: bool = False
     applied: Array | None = None  # (F,) applied action, if it may differ from the requested one
-    fell_back: bool = False  # whether the limits' fallback replaced the requested action
+    fell_back: bool = False  # whether the fallback controller's action replaced the requested one
 
 
 class Episode(ABC):
@@ -52,8 +53,8 @@ class Episode(ABC):
         """Apply an action (F,), and return the result."""
 
     def resume(self, coordinates: Array) -> None:  # noqa: B027
-        """Let the episode continue at coordinates (C,) after a step that failed, where it would not continue by
-        itself."""
+        """Continue the episode at coordinates (C,) after a failed step, so that the fallback controller can act. By
+        default, nothing is done, because the episode continues by itself."""
 
     @abstractmethod
     def perturb(self, rng: np.random.Generator, sigma: float) -> None:

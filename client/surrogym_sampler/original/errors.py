@@ -25,7 +25,7 @@ import os
 import traceback
 
 MORE_TIME = "a larger --step-limit gives it more time"
-# what the code of a user's environment may raise; KeyboardInterrupt is the user's own and passes through
+# Errors of a user's environment that are caught. KeyboardInterrupt is not: the user pressed Ctrl-C.
 RAISED = (Exception, SystemExit)
 
 
@@ -135,7 +135,7 @@ def message_of(error: BaseException) -> str:
 
 def sentence(error: BaseException) -> str:
     """Describe an exception of a user's environment: its type, its message, and the line that raised it."""
-    # the package's own errors are complete sentences, and their line would not help the environment's author
+    # An error of Surrogym is a complete sentence already; the line that raised it would not help the user.
     if isinstance(error, OriginalError):
         return message_of(error)
     frame = traceback.extract_tb(error.__traceback__)[-1:]

@@ -10,7 +10,7 @@ from surrogym_sampler.original.executables import is_executable
 from surrogym_sampler.original.periods import is_other
 from surrogym_shared.spec import BoxAction, DiscreteAction, EnvironmentSpec
 
-ROUNDING = 1e-6  # share of a limit by which a value may exceed it; float32 rounds by less
+ROUNDING = 1e-6  # a value may exceed a limit by this share of the limit, because float32 rounds
 
 Range: TypeAlias = tuple[float, float]
 

@@ -52,7 +52,8 @@ class IsolatedEnvironment:
         self._factory = factory
         self._step_limit = step_limit
         self._number = 0  # number of the last request
-        self._rest_seconds = 0.0  # that closing may take longer, because the fallback of limits acts
+        # Additional seconds for closing, in which the fallback controller brings the machine to rest.
+        self._rest_seconds = 0.0
         self._process: BaseProcess | None = None
         self._pipe: Connection | None = None
 
@@ -82,7 +83,8 @@ class IsolatedEnvironment:
     def close(self) -> None:
         """Let the environment finish its step and close. If that takes too long, or at Ctrl-C, its process is killed.
 
-        A process whose fallback may act is not killed at Ctrl-C: it brings the machine to rest, closes and ends.
+        If the specification has a fallback controller, Ctrl-C does not kill the process: the controller brings the
+        machine to rest, then the process ends by itself.
         """
         try:
             if self._pipe is not None and self._process is not None and self._process.is_alive():
@@ -122,7 +124,8 @@ class IsolatedEnvironment:
             raise value
         if ok is None:
             assert self._process is not None
-            self._process.join(self._step_limit + self._rest_seconds + CLOSE_LIMIT)  # the child closes before it exits
+            # Wait, because the child closes its environment before it exits.
+            self._process.join(self._step_limit + self._rest_seconds + CLOSE_LIMIT)
             self._kill()
             raise EnvironmentDied(
                 f"the environment ended its process during {method}: {value}; let it raise an exception"
@@ -241,7 +244,7 @@ def _serve(pipe: Connection, factory: Factory, step_limit: float) -> None:
         return  # the parent has ended
     finally:
         if not closed:
-            with working:  # a second SIGTERM does not interrupt the fallback of limits
+            with working:  # so that a second SIGTERM does not interrupt the fallback controller
                 environment.close()
 
 

@@ -168,8 +168,8 @@ def specification(name: str) -> EnvironmentSpec:
 
 def fits(noted: str, name: str) -> bool:
     """Return whether the specification of the environment ``noted`` may be used for the environment ``name``, which an
-    adapter opens. It may if both names stand for the same environment, and this is built in or has no specification of
-    its own."""
+    adapter opens. It may if both names stand for the same environment, and this environment is built in or has no
+    specification of its own."""
     return is_same(noted, name) and (is_known(name) or not has_specification(name))
 
 

@@ -100,7 +100,7 @@ class ResettableEnvironment(Protocol):
         ...
 
     def coordinates(self, observation: Any) -> ArrayLike:
-        """Return the coordinates, without lags, that an observation shows."""
+        """Return the coordinates that an observation shows, without those that repeat earlier values (lags)."""
         ...
 
     def close(self) -> None:

@@ -88,7 +88,7 @@ class FromReset:
         )
 
     def resume(self, coordinates: Array) -> None:
-        """Let an episode continue at coordinates (C,) after a step that failed: the fallback of limits still acts."""
+        """Continue the episode at coordinates (C,) after a failed step, so that the fallback controller can act."""
         self._at = coordinates
 
     def save(self) -> bytes:

@@ -15,7 +15,7 @@ VELOCITY = "_velocity"
 AXES = ("x", "y", "z")
 QUATERNION = ("qw", "qx", "qy", "qz")
 FREE, BALL, SLIDE, HINGE = range(4)  # numbers of MuJoCo's joint types (mjtJoint)
-RESETS = 4  # number of resets that are compared to find what they draw into a model
+RESETS = 4  # number of resets that are compared to find the entries of a model that a reset draws
 # fields of a MuJoCo model that tasks draw at random at a reset
 DRAWN = ("body_pos", "geom_pos", "geom_size", "site_pos")
 
@@ -169,7 +169,7 @@ class Attribute(StatePart):
         else:
             numbers = [_like(old, new) for old, new in zip(before, values.tolist(), strict=True)]
             made = type(before)(*numbers) if hasattr(before, "_fields") else type(before)(numbers)
-            # assigned as a whole, because a tuple can't be changed in place
+            # the attribute is replaced, because a tuple can't be changed in place
             setattr(self._owner, self._attribute, made)
 
 

@@ -21,19 +21,20 @@ from surrogym_sampler.priors.parameters import Parameter
 from surrogym_shared.spec import EnvironmentSpec
 
 FEWEST = 2  # smallest number of real steps
-STARTS = 5  # largest number of starting points; the first is the simulator's own values
-EXPECTED = 1e-3  # share of the coordinates' changes; with a smaller error no further starting point is tried
-EDGE = 0.01  # share of a range: smallest distance of a starting point from the range's ends
-SMALLEST = 1e-9  # share of the coordinates' changes; a smaller error counts as rounding
-FAR = 1e3  # error of a step that the simulator can't take, in standard deviations of the changes
+STARTS = 5  # largest number of starting points of the fit; the first one is the simulator's own values
+EXPECTED = 1e-3  # if the error is below this share of the coordinates' changes, no further starting point is tried
+EDGE = 0.01  # the first starting point is at least this share of a parameter's range away from the ends of the range
+SMALLEST = 1e-9  # an error below this share of the coordinates' changes counts as rounding
+FAR = 1e3  # error that counts for a step which the simulator can't take, in standard deviations of the changes
 CONFIDENCE = 0.9  # probability of each parameter's interval
-NUDGE = 1e-5  # share of a parameter's range: step size of numerical derivatives
+NUDGE = 1e-5  # step size of numerical derivatives, as a share of a parameter's range
 WITHIN = 0.29  # standard deviation of a uniform distribution as a share of its range: the prior of a parameter
-FINEST = 1e-7  # smallest standard deviation of a parameter, as a share of its range; the fit is no more precise
-# the steps don't determine a direction of the parameters whose eigenvalue is below this share of the largest
+FINEST = 1e-7  # smallest stated standard deviation of a parameter, as a share of its range: the fit's own precision
+# If the eigenvalue of a combination of parameters is below this share of the largest one, the real steps don't
+# determine this combination.
 ROUNDING = 1e-14
 FIT: dict[str, Any] = {"bounds": (0.0, 1.0), "x_scale": 0.3, "ftol": 1e-12, "xtol": 1e-12, "gtol": 1e-12}
-LEAST_SHARE = 1e-3  # share of the largest error; a coordinate with a smaller error gets no larger weight
+LEAST_SHARE = 1e-3  # coordinates whose errors are below this share of the largest error all get the same weight
 
 # One step of a simulator: parameters (P,), coordinates (C,) and action (F,) to next coordinates (C,).
 Step = Callable[[Array, Array, Array], Array]
@@ -103,8 +104,8 @@ def calibrate(
         step: takes one step of the simulator; if it raises, the step counts as very wrong.
 
     Raises:
-        NotCalibrated: there are fewer measured numbers than parameters, or the simulator can't take half of the steps
-            with its own values.
+        NotCalibrated: the steps measure no more numbers than there are parameters, or the simulator fails in more than
+            half of the steps with its own values.
     """
     if len(real) < FEWEST:
         raise NotCalibrated(f"expected at least {FEWEST} real steps for a calibration, got {len(real)}: take more")
@@ -238,8 +239,8 @@ def _with_intervals(
     off = errors(scaling.values(x))
     weights, rows = _weights(off), len(off)
     jacobian = np.stack([((_moved(errors, scaling, x, i) - off) * weights / NUDGE).ravel() for i in range(len(x))], 1)
-    # degrees of freedom of a single coordinate; those of all would be too many, because the weights come from the same
-    # steps
+    # Degrees of freedom of one coordinate. Those of all coordinates would be too many, because the weights are computed
+    # from the same steps.
     left = max(1.0, rows - len(parameters) / errors.moving)
     variance = float(((off * weights) ** 2).sum()) / errors.moving / left
     size, axes = np.linalg.eigh(jacobian.T @ jacobian)

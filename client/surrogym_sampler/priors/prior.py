@@ -22,18 +22,18 @@ from surrogym_shared.spec import BoxAction, EnvironmentSpec
 from surrogym_shared.surrogate_file import SurrogateFile
 from surrogym_shared.wire.priors import CalibratedParameter, PriorAbout
 
-BY_INPUT = 50  # number of simulated steps for each coordinate and action entry
-FEWEST, MOST = 100, 400  # smallest and largest number of simulated steps
+BY_INPUT = 50  # default number of simulated steps to learn from, for each coordinate and action entry
+FEWEST, MOST = 100, 400  # smallest and largest default number of simulated steps
 WORSE = 1.5  # if the error on the real steps so far exceeds this multiple of the calibration's error, calibrate again
-AGAIN = 2  # factor by which the number of real steps must grow before the parameters are calibrated again
+AGAIN = 2  # the parameters are calibrated again when there are this many times the steps of the last calibration
 TRIALS = 5  # number of steps that test whether a simulator works
-RIGHT = 1e-3  # an error of the simulator below this share of the coordinates' changes is small enough
+RIGHT = 1e-3  # if the simulator's error is below this share of the coordinates' changes, its parameters are kept
 
 Progress = Callable[[float | None, str], None]
 
 
 def silent(share: float | None, words: str) -> None:
-    """Ignore the progress."""
+    """Do nothing: the default callback for progress."""
     del share, words
 
 

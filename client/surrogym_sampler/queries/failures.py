@@ -7,9 +7,10 @@ from collections.abc import Iterable
 
 from surrogym_sampler.original.errors import MachineFails
 
-FIRST_FEW = 4  # different failed queries after which a machine that has never answered counts as broken
-MANY = 8  # different failed queries in a row after which a machine that has answered before counts as broken
-FIRST_DELAY, LONGEST_DELAY = 1.0, 30.0  # seconds to wait after a failure, doubled with each further one
+FIRST_FEW = 4  # a machine that has never answered counts as broken after this number of different failed queries
+MANY = 8  # a machine that has answered before counts as broken after this number of failed queries in a row
+# Wait in seconds after a failure: the first, doubled with each failure, to the longest.
+FIRST_DELAY, LONGEST_DELAY = 1.0, 30.0
 
 
 class Failures:

@@ -12,7 +12,7 @@ from typing import Generic, TypeVar
 from surrogym_client.errors import SurrogymClientError
 from surrogym_shared.wire import ClaimedQueries
 
-HELD_SECONDS = 1.0  # longest time in seconds that a query claimed ahead waits for the end of the running step
+HELD_SECONDS = 1.0  # a query claimed ahead is returned if the running step does not end within these seconds
 LEAD = 3.0  # a claim ahead starts this multiple of an answer's duration before the expected end of the step
 
 S = TypeVar("S")
@@ -61,7 +61,8 @@ class ClaimAhead:
     def _run(self) -> ClaimedQueries | None:
         if self._over.wait(self._after):
             return None
-        # a failed claim is repeated after the step; queries whose return fails come back when their leases end
+        # Errors are ignored: a failed claim is repeated after the step, and unreturned queries come back when their
+        # leases end.
         with suppress(SurrogymClientError):
             claimed = self._claim()
             if claimed.queries and self._over.wait(HELD_SECONDS):

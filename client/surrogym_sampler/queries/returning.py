@@ -27,7 +27,7 @@ from surrogym_shared.spec import EnvironmentSpec, limits
 
 SKIPPED = "the design chooses another query, and surrogym doctor --env ENVIRONMENT checks save and restore"
 MOST_HANGS = 2  # number of time-outs of `save` in a row after which no state is saved; a single one may be chance
-ELSEWHERE = 0.01  # share of a sampling range; a restored state that differs by more is reported
+ELSEWHERE = 0.01  # a restored state is reported if it differs by more than this share of a sampling range
 
 
 @runtime_checkable
@@ -81,7 +81,7 @@ class Returning:
                 self._restore(name)
             except (StepTimedOut, EnvironmentDied):
                 if not self._resets():
-                    raise  # the environment itself is at fault, not the snapshot
+                    raise  # the environment can't be reset either, so the snapshot is not at fault
                 self._restore_again(name)
         except SnapshotGone:
             self._folder.drop(name)

@@ -21,7 +21,7 @@ FORM = 1  # version of the format of snapshot files
 ENDING = ".snapshot"
 UNFINISHED = ".part"
 ABANDONED_SECONDS = 60.0  # seconds without a change after which an unfinished file counts as abandoned by its writer
-LONGEST_HEAD = 1 << 16  # largest number of bytes of a file's first line
+LONGEST_HEAD = 1 << 16  # largest number of bytes of a snapshot file's first line, which describes the snapshot
 
 Array = NDArray[np.float64]
 

@@ -1,4 +1,4 @@
-"""A query as lines for a person: where it begins, and a small picture of its actions."""
+"""Description of a query in lines of text: the state where it begins, and a bar for the size of each action."""
 
 from __future__ import annotations
 

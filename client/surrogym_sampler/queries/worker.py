@@ -35,7 +35,7 @@ from surrogym_shared.wire import ClaimedQueries, NewSample, Phase, Query, StepQu
 # Retries of a request while the server or its storage does not answer.
 PATIENCE = Retries(seconds=900.0, first_delay=0.1, longest_delay=5.0)
 LOOK_SECONDS = 0.1  # seconds between two checks by a waiting sampler of whether it was stopped
-LAST_SECONDS = 5.0  # seconds in which a stopped sampler retries to send its last real step
+LAST_SECONDS = 5.0  # a stopped sampler tries for these seconds to send its last real step
 END_SECONDS = 2.0  # longest wait of a claim, in seconds, if the sampler has to end with the design
 AGAIN_SECONDS = 1.0  # seconds to wait after a claim with no query that the environment allows
 MOST_GONE = 1_000  # largest number of deleted snapshots in one report to the server
@@ -133,7 +133,7 @@ class Sampler:
         self._pipeline = Pipeline(self._settle, self._return)
         self._started = time.monotonic()
         self._broken_off = False  # whether an error or Ctrl-C ended the run
-        self._stopping = False  # not an Event, because setting one in a signal handler can deadlock
+        self._stopping = False  # a bool, because setting a threading.Event in a signal handler can deadlock
 
     def stop(self) -> None:
         """Let ``run`` end after the running step. Call this from another thread or a signal handler.
@@ -249,7 +249,7 @@ class Sampler:
     def _step(self, query: Query) -> _Answer:
         taken: list[NewSample] = []
         error, for_good = "", False
-        outcome: Outcome = "failed"  # the outcome if no step is taken
+        outcome: Outcome = "failed"  # unless a real step is taken, or another reason is found
         try:
             check_query(self._own, query)
             if self._approve is not None and not self._approve(query):

@@ -1,4 +1,4 @@
-"""Checks of leases, late answers and idempotency keys, before there is a model."""
+"""Checks of a server that has no model yet: leases of queries, late samples, and repeated requests."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Checks of sessions: seq, seeds, autoreset, spaces, ends of episodes, errors and transports."""
+"""Checks of a server's sessions: numbered requests, seeds, autoreset, spaces, ends of episodes, errors, transports."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from surrogym_shared.wire import OpenSession
 
 BACK = [[-1.0], [-1.0]]
 ON_AND_BACK = [[1.0], [-1.0]]  # actions that end the episode of the first lane, not of the second
-ROLLED = 5  # number of steps in a rollout; an episode is shorter, so that the rollout contains a reset
+ROLLED = 5  # number of steps in a tested rollout: more than an episode has, so that the rollout contains a reset
 
 
 def the_same_seq_and_body_get_the_same_reply(target: Target) -> None:

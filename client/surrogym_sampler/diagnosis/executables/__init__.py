@@ -50,5 +50,5 @@ def _outcome(check: Callable[[Subject], None], way_out: str, subject: Subject) -
 
 
 def _own(error: Exception) -> str:
-    """Return an error's message without the advice to run this check, which is running already."""
+    """Return an error's message without the advice to run the checks of this module, because they run already."""
     return str(error).removesuffix(f"; {CHECK}")

@@ -18,8 +18,10 @@ from surrogym_shared.spec import Fixed, limits
 
 PLACES = 3  # number of random states in a check
 SEEDS = 5
-WANDERING = 5  # number of steps that lead away from a state
-TINY = 1e-6  # share of a range; Python writes such a number with an exponent, which the program must be able to read
+WANDERING = 5  # number of random steps between two steps that are compared
+# A state with coordinates of this share of their ranges is tested. Python writes such a number with an exponent, which
+# the program must be able to read.
+TINY = 1e-6
 
 
 def a_reset_without_a_seed_gives_a_state(subject: Subject) -> None:

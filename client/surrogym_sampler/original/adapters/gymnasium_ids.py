@@ -26,10 +26,10 @@ from surrogym_sampler.original.state_parts import (
     mujoco_parts,
 )
 
-# environments of this package are opened without consent if a server names them, so the package must be the installed
-# one: the working directory is not searched
+# Environments of the package ROBOTICS are opened without consent if a server names them. So only an installed package
+# is used: the working directory is not searched.
 ROBOTICS = "gymnasium_robotics"
-# spaces whose values are not numbers that change gradually
+# Observation spaces that can't be used, because their values are not numbers that change gradually.
 SYMBOLS = ("Discrete", "MultiDiscrete", "MultiBinary", "Text", "Graph", "Sequence")
 STEP = ("observation", "reward", "terminated", "truncated", "info")
 
@@ -141,7 +141,8 @@ class GymnasiumSimulator(_Gymnasium, OfParts):
         self.reset(0)
 
     def write(self, state: Array) -> None:
-        # Gymnasium allows no step after an episode has ended; CartPole, for example, would pay 0 for a fall.
+        # Gymnasium allows no step after an episode has ended: CartPole, for example, would then give the reward 0.
+        # So the environment is reset first.
         if self._over:
             self.reset(None)
         super().write(state)

@@ -20,8 +20,8 @@ from surrogym_shared.spec import EnvironmentSpec, Inequality, Term
 from surrogym_shared.terms import evaluate, holds
 
 LEVEL = 1e-5  # points have the same value (level) of a quantity if they differ by at most this share of its range
-SHARED = 2  # smallest number of boundary points of a face, on which a quantity has one value
-SURE = 3  # smallest number of points that have the same value (level) of a quantity not by chance
+SHARED = 2  # boundary points form a face of the box if at least this number of them share the value of a quantity
+SURE = 3  # if at least this number of points share the value (level) of a quantity, this is not by chance
 MOST_FACES = 6
 # smallest share of the boundary points that must lie on faces of the box; the others may be where the state jumps, as
 # at a contact

@@ -33,8 +33,8 @@ from surrogym_shared.spec import (
     limits,
 )
 
-MOSTLY = 0.5  # share of steps with the same reward, above which other rewards are found only by luck
-PLACES = 300  # number of random states whose observation is read, without a step
+MOSTLY = 0.5  # if this share of the random steps has the same reward, a person is asked to declare the reward
+PLACES = 300  # number of random states that are set to read their observations; no step is taken
 UNKNOWN_LIMIT = 200  # assumed time limit of an episode, if the simulator has none
 
 

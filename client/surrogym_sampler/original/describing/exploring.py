@@ -18,11 +18,11 @@ from surrogym_shared.spec import BoxAction, DiscreteAction
 from surrogym_shared.spec.actions import Action
 
 STEPS = 400
-EPISODES = 4  # number of episodes among which the steps are divided, if none ends early
+EPISODES = 4  # number of random episodes that share the steps, if no episode ends early
 RESETS = 32  # number of resets that show the range of start states
 LONGEST_HOLD = 10  # largest number of steps for which an action is held
-ROUNDING = 1e-9  # share of a variable's largest value, or of 1 if that is larger; a smaller change is rounding
-FEWEST_EQUAL = 3  # smallest number of episodes of the same length that show a time limit
+ROUNDING = 1e-9  # a variable that varies by less than this share of its largest value (at least 1) counts as constant
+FEWEST_EQUAL = 3  # if at least this number of episodes ended, all after the same number of steps, there is a time limit
 PLACES_TRIED = 20  # number of random positions from which a start without contacts is chosen
 
 
@@ -140,7 +140,8 @@ def _far_from(counted: Counted, visited: Array, state: Array, rng: np.random.Gen
         if counted.touches():
             continue
         shares = (visited[:, at] - placed[at]) / np.maximum(high - low, 1e-12)
-        shares = np.where(turns[at], shares - np.round(shares), shares)  # distance of angles by the shorter way round
+        # Angles differ by the shorter way around the circle.
+        shares = np.where(turns[at], shares - np.round(shares), shares)
         distance = float(np.sqrt((shares**2).sum(1)).min())
         if distance > farthest:
             best, farthest = counted.read(), distance

@@ -15,8 +15,8 @@ from surrogym_shared.spec import EnvironmentSpec, ObservationEntry, Term
 from surrogym_shared.terms import evaluate
 
 TOLERANCE = 1e-7  # largest error of a term that expresses an observation entry, as a share of the entry's largest value
-DIGITS = 6  # decimal digits of a rounded weight, which is used if it still explains the entry
-FEW_TURNS = 4  # largest number of angles with which sums of three angles are tried as well
+DIGITS = 6  # weights rounded to this number of decimals are preferred, if they still give the observation exactly
+FEW_TURNS = 4  # with at most this number of angles, the cosine and sine of sums of three angles are tried as well
 CLIPPED = 0.02  # an entry counts as clipped if more than this share of the states has its smallest or largest value
 
 

@@ -61,7 +61,7 @@ def known_reward(
 
 @dataclass(frozen=True)
 class _Anywhere:
-    """Real steps from random states, which the simulator is set to."""
+    """Draws random states and actions, sets the simulator to the states, and takes a real step from each."""
 
     counted: Counted
     kept: list[int]

@@ -19,15 +19,15 @@ from surrogym_sampler.original.protocol import Array
 from surrogym_sampler.original.simulator import Taken
 
 PLACES = 4  # number of states in each test
-EXACT = 1e-6  # share of a variable's observed range; a smaller difference is rounding
+EXACT = 1e-6  # a difference below this share of a variable's observed range counts as rounding
 # Setting a state works if a step after it differs from the one that an episode took there by at most this share of each
 # variable's observed range.
 SETTABLE = 1e-3
-FEW = 3.0  # a difference may be this multiple of the noise, which is measured in few steps only
+FEW = 3.0  # two steps count as equal if they differ by at most this multiple of the noise measured in a few steps
 FARTHEST = 3.0  # largest shift of a position in a test, in the simulator's unit
 TURN = 2 * np.pi
-PART = 1.0  # shift of a variable by a part of a turn, in radians
-ANYWHERE = 32  # number of states within the limits from which a step is taken
+PART = 1.0  # shift in radians, less than a turn, that must change something if a variable is an angle
+ANYWHERE = 32  # number of random states within the limits from which a step tests whether states stay inside
 
 
 @dataclass(frozen=True)
@@ -158,7 +158,8 @@ class _Shifted:
         for shift in (TURN, -2 * TURN):
             for alike in self._compared(index, shift):
                 if not (alike.itself and alike.others):
-                    return False  # not an angle, so no steps from the other states are needed
+                    # One difference shows that the variable is no angle, so the remaining steps are left out.
+                    return False
                 whole.append(alike.shown)
         part = list(self._compared(index, PART))
         return not all(alike.others for alike in part) or (all(whole) and not all(alike.shown for alike in part))
@@ -188,9 +189,8 @@ class _Shifted:
 def _leaving(counted: Counted, seen: Seen, rng: np.random.Generator) -> float:
     """Return the share of steps from random states within declared limits that lead far outside of them.
 
-    Every second state is a corner of the limits, because a state that runs away most likely does so at an extreme.
-
-    Mechanical variables are not tested: their limits are those of joints.
+    Every second state is a corner of the limits, because a state that runs away most likely does so at an extreme. If
+    the simulator has mechanical variables, no step is taken and 0 is returned: limits are then the stops of joints.
     """
     simulator = counted.simulator
     limited = [i for i, v in enumerate(simulator.variables) if v.motion == "other" and v.limited]

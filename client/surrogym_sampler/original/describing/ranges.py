@@ -15,10 +15,11 @@ from surrogym_sampler.original.protocol import Array
 from surrogym_sampler.original.simulator import Simulator
 from surrogym_shared.spec import Coordinate, Fixed, Uniform, limits
 
-FASTER = 1.5  # factor on the largest observed speed, because a policy may be faster than random actions
-MARGIN = 0.25  # margin on each side of the observed range, as a share of it
+FASTER = 1.5  # largest speed as a multiple of the observed one, because a policy may be faster than random actions
+MARGIN = 0.25  # the sampling range exceeds the observed range by this share of it on each side
 SINGLE = 1e-6  # relative rounding error of an observation in single precision
-# share of the distance between two stops; a joint that moves more in a step may meet a stop from anywhere
+# If a joint moves more than this share of the distance between its two stops in one step, it may meet a stop from
+# anywhere. Its sampling range then includes the stops.
 SHORT_WAY = 0.05
 UNKNOWN_SPEED = 1.0  # assumed largest speed of a variable that never moved, in the simulator's unit
 
@@ -100,7 +101,7 @@ class Ranges:
         if variable.motion == "speed":
             fastest = FASTER * max(abs(low), abs(high)) or UNKNOWN_SPEED
             return -fastest, fastest
-        # whether actions move the object only indirectly; its limits may then be far from its usual positions
+        # An object that no actuator drives is pushed by others. Its limits may be far from its usual positions.
         pushed = variable.motion == "slide" and not variable.driven
         trusted = not pushed and (self._probed.stays or constant)
         if variable.low is not None and variable.high is not None and trusted:

@@ -26,11 +26,13 @@ from surrogym_shared.spec.base import MAX_TERM_PARTS
 from surrogym_shared.spec.terms import Part
 from surrogym_shared.terms import evaluate
 
-MOST = 120  # largest number of coefficients of a fit
-ENOUGH = 1.5  # smallest number of steps for each coefficient of a fit
-MOSTLY = 0.9  # share of steps that a reward must explain; the others may depend on a schedule that is not in the state
-TRIMS = 5  # number of repeated fits, each to the steps that the previous fit explained best
-NOTHING = 1e-10  # size below which a term is rounding, as a share of the reward's range
+MOST = 120  # no quadratic reward is fitted if it has more than this number of coefficients
+ENOUGH = 1.5  # a quadratic reward is fitted only to at least this number of steps for each of its coefficients
+# A quadratic reward is possible if it gives the rewards of this share of the steps exactly. The other steps may depend
+# on a schedule that is not in the state.
+MOSTLY = 0.9
+TRIMS = 5  # number of successive fits of a quadratic reward, each to the steps that the previous fit explained best
+NOTHING = 1e-10  # a term of a fitted reward below this share of the reward's range is rounding, and is left out
 
 Timing = Literal["after", "before"]
 

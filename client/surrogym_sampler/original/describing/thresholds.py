@@ -27,20 +27,21 @@ from surrogym_sampler.original.protocol import Array
 from surrogym_shared.spec import DeclaredReward, EnvironmentSpec, Inequality, Quantity, RewardTerm, Term
 from surrogym_shared.terms import evaluate
 
-SEEK = 200  # largest number of steps from random states to find a second value of the reward
+SEEK = 200  # largest number of steps from random states in the search for a second value of the reward
 BATCH = 12
-ENOUGH = 4  # number of steps with the rarer value of the reward that are enough to start bisections
-POINTS = 12  # number of boundary points: twice the unknowns of an ellipsoid of three entries
+ENOUGH = 4  # bisections begin once this number of steps has the rarer one of the two reward values
+POINTS = 12  # number of boundary points to find: twice the unknowns of an ellipsoid in three dimensions
 HALVINGS = 24
-COARSE = 10  # number of first halvings of a bisection; their steps are far enough from the boundary to test its form
-NEAR = 0.02  # share of the range of states by which the end of a bisection moves to find a neighbouring point
+COARSE = 10  # the first steps of a bisection, this many, are far enough from the boundary to test a formula of it
+# To find a neighbour of a boundary point, one end of its bisection moves by this share of the states' range.
+NEAR = 0.02
 FLAT = 1e-3  # a singular value below this share of the largest means that the points lie on more than one ellipsoid
-MOST = 5_000  # largest number of groups of entries that are tried
+MOST = 5_000  # largest number of groups of terms in which a level or an ellipsoid is searched
 READS: dict[Timing, Callable[[Paid], Array]] = {"after": Paid.after, "before": Paid.before}
 
-# Takes steps from states (n, C) with actions (n, F), and returns those that don't end an episode.
+# Function that takes steps from states (n, C) with actions (n, F), and returns those that don't end an episode.
 Steps = Callable[[Array, Array], Paid]
-# Draws n random states (n, C) and actions (n, F).
+# Function that draws n random states (n, C) and n random actions (n, F).
 Drawn = Callable[[int], tuple[Array, Array]]
 
 
@@ -135,12 +136,13 @@ class _Boundary:
     """
 
     def __init__(self, steps: Paid, explored: int, rare: NDArray[np.bool_], step: Steps) -> None:
-        # ``points``: the steps next to the boundary; ``passed``: earlier steps of their bisections
+        # ``points``: the steps next to the boundary; ``passed``: the first, coarse steps of the bisections that led
+        # there
         self.points = self.passed = steps.at(slice(0))
         self._steps, self._step = steps, step
         self._ends: list[tuple[Paid, Paid]] = []  # the two ends of the bisection that found each point
         few, others = ([steps.one(i) for i in _spread(np.flatnonzero(of), explored)] for of in (rare, ~rare))
-        self._paired = 0  # number of points for which a neighbour was found or tried
+        self._paired = 0  # for this number of the first points, neighbours were already searched
         self._pairs = ((few[n % len(few)], others[(n + n // len(few)) % len(others)]) for n in itertools.count())
 
     def more(self) -> Paid:

@@ -6,7 +6,7 @@ import math
 import subprocess
 
 SHELL = "/bin/sh"
-# The pipe to the shell's input closes when this process ends; then `read` returns.
+# `read` returns when this process ends, which closes the pipe to the shell's input. $1: grace seconds, $0: the group.
 SCRIPT = 'read -r _; sleep "$1"; kill -s KILL -- "-$0"'
 
 

@@ -22,7 +22,7 @@ from surrogym_shared.spec.actions import Action
 PROTOCOL = 1
 LONGEST_LINE = 1 << 24  # largest number of bytes of a line, without its end
 SHOWN = 80  # largest number of characters of a line in an error
-SHOWN_ERROR = 400  # largest number of characters of the program's error message in our error
+SHOWN_ERROR = 400  # largest number of characters of the program's own error message in an error
 CHECK = "surrogym conformance --exec COMMAND checks the program"
 
 Reply = dict[str, Any]

@@ -23,7 +23,7 @@ from surrogym_sampler.original.executables.messages import LONGEST_LINE, Reply, 
 from surrogym_sampler.original.executables.standard_error import StandardError
 
 GRACE_SECONDS = 30.0  # seconds that a running step may still take after this process was killed
-END_SECONDS = 2.0  # seconds to wait after the request to close, and again after SIGTERM
+END_SECONDS = 2.0  # seconds to wait for the program's end after the request to close, and again after SIGTERM
 CHUNK = 1 << 16  # largest number of bytes read at once
 
 

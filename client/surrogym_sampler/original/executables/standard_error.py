@@ -10,7 +10,7 @@ from typing import IO
 OWN = 2  # file descriptor of this process's standard error
 TAIL = 4096  # number of last bytes of the program's standard error that are kept
 SHOWN = 200  # largest number of characters of the last line in an error
-PATIENCE = 0.1  # seconds that this process's standard error has to accept a piece
+PATIENCE = 0.1  # a piece of output is dropped if this process's standard error does not accept it within these seconds
 LAST_SECONDS = 1.0  # seconds to read the output of an ended program; a process that it started may hold the pipe open
 
 

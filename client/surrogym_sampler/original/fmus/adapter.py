@@ -29,8 +29,10 @@ from surrogym_shared.spec import MAX_DIMENSIONS, BoxAction, EnvironmentSpec
 from surrogym_shared.spec.base import REWARD
 
 UNKNOWN_LIMITS = (-1.0, 1.0)  # assumed limits of an input that declares none
-SAME = 1e-9  # largest relative error of a value that counts as set
-SHIFT = 0.05  # share of a variable's limits, or of 1, by which its start is shifted to test whether it can be set
+SAME = 1e-9  # a variable counts as set if it is read back with at most this relative error
+# To test whether a variable can be set, its start is shifted by this share of the width of its limits (2 without
+# limits).
+SHIFT = 0.05
 MOTIONS: dict[str | None, Motion] = {"rad": "turn", "rad/s": "speed", "m/s": "speed"}
 
 
@@ -82,7 +84,7 @@ class Fmu(SavingSimulator):
             raise
 
     def reset(self, seed: int | None) -> Array:
-        del seed  # an FMU draws no start
+        del seed  # the seed has no effect, because an FMU draws no random start
         self._process.initialise()
         return self.observe()
 
@@ -114,7 +116,8 @@ class Fmu(SavingSimulator):
         return np.array(action, dtype=np.float64)
 
     def with_specification(self, spec: EnvironmentSpec, *, shows_own: bool, step_limit: float) -> Simulated:
-        del shows_own  # Outputs may depend on the last input, so a policy observes what the specification declares.
+        # Ignored: an FMU's outputs may depend on the last input, so a policy observes what the specification declares.
+        del shows_own
         self._process.step_limit = step_limit
         return FmuEnvironment(self, spec)
 
@@ -124,7 +127,7 @@ class Fmu(SavingSimulator):
         )
 
     def _why_fixed(self) -> str:
-        """Return why the state can't be set; empty if a shifted start could be set and read back."""
+        """Return the reason why the FMU's state can't be set; empty if a shifted start could be set and read back."""
         if calculated := [v.name for v in self._state if not v.can_start]:
             return f"the FMU calculates {', '.join(calculated)}, which has no start to set, so it can only be reset"
         wanted = np.array([_shifted(v, at) for v, at in zip(self._state, self.rest, strict=True)])

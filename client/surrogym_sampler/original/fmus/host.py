@@ -124,7 +124,7 @@ class Host:
 
     def _values(self) -> Fields:
         values = self._open_instance.read(self._reads)
-        # by name, because a variable that is both state and output is read twice
+        # a dictionary, because a variable that is both state and output is read twice but reported once
         named = dict(zip(self._names, values, strict=True))
         wrong = [f"{name} is {value}" for name, value in named.items() if not math.isfinite(value)]
         if wrong:

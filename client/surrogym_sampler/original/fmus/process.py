@@ -31,7 +31,7 @@ from surrogym_sampler.original.fmus.archive import Archive, Declared
 from surrogym_sampler.original.fmus.choices import Value
 from surrogym_sampler.original.protocol import Array
 
-START_LIMIT = 120.0  # seconds until the native code must be loaded
+START_LIMIT = 120.0  # seconds within which the native code must be loaded
 HEADER = struct.Struct("<8s16sqq")  # header of a snapshot: form, the FMU's digest, steps since the start, key in memory
 FORM = b"SGFMU\x00\x00\x01"
 COMMAND = shlex.join([sys.executable, "-m", "surrogym_sampler.original.fmus.host"])

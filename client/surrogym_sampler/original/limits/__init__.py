@@ -1,5 +1,5 @@
-"""Guard of an original environment with declared limits: it applies the fallback before a limit is left, and when no
-action comes."""
+"""Guard of an original environment with declared limits: its fallback controller acts before a limit is left, and
+when no action comes."""
 
 from surrogym_sampler.original.limits.episodes import GuardedEpisode
 from surrogym_sampler.original.limits.queries import guarded

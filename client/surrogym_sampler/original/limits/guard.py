@@ -1,4 +1,4 @@
-"""The guard: whether the requested action or the fallback is applied, and the watchdog for actions that do not come.
+"""The guard, which applies the requested action or the fallback controller's, and the watchdog for missing actions.
 
 Shapes: C coordinates, F action entries.
 """
@@ -19,8 +19,8 @@ from surrogym_shared.spec import EnvironmentSpec
 
 Array = NDArray[np.float64]
 
-MOST_STEPS = 200  # largest number of steps of the fallback, which then ends even if the machine still moves
-MOST_ERRORS = 5  # number of errors of the environment in a row after which the fallback ends
+MOST_STEPS = 200  # after this number of steps, the fallback controller stops, even if the machine still moves
+MOST_ERRORS = 5  # after this number of errors of the environment in a row, the fallback controller stops
 STILL = 1e-3  # a machine rests if no coordinate changes by more than this share of its largest change in the episode
 
 
@@ -42,10 +42,10 @@ class Guard:
     def __init__(self, spec: EnvironmentSpec) -> None:
         self._spec = spec
         self._at = np.zeros(len(spec.coordinates))
-        self._change = np.zeros(len(spec.coordinates))  # (C,) absolute change of the last step
+        self._change = np.zeros(len(spec.coordinates))  # (C,) absolute change of each coordinate in the last step
         self._margins = margins(spec)
-        self._room = self._room_before = np.full(len(self._margins), np.inf)  # (L,) distances to the limits
-        self._fastest = np.zeros(len(spec.coordinates))  # (C,) largest change of a step in this episode
+        self._room = self._room_before = np.full(len(self._margins), np.inf)  # (L,) distances to the L limits
+        self._fastest = np.zeros(len(spec.coordinates))  # (C,) largest change of each coordinate in a step
         self._measured = True  # whether all coordinates of the last state are finite
 
     def begin(self, coordinates: Array) -> None:
@@ -93,10 +93,10 @@ class Watchdog:
     """Applies the specification's fallback controller until the machine rests, if no action comes for a sampling period
     during an episode.
 
-    An episode runs from its first action on. A simulator waits for its actions, so nothing is watched there.
+    An episode runs from its first action on. A simulator waits for its actions, so it needs no watchdog.
 
-    The environment is used by one thread at a time: hold the watchdog (``with watchdog:``) around every call of it. The
-    watchdog lets other threads call it between two steps of the fallback, so that a reset need not wait for the rest.
+    Only one thread at a time may use the environment: hold the watchdog (``with watchdog:``) around every call of the
+    environment. Other threads may call it between two steps of the fallback, so that a reset need not wait.
 
     Args:
         spec: specification with limits and a sampling period.
@@ -112,11 +112,11 @@ class Watchdog:
         self._guard = guard
         self._step = step
         self._changed = threading.Condition(threading.RLock())
-        self._due: float | None = None  # when the fallback's next step is due; None: no episode runs
+        self._due: float | None = None  # when the fallback controller acts next, if no action comes; None: no episode
         self._wanted = self._closed = False
-        self._fallen = ""  # why the episode was ended by the watchdog; empty if it was not
-        self._steps = self._errors = 0  # of the fallback in this episode; errors of the environment in a row
-        self._end = 0.0  # when the fallback ends although the machine still moves
+        self._fallen = ""  # why the watchdog ended the episode; empty if it did not
+        self._steps = self._errors = 0  # steps of the fallback controller, and errors in a row during these steps
+        self._end = 0.0  # time at which the fallback controller stops, even if the machine still moves
         self._thread: threading.Thread | None = None
 
     def __enter__(self) -> None:
@@ -132,7 +132,7 @@ class Watchdog:
 
     @property
     def rest_seconds(self) -> float:
-        """Longest time in seconds that the fallback takes, besides its last step."""
+        """Longest time in seconds for which the fallback controller acts, without the duration of its last step."""
         return 0.0 if self._waits else rest_seconds(self._spec)
 
     def check(self) -> None:
@@ -145,8 +145,8 @@ class Watchdog:
         self._fallen, self._due = "", None
 
     def running(self) -> None:
-        """Note that an action is applied, so that the next one is due within a period. Call this before the step too:
-        the machine may move although the step raised an error."""
+        """Note that an action is applied, so that the next action is due within a sampling period. Call this before
+        and after the step, because the machine may move although the step raises an error."""
         if self._waits:
             return
         self._due = time.monotonic() + self._period
@@ -186,9 +186,9 @@ class Watchdog:
                     self._fall(reason)
 
     def _fall(self, reason: str) -> None:
-        """Take a step of the fallback, and note when the next one is due. The episode has ended then.
+        """End the episode, take a step with the fallback controller's action, and note when its next step is due.
 
-        An error of the environment does not end the fallback at once: the next step is tried a period later.
+        After an error of the environment, the controller tries again one sampling period later.
         """
         if not self._fallen:
             self._fallen, self._steps, self._errors = reason, 0, 0

@@ -32,7 +32,7 @@ STIRRED_TANK: dict[str, Any] = {  # The parameters in the quick start of pc-gym 
     "o_space": {"low": [0.7, 300.0, 0.8], "high": [1.0, 350.0, 0.9]},
     "x0": [0.8, 330.0, 0.8],
 }
-SCHEDULES = ("SP", "disturbances")  # parameters that list one value per sample; only the first N values count
+SCHEDULES = ("SP", "disturbances")  # parameters with one value for each step; pc-gym uses the first N values only
 REFUSED = {
     "a_delta": "actions are changes, and their sum is not part of the state",
     "uncertainty_percentages": "its parameters are drawn by a generator that can't be seeded",

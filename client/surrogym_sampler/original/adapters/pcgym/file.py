@@ -10,7 +10,7 @@ from typing import Any
 
 from surrogym_sampler.original.errors import UnknownEnvironment
 
-FEWEST, MOST = 2, 100_000  # smallest and largest number of samples in an episode
+FEWEST, MOST = 2, 100_000  # smallest and largest number N of samples in an episode that a file may declare
 NEEDED = ("model", "N", "tsim", "SP", "a_space", "o_space", "x0")
 RANGES = ("a_space", "o_space", "disturbance_bounds")
 SHOWN = 60  # largest number of characters of a value in a message
