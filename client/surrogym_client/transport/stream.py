@@ -133,7 +133,7 @@ class Stream:
                 return message
 
     def _gathered(self, parts: list[bytes]) -> bytes | None:
-        """Return the message that the protocol's new events complete after its earlier ``parts``; None if incomplete."""
+        """Return the message that the protocol's new events complete, after its ``parts`` so far; None if incomplete."""
         for event in self._protocol.events_received():
             assert isinstance(event, Frame)
             if event.opcode is Opcode.CLOSE:

@@ -15,7 +15,7 @@ from surrogym_client.transport.connection import Retries
 from surrogym_shared.wire import Query
 
 AWAY = (ServerUnreachable, Unavailable)
-ONE_ATTEMPT = Retries(seconds=0)  # no retries: a renewal that fails is repeated at the next renewal
+ONE_ATTEMPT = Retries(seconds=0)  # no retries, for renewals and early claims, which are repeated later anyway
 NEARLY_OVER = 0.1  # a lease counts as nearly over if at most this share of it is left
 
 

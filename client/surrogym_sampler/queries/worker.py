@@ -249,7 +249,7 @@ class Sampler:
     def _step(self, query: Query) -> _Answer:
         taken: list[NewSample] = []
         error, for_good = "", False
-        outcome: Outcome = "failed"  # unless a real step is taken, or another reason is found
+        outcome: Outcome = "failed"  # counts only if no real step is taken
         try:
             check_query(self._own, query)
             if self._approve is not None and not self._approve(query):
