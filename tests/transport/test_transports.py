@@ -152,7 +152,7 @@ def test_with_transport_stream_only_the_stream_is_retried_and_then_fails():
         (b"no frame", "/v1/sessions/abc/step .*: expected a frame"),
         (
             frames.encode(frames.ResetReply(1, memoryview(b""), memoryview(b""))),
-            "expected a StepReply, got a ResetReply",
+            "expected a reply of the type StepReply, got ResetReply",
         ),
     ],
 )

@@ -49,7 +49,7 @@ def can_be_drawn(spec: EnvironmentSpec, original: str | None = None) -> bool:
 
 
 def is_drawn_by_gymnasium(name: str) -> bool:
-    """Whether a name from a server is safe to open for drawing: an id of Gymnasium's own packages, or of this one."""
+    """Whether a name from a server is safe to open for drawing: an id of Gymnasium's own packages, or of Surrogym."""
     entry = gymnasium.registry.get(name)
     return entry is not None and str(entry.entry_point).startswith(tuple(DRAWN_WITH))
 

@@ -186,7 +186,8 @@ def _step_infos(step: LaneStep, lanes: Bools) -> dict[str, Any]:
 
 
 def _entry(key: str, values: NDArray[Any], lanes: Bools) -> dict[str, Any]:
-    """Return an info as Gymnasium has it: values at ``key``, 0 outside of ``lanes``, and ``lanes`` at ``_key``."""
+    """Return an entry of Gymnasium's infos: ``key`` has the values, 0 outside of the mask ``lanes`` (N,), and ``_key``
+    has this mask."""
     shown = np.zeros_like(values)
     shown[lanes] = values[lanes]
     return {key: shown, f"_{key}": lanes.copy()}

@@ -26,7 +26,7 @@ _EVENT_SILENCE_SECONDS = 60.0
 _NUMBERS = 2_000
 _OF_ALL_POINTS = ("model_version", "outputs")
 _MODEL_FILE = "application/octet-stream"
-_BATCH_BYTES = 96 * 1024  # most bytes of samples in one request; the server accepts 128 KiB of JSON
+_BATCH_BYTES = 96 * 1024  # largest size in bytes of the samples in one request; the server accepts 128 KiB of JSON
 
 
 class Api:

@@ -104,7 +104,7 @@ class JobCalls:
         version: int | None = None,
         evaluation: int | None = None,
     ) -> wire.JobView:
-        """Report that a job has ended. Repeating it is harmless. Raises ``LeaseExpired`` like ``report``."""
+        """Report that a job has ended. Repeating it is harmless. Raises ``LeaseExpired`` if another worker has it."""
         body = wire.FinishJob(
             lease_token=lease_token, status=status, error=error, version=version, evaluation=evaluation
         )

@@ -1,4 +1,4 @@
-"""Parse the server's replies into the wire models; keys that tell a repeated request from a new one."""
+"""Parse the server's replies into the wire models, and make keys by which the server recognises a repeated request."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ from surrogym_client.errors import refused_here
 from surrogym_shared.codes import Code
 from surrogym_shared.patterns import ALIAS, IN_WORDS, NAME, POLICY
 
-SESSION_PATTERN = r"[^/\\]*[^/\\.][^/\\]*"  # the server chooses the form of session ids
+SESSION_PATTERN = r"[^/\\]*[^/\\.][^/\\]*"  # any single part of a URL; the server chooses the ids
 
 
 def surrogate(name: str) -> str:

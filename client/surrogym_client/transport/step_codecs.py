@@ -193,7 +193,7 @@ def _reply(content: bytes, kind: type[R]) -> R:
         fields = msgspec.structs.asdict(reply)
         del fields["seq"]
         raise error_from_problem(Problem(**fields))
-    raise FrameError(f"expected a {kind.__name__}, got a {type(reply).__name__}")
+    raise FrameError(f"expected a reply of the type {kind.__name__}, got {type(reply).__name__}")
 
 
 def _rows(what: str, raw: Array, expected: tuple[int, ...]) -> Array:

@@ -104,8 +104,8 @@ def _flat(path: Path, columns: Mapping[str, dict[str, Cells]]) -> dict[str, Cell
 
 
 def _columns(name: str, array: Cells, names: Sequence[str]) -> dict[str, Cells]:
-    """Return an array's columns by name: one for (n,), k for (n, k), named ``q.s0`` or ``q.<name>``, ``action.0``,
-    ``next.s0``."""
+    """Return an array's columns by name: an array (n,) is one column, an array (n, k) is k columns, which are named
+    ``q.s0`` or ``q.<name>``, ``action.0``, ``next.s0``."""
     if array.ndim == 1:
         return {name: array}
     count = array.shape[1]

@@ -110,7 +110,8 @@ class ResettableEnvironment(Protocol):
 
 @runtime_checkable
 class RolloutEnvironment(Protocol):
-    """An environment that answers rollout queries; ``FromReset`` makes one from a ``ResettableEnvironment``."""
+    """An environment that answers rollout queries, sequences of actions from a reset. ``FromReset`` makes it from a
+    ``ResettableEnvironment``."""
 
     def spec(self) -> EnvironmentSpec:
         """Return the specification, which is known before the first query."""

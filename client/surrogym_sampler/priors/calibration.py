@@ -20,13 +20,13 @@ from surrogym_sampler.original.protocol import Array
 from surrogym_sampler.priors.parameters import Parameter
 from surrogym_shared.spec import EnvironmentSpec
 
-FEWEST = 2  # smallest number of real steps
+FEWEST = 2  # smallest number of real steps for a calibration
 STARTS = 5  # largest number of starting points of the fit; the first one is the simulator's own values
 EXPECTED = 1e-3  # if the error is below this share of the coordinates' changes, no further starting point is tried
 EDGE = 0.01  # the first starting point is at least this share of a parameter's range away from the ends of the range
 SMALLEST = 1e-9  # an error below this share of the coordinates' changes counts as rounding
 FAR = 1e3  # error that counts for a step which the simulator can't take, in standard deviations of the changes
-CONFIDENCE = 0.9  # probability of each parameter's interval
+CONFIDENCE = 0.9  # probability that a parameter is in the interval that a calibration states
 NUDGE = 1e-5  # step size of numerical derivatives, as a share of a parameter's range
 WITHIN = 0.29  # standard deviation of a uniform distribution as a share of its range: the prior of a parameter
 FINEST = 1e-7  # smallest stated standard deviation of a parameter, as a share of its range: the fit's own precision
@@ -82,8 +82,8 @@ class Calibration:
 
     parameters: tuple[Calibrated, ...]
     steps: int
-    error_before: float  # error with the simulator's own values
-    error: float  # error with the calibrated values
+    error_before: float  # error of the simulator with its own parameter values
+    error: float  # error of the simulator with the calibrated parameter values
 
     @property
     def values(self) -> dict[str, float]:

@@ -15,7 +15,8 @@ IN_WORDS: dict[Access, str] = {"any": "any state", "snapshot": "snapshots", "res
 
 
 def check_environment(surrogate: str, asked: EnvironmentSpec, own: EnvironmentSpec) -> None:
-    """Check that an environment fits a surrogate: coordinates, action, access, and ranges within the environment's own.
+    """Check that an environment fits a surrogate: it has the same coordinates, action and start of a query (any state,
+    snapshot or reset), and its ranges include those of the surrogate.
 
     Args:
         surrogate: name of the surrogate, for messages.

@@ -37,7 +37,7 @@ PATIENCE = Retries(seconds=900.0, first_delay=0.1, longest_delay=5.0)
 LOOK_SECONDS = 0.1  # seconds between two checks by a waiting sampler of whether it was stopped
 LAST_SECONDS = 5.0  # a stopped sampler tries for these seconds to send its last real step
 END_SECONDS = 2.0  # longest wait of a claim, in seconds, if the sampler has to end with the design
-AGAIN_SECONDS = 1.0  # seconds to wait after a claim with no query that the environment allows
+AGAIN_SECONDS = 1.0  # seconds to wait after a claim that gave no query which the environment allows
 MOST_GONE = 1_000  # largest number of deleted snapshots in one report to the server
 STOPPED = "the sampler was stopped"
 NOT_APPROVED = "the person at the machine did not approve the query"
@@ -319,7 +319,7 @@ class Sampler:
         if query.snapshot is None:
             environment.begin(reset_seed(query, self._spec.design.seed))
         else:
-            assert self._returning is not None  # check_query has refused snapshots of an environment without them
+            assert self._returning is not None  # check_query has refused snapshots if the environment has none
             self._returning.begin(query.snapshot)
         for number, action in enumerate(query.actions):
             if self._stopped():
@@ -381,7 +381,7 @@ class Sampler:
             return  # the lease has ended, so another sampler may have the query
 
     def _count(self, query: Query, outcome: Outcome, error: str, *, again: bool) -> None:
-        if outcome == "refused" and again:  # the server may offer a refused query again, but it is counted once
+        if outcome == "refused" and again:  # a query that the server offers again after a refusal is counted once
             if query.id in self._refused:
                 return
             self._refused.add(query.id)

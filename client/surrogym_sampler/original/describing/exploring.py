@@ -20,7 +20,7 @@ from surrogym_shared.spec.actions import Action
 STEPS = 400
 EPISODES = 4  # number of random episodes that share the steps, if no episode ends early
 RESETS = 32  # number of resets that show the range of start states
-LONGEST_HOLD = 10  # largest number of steps for which an action is held
+LONGEST_HOLD = 10  # largest number of steps for which a random action is held
 ROUNDING = 1e-9  # a variable that varies by less than this share of its largest value (at least 1) counts as constant
 FEWEST_EQUAL = 3  # if at least this number of episodes ended, all after the same number of steps, there is a time limit
 PLACES_TRIED = 20  # number of random positions from which a start without contacts is chosen

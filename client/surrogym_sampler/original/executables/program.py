@@ -256,7 +256,7 @@ class Program:
         return line
 
     def _unfinished(self) -> str:
-        """Return the part of an error about a line that the program began and did not end; empty if there is none."""
+        """Return the end of an error message, which quotes a line that the program did not finish; empty without one."""
         return f"; it printed {short(bytes(self._unread))} without an end of the line" if self._unread else ""
 
     def _death(self, method: str, closed: str) -> EnvironmentDied:
@@ -270,7 +270,7 @@ class Program:
         return EnvironmentDied(f"{self._called} {did} during {method}{after}{self._complaint()}")
 
     def _complaint(self) -> str:
-        """Return the part of an error about the program's standard error; empty if it wrote nothing."""
+        """Return the end of an error message that quotes the program's standard error; empty if it wrote nothing."""
         last = "" if self._standard_error is None else self._standard_error.last_line()
         return f"; the last line of its standard error: {last}" if last else ""
 

@@ -16,10 +16,10 @@ from fmpy.fmi2 import FMU2Slave, fmi2Discard, fmi2Fatal, fmi2Terminated
 from fmpy.fmi3 import FMU3Slave
 
 Value = bool | int | float | str
-Typed = tuple[str, int]  # type and reference of a variable
-Start = tuple[str, int, Value]  # type, reference and value of a variable that is set before the FMU is initialised
+Typed = tuple[str, int]  # FMI type and value reference of a variable
+Start = tuple[str, int, Value]  # FMI type, value reference and value to set before the FMU is initialised
 STATUS = {2: "discard", 3: "error", 4: "fatal", 5: "pending (it works asynchronously)"}
-SET_AS = {"Enumeration": {2: "Integer", 3: "Int64"}}  # types that are set by the calls of another type, by FMI version
+SET_AS = {"Enumeration": {2: "Integer", 3: "Int64"}}  # FMI type whose calls serve for another type, by FMI version
 
 
 class Broken(Exception):

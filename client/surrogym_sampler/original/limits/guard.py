@@ -44,7 +44,7 @@ class Guard:
         self._at = np.zeros(len(spec.coordinates))
         self._change = np.zeros(len(spec.coordinates))  # (C,) absolute change of each coordinate in the last step
         self._margins = margins(spec)
-        self._room = self._room_before = np.full(len(self._margins), np.inf)  # (L,) distances to the L limits
+        self._room = self._room_before = np.full(len(self._margins), np.inf)  # (L,) to the limits
         self._fastest = np.zeros(len(spec.coordinates))  # (C,) largest change of each coordinate in a step
         self._measured = True  # whether all coordinates of the last state are finite
 

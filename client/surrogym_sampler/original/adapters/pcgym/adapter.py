@@ -88,7 +88,7 @@ def _as_before() -> None:
 
 def _require_model(name: str, model: str, classes: Any) -> None:
     found = [key for key, value in vars(classes).items() if isinstance(value, type) and hasattr(value, "info")]
-    known = sorted(key for key in found if key.islower())  # make_env accepts no other names
+    known = sorted(key for key in found if key.islower())  # pc-gym's make_env accepts only names in lower case
     if model not in known:
         raise UnknownEnvironment(f"{name}: expected the parameter model to be one of {', '.join(known)}, got {model!r}")
 
