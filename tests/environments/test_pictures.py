@@ -185,7 +185,7 @@ def test_rendering_before_the_first_reset_is_refused() -> None:
         RemoteEnv(ExactPendulum(), render_mode="rgb_array"),
         RemoteVectorEnv(ExactPendulum(), 2, render_mode="rgb_array"),
     ):
-        with pytest.raises(gymnasium.error.ResetNeeded, match=r"expected reset\(\) before render\(\)"):
+        with pytest.raises(gymnasium.error.ResetNeeded, match=r"expected a call of reset\(\) before render\(\)"):
             env.render()
 
 

@@ -109,7 +109,7 @@ def test_a_specification_with_reordered_coordinates_of_a_built_in_task_is_refuse
     """They were taken by their place: an angle was set as a speed."""
     spec = original.make("Pendulum-v1").spec()
     turned = spec.model_copy(update={"coordinates": spec.coordinates[::-1]})
-    with pytest.raises(UnknownEnvironment, match=r".'state0', 'state1'., .* whose coordinates are theta, speed, in"):
+    with pytest.raises(UnknownEnvironment, match=r".'state0', 'state1'., .* built-in task, theta, speed, in"):
         original.make("Pendulum-v1", spec=turned)
 
 

@@ -133,7 +133,7 @@ class Stream:
                 return message
 
     def _gathered(self, parts: list[bytes]) -> bytes | None:
-        """Return the message that the ``parts`` so far and the protocol's new events make up; None if it is incomplete."""
+        """Return the message that ``parts`` so far and the protocol's new events make up; None if incomplete."""
         for event in self._protocol.events_received():
             assert isinstance(event, Frame)
             if event.opcode is Opcode.CLOSE:

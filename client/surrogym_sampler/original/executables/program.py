@@ -256,7 +256,7 @@ class Program:
         return line
 
     def _unfinished(self) -> str:
-        """Return the end of an error message, which quotes a line that the program did not finish; empty without one."""
+        """Return the end of an error message that quotes a line which the program did not finish; empty without it."""
         return f"; it printed {short(bytes(self._unread))} without an end of the line" if self._unread else ""
 
     def _death(self, method: str, closed: str) -> EnvironmentDied:
