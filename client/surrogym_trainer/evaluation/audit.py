@@ -21,8 +21,7 @@ from surrogym_trainer.evaluation.systematic import Inputs, Systematic, columns, 
 from surrogym_trainer.policies.evidence import Audit, Promise
 
 AUDIT_STEPS = 8
-# an audit takes at most this number of steps, and more than it began with only while its result is undecided
-MOST_STEPS = 40
+MOST_STEPS = 40  # while the result of an audit is undecided, further steps are added up to this number in all
 ALARM = 0.01  # probability that the sizes of the output errors fail the test although the model is right
 # probability that a right model ever fails the test for errors that all steps share, however many steps are taken
 SHIFT_ALARM = 0.05
@@ -185,9 +184,8 @@ def judge(
     An output is at fault in either of two cases:
 
     - The sum of its squared errors, each divided by the variance that is allowed for it, is larger than chance
-      explains. The bound
-      is a quantile of the chi-squared distribution, which any output of a right model exceeds with a probability of
-      about 1 %. Single errors within the tolerance are never a fault.
+      explains. The bound is a quantile of the chi-squared distribution. The probability that any output of a right
+      model exceeds it is about 1 %. Single errors within the tolerance are never a fault.
     - The errors have a part that all steps share, more than chance explains. If this part is added to the model, the
       policy's return leaves the promised interval, see ``Consequence``. A shared part without an effect on the return
       is not a fault.

@@ -23,7 +23,7 @@ from surrogym_trainer.policies.predict import Predict
 # the effect on the return is computed for this number of errors that are drawn from their posterior distribution
 DRAWS = 64
 STARTS = 4  # for each drawn error, the return is the mean over this number of virtual episodes
-# if the probability that an output's errors have a part that all steps share exceeds this, the output is reported
+# an output is reported only if the probability that its errors have a part that all steps share exceeds this
 CERTAIN = 0.9
 # for the reported effect of one output's errors, the return is the mean over this number of virtual episodes
 EFFECT_STARTS = 32

@@ -76,8 +76,8 @@ def interval(returns: Array, floor: float | None = None) -> Promise:
 
 
 class _Parts(NamedTuple):
-    """The variation of the returns of virtual episodes, split into that between drawn functions and that between
-    starts."""
+    """The variation of the returns of virtual episodes, split into the variation between drawn functions and the
+    variation between starts."""
 
     # (S,) mean return along each of S drawn functions, shrunk so that their variance has no part due to the starts
     functions: Array

@@ -55,7 +55,8 @@ class Audit(BaseModel):
 
     Attributes:
         steps: number of real steps.
-        elsewhere: number of those that were taken in gaps of the samples, in states that the policy does not visit.
+        elsewhere: number of these steps that were taken in gaps of the samples, in states that the policy does not
+            visit.
         episodes: number of whole episodes that the steps form; 0 if they are single steps or a part of an episode.
         untested: share of the policy's states that are far from every step of the audit, if states can't be set.
         unanswered: number of further queries, at which the original environment failed.

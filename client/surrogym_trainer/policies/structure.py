@@ -119,7 +119,8 @@ class Structure(BaseModel):
 
 
 def save(learner: BaseAlgorithm, path: Path) -> None:
-    """Save a policy as ``learner.save`` does, and add the description if the policy can be described."""
+    """Save a policy as ``learner.save`` does. If possible, add a description from which the file is read without
+    unpickling."""
     file = io.BytesIO()
     # without this entry, the module normalisation knows that the observations were not normalised
     learner.save(file, exclude=["_last_original_obs"])

@@ -115,8 +115,8 @@ def _best_to_worst(known: Known, real: EvaluationDetail) -> str:
 
 
 def _further(known: Known) -> str:
-    """Return a table of the policy's other real episodes, such as those in other environments, as HTML; empty if there
-    are none."""
+    """Return a table of the policy's real episodes that no other section shows, such as those in other environments, as
+    HTML; empty if there are none."""
     evaluations = [] if known.policy is None else known.policy.evaluations
     shown = None if known.real is None else known.real.id
     others = [one for one in evaluations if one.controller == "policy" and one.id != shown]

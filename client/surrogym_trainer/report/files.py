@@ -18,7 +18,7 @@ class NoPdf(SurrogymClientError):
 
 
 def write(out: Path, page: str) -> int:
-    """Write a page in the format of the file's ending, and return the size in bytes.
+    """Write an HTML page to the file ``out``, as HTML or PDF by the file's ending, and return the file's size in bytes.
 
     Raises:
         NoPdf: Chromium is not installed, or it failed; nothing was written.

@@ -1,4 +1,4 @@
-"""The card of a trained policy."""
+"""The card of a trained policy: for what, with which settings and with which results it was trained."""
 
 from __future__ import annotations
 

@@ -331,7 +331,8 @@ def _in_gaps(subject: Subject, count: int) -> tuple[Array, Array]:
 def way_of(subject: Subject, episodes: int, steps: int, start_box: float = 0.0) -> tuple[Array, Array]:
     """Return the states (m, C) and actions (m, F) of a policy in whole virtual episodes.
 
-    Each episode follows a sampled function of its own. Actions are in the original environment's units.
+    Each episode follows a function of its own, sampled from the model's posterior. Actions are in the original
+    environment's units.
 
     Args:
         subject: the policy.

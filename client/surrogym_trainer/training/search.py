@@ -132,8 +132,8 @@ def name_of(settings: TrainSettings) -> str:
 
 
 def with_algorithm(settings: TrainSettings, spec: EnvironmentSpec) -> TrainSettings:
-    """Return the settings with the name of a search. If they name none, it is ``FAST``, or ``REFERENCE`` if ``FAST``
-    does not support the settings.
+    """Return the settings with the name of a search. If they name none, it is ``FAST`` (PPO in NumPy), or ``REFERENCE``
+    (PPO of Stable-Baselines3) if ``FAST`` does not support the settings.
 
     Only ``REFERENCE`` has trackers and some of the hyperparameters, and can continue a policy of Stable-Baselines3.
     ``REFERENCE`` is also the search of the preset ``paper``.

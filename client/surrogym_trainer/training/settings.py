@@ -64,8 +64,8 @@ class TrainSettings:
 
     @property
     def learning(self) -> dict[str, Any]:
-        """The session fields of the lanes in which a policy learns. By default, a share of the episodes starts anywhere
-        in the sampling range, or none if some episodes start at the states of real steps."""
+        """The fields of ``OpenSession`` for the session in which a policy learns. By default, a share of the episodes
+        starts anywhere in the sampling range, or none if some episodes start at the states of real steps."""
         usual = START_BOX if self.start_visited is None else 0.0
         fields: dict[str, Any] = {"seed": self.seed, "start_box": usual if self.start_box is None else self.start_box}
         if self.start_visited is not None:

@@ -202,7 +202,8 @@ END_IF"""
 
 
 def _guard(controller: Controller, real: str) -> dict[str, str]:
-    """Return the parts of the source that keep limits; they are empty if the controller has no limits."""
+    """Return the parts of the source that replace the policy's action if a limit would be left soon; they are empty if
+    the controller has no limits."""
     guard = controller.guard
     if guard is None:
         return {"guard": "", "guard_variables": "", "limited": ""}

@@ -28,7 +28,7 @@ class Distribution(Sampled, Protocol):
 
     def arrays(self) -> tuple[tuple[int, ...], Array, Array]:
         """Return, for compiled code, the numbers of choices of discrete actions, and the centre (F,) and the reach
-        (F,), half the width, of the bounds of continuous actions. What does not apply is empty."""
+        (F,), half the width, of the bounds of continuous actions. Parts that do not apply are empty."""
         ...
 
     def slopes(self, outputs: Array, further: Array, actions: Array, by: Array) -> tuple[Array, Array]:

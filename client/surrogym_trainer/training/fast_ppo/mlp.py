@@ -79,8 +79,8 @@ class Mlp:
         return slope
 
     def _array(self, place: int, rows: int, columns: int) -> Array:
-        """Return the reusable array with this number ``place``. Allocating memory for each batch would take as long as
-        the matrix products."""
+        """Return the array with the number ``place``, which every batch of this size reuses. Allocating memory for each
+        batch would take as long as the matrix products."""
         key = (place, rows)
         if key not in self._made:
             self._made[key] = np.empty((rows, columns), dtype=np.float32)

@@ -91,7 +91,8 @@ class Collector:
         )
 
     def _end(self, ended: NDArray[np.bool_], lost: NDArray[np.bool_]) -> list[float]:
-        """End the episodes of the lanes in ``ended`` (N,). Returns their returns, except those of lost episodes."""
+        """Begin the sums of returns anew in the lanes that ``ended`` (N,) marks. Returns the returns of the ended
+        episodes, except those of ``lost`` (N,) ones."""
         earned: list[float] = self._earned[ended & ~lost].tolist()
         if self._penalised:
             self._penalties.extend(self._penalty[ended].tolist())
