@@ -1,4 +1,4 @@
-"""``python -m surrogym_server serve``: the server's commands without the client's."""
+"""Entry point of ``python -m surrogym_server serve``, which runs a server without the client's commands."""
 
 from __future__ import annotations
 

@@ -73,13 +73,13 @@ from surrogym_server.storage.port import Storage
 from surrogym_server.storage.sql import open_storage
 from surrogym_shared.spec import EnvironmentSpec
 
-# Optional features. To remove a feature, delete its folder and its line here.
+# Optional features of the server. To remove one, delete its folder in ``features`` and its line here.
 FEATURES: tuple[Feature, ...] = (
     policies,
     jobs,
     priors,
 )
-# Clusters of machines, by the value of the setting ``engine`` that chooses them.
+# Clusters of machines that can run sessions and fits, by the value of the setting ``engine`` that chooses each.
 CLUSTERS: dict[str, Cluster] = {
     "ray": ray,
 }
@@ -94,15 +94,15 @@ A sampler claims queries and adds samples; a trainer opens a session and steps i
 
 @dataclass(frozen=True)
 class DesignPort:
-    """The two functions of the design: ``plan`` chooses the first queries, and ``run`` computes a round (a fit and the
-    next queries). Tests replace both by faster functions."""
+    """The two functions of the design of queries: ``plan`` chooses the first queries, and ``run`` computes a round: it
+    fits a model and chooses the next queries. Tests replace both by faster functions."""
 
     plan: Plan = initial_queries
     run: Callable[[DesignJob], DesignResult] = run_design_job
 
 
 class State(TypedDict):
-    """Objects that the app makes available to every request."""
+    """Objects that each request can read from ``request.state``: the services, and those of the optional features."""
 
     services: Services
     parts: Parts
@@ -110,7 +110,7 @@ class State(TypedDict):
 
 @dataclass(frozen=True)
 class _Process:
-    """Objects of a server process on which its services are built."""
+    """Objects that a server process has once, and that its services share."""
 
     storage: Storage
     definitions: Definitions
@@ -127,7 +127,8 @@ def create_app(settings: Settings, design: DesignPort = DesignPort(), fits: Fits
     Args:
         settings: the server's settings.
         design: functions that choose the first queries and compute a round.
-        fits: worker processes for rounds, if they have started already; None to start them. The app closes them.
+        fits: child processes that compute rounds, if they have been created already; None to create them. The app
+            closes them.
 
     Raises:
         InvalidInput: the address of the database can't be used, the device does not exist, or the cluster does not
@@ -149,7 +150,8 @@ def create_app(settings: Settings, design: DesignPort = DesignPort(), fits: Fits
         docs_url=None,
         redoc_url=None,
         openapi_url=None,
-        # The app has its own /metrics. Without these hooks a request takes 5 us less.
+        # FastAPI's hooks for telemetry are switched off: the app has metrics of its own, and each request takes 5 us
+        # less.
         telemetry={"tracing": False, "metrics": False, "logs": False},
     )
     app.state.gate = Gate(settings.tokens)
@@ -172,8 +174,8 @@ def create_app(settings: Settings, design: DesignPort = DesignPort(), fits: Fits
     if settings.loopback and not settings.tokens:
         app.add_middleware(KnownHosts, hosts=frozenset({*LOCAL_NAMES, "127.0.0.1", "::1", *settings.host_names}))
     app.add_middleware(Observed, metrics=app.state.metrics)
-    # Steps are the most frequent requests. Their routes come first and are added directly, because an included router
-    # would cost a search of its own.
+    # Most requests are steps, so their routes are searched first. They are added directly, because an included router
+    # would need a search of its own.
     app.router.routes.extend(stepping.routes)
     rooms = (sessions, service, metrics, surrogates, queries, samples, logs, models)
     for one in (*(room.router for room in rooms), *(feature.router for feature in FEATURES), events.router):
@@ -185,13 +187,13 @@ def create_app(settings: Settings, design: DesignPort = DesignPort(), fits: Fits
 def _check_device(name: str) -> None:
     if name == "cuda" and not torch.cuda.is_available():
         why = "this torch build has no CUDA" if torch.version.cuda is None else "torch finds no GPU that it can use"
-        raise InvalidInput(f"setting device: expected cpu, got cuda, which can't be used, because {why}")
+        raise InvalidInput(f"setting device: expected cpu, got cuda, which can't be used, because {why}: set it to cpu")
 
 
 def _cluster(engine: str) -> Cluster | None:
     if engine not in ("local", *CLUSTERS):
         raise InvalidInput(
-            f"setting engine: expected {' or '.join(('local', *CLUSTERS))}, got {engine}, which this server lacks"
+            f"setting engine: expected {' or '.join(('local', *CLUSTERS))}, got {engine}: choose one of these"
         )
     return CLUSTERS.get(engine)
 
@@ -205,7 +207,7 @@ def _connected(cluster: Cluster, settings: Settings, storage: Storage) -> Sessio
 
 
 def say_goodbye(app: FastAPI) -> None:
-    """End all long polls and event streams, so that a shutdown need not wait for them."""
+    """End all requests that wait for work or events (long polls and streams), so that a shutdown need not wait."""
     if app.state.notices is not None:
         app.state.notices.close()
 
@@ -220,7 +222,9 @@ async def _lifespan(
     fits: Fits | None,
 ) -> AsyncIterator[State]:
     torch.set_num_threads(settings.threads)
-    threadpool_limits(settings.threads, user_api="blas")  # threads of NumPy's BLAS, which computes policies' actions
+    threadpool_limits(
+        settings.threads, user_api="blas"
+    )  # limits the threads of NumPy, which computes policies' actions
     process = _build_process(settings, design, storage, app.state.metrics, engine, fits)
     app.state.notices = process.notices
     services = _build_services(settings, design, process)

@@ -1,4 +1,4 @@
-"""The exception tree of the server; it knows no HTTP. ``api.problems`` maps each leaf to one error code.
+"""The exceptions of the server, as a tree. They don't depend on HTTP: ``api.problems`` maps each leaf to an error code.
 
 SurrogymError
 ├── InvalidInput            the caller sent something that can't be used; says what was expected and what came
@@ -38,7 +38,7 @@ from __future__ import annotations
 
 
 class SurrogymError(Exception):
-    """Base of all errors that the server raises on purpose. ``str(error)`` is one sentence for a person."""
+    """Base class of all errors that the server raises on purpose. ``str(error)`` is a sentence for the user."""
 
 
 class InvalidInput(SurrogymError):

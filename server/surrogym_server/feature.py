@@ -1,7 +1,7 @@
 """Interface between ``app.py`` and the optional features.
 
-A feature is one folder of ``features``, with its routes, its service and its tables. It imports the core, and the core
-does not import it.
+A feature is one folder of ``features``, with its routes, its service and its database tables. It imports other parts of
+the server, and only ``app.py`` imports it.
 """
 
 from __future__ import annotations
@@ -25,24 +25,24 @@ S = TypeVar("S")
 
 
 class Service(Protocol):
-    """Service of an optional feature in a server process: its periodic work and its metrics."""
+    """Interface of an optional feature's service, of which a server process has one: periodic work and metrics."""
 
     async def sweep(self) -> None:
         """Do the periodic work of the feature. The server calls this every ``sweep_seconds``."""
 
     def metrics(self) -> Iterable[Metric]:
-        """Return the metrics of the feature for ``/metrics``."""
+        """Return the Prometheus metrics of the feature, which the endpoint ``/metrics`` shows."""
 
 
 @dataclass(frozen=True)
 class Core:
-    """Objects of the server process that a feature may use."""
+    """Objects of the server process that an optional feature may use."""
 
     settings: Settings
     storage: Storage
     notices: Notices
     metrics: ProcessMetrics
-    complete: Complete  # adds the fields that a specification (JSON) of an older program lacks
+    complete: Complete  # function that adds missing fields with their defaults to a specification (JSON)
 
 
 @dataclass(frozen=True)
@@ -68,11 +68,11 @@ class Cluster:
     fits: Callable[[Settings, Callable[[DesignJob], DesignResult]], Compute | None]
 
 
-Parts = Mapping[type[Service], Service]  # the services of the features, by class
+Parts = Mapping[type[Service], Service]  # the service of each optional feature, by the class of the service
 
 
 def part(kind: type[S]) -> Any:
-    """Return a FastAPI dependency that gives a route the service of class ``kind``."""
+    """Return a FastAPI dependency whose value is the optional feature's service of class ``kind``."""
 
     async def started(request: Request) -> S:
         found = request.state.parts[kind]

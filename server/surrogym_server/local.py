@@ -91,8 +91,8 @@ class LocalSurrogate:
     def open(self, request: OpenSession) -> SessionView:
         if request.model not in ("latest", VERSION):
             raise UnknownModel(
-                f"expected model 'latest' or {VERSION}, the only one of a surrogate without a server, got "
-                f"{request.model}"
+                f"expected model 'latest' or {VERSION}, the only version of a surrogate without a server, got "
+                f"{request.model}: use 'latest'"
             )
         asked = opening(request)
         digest = digest_of("open", asked)
@@ -153,7 +153,7 @@ class LocalSurrogate:
 
     def _get(self, session: str) -> Session:
         if session not in self._sessions:
-            raise UnknownSession(f"no session {session!r}: open a new one")
+            raise UnknownSession(f"expected the id of an open session, got {session!r}: open a new session")
         return self._sessions[session]
 
     def _advance(self, request: Advance) -> Outcome:
@@ -163,7 +163,7 @@ class LocalSurrogate:
 
 
 class _OneModel:
-    """Source of models for a surrogate that has one model only."""
+    """Source of models (see ``engine.core.Models``) that returns the same model for each surrogate and version."""
 
     def __init__(self, model: DynamicsModel) -> None:
         self._model = model
@@ -178,4 +178,4 @@ class _OneModel:
 
 
 def _always() -> None:
-    """Do nothing: the check that a rollout makes before each step never stops it here."""
+    """Do nothing. A server checks before each step of a rollout whether to continue; without a server, none stops."""

@@ -1,4 +1,4 @@
-"""Logs of one server: a line for each record, as text or as JSON, with the id of the request it belongs to."""
+"""Logging of a server: each record is a line of text or JSON, with the id of the HTTP request during which it arose."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ LogFormat = Literal["text", "json"]
 REQUEST_ID: ContextVar[str | None] = ContextVar("request_id", default=None)
 
 
-# Escapes for control characters: a line break in a logged path or name could imitate another line of the log.
+# Control characters in log records are replaced by these escapes. Otherwise a line break in a logged path or name could
+# imitate another line of the log.
 _ESCAPES = {code: f"\\x{code:02x}" for code in (*range(32), *range(127, 160), 0x2028, 0x2029)}
 
 

@@ -12,7 +12,7 @@ from surrogym_server.errors import InvalidSpec, SurrogymError
 from surrogym_shared import plugins
 
 T = TypeVar("T")
-# By the type of a setting: its name in messages, and the types of values that a specification may give for it.
+# For each type of a plug-in's setting: what error messages call it, and the types of values that are accepted for it.
 TYPES: dict[Any, tuple[str, tuple[type, ...]]] = {
     float: ("a number", (int, float)),
     int: ("a whole number", (int,)),
@@ -23,18 +23,18 @@ TYPES: dict[Any, tuple[str, tuple[type, ...]]] = {
 
 @dataclass(frozen=True)
 class Choice:
-    """Choice of a class in a registry: the name of the class, and settings for its instance."""
+    """Choice of a class in a registry, such as a model family: its name, and the settings with which to make it."""
 
     name: str
     settings: tuple[tuple[str, float | bool | str], ...] = ()
 
 
 class Registry(plugins.Registry[T]):
-    """Classes by name, and instances made from them. A request chooses a class only by its name."""
+    """Registry of classes of one kind, such as model families, by name. It makes instances of them with settings."""
 
     def lack(self, choice: Choice) -> str | None:
-        """Describe what must be installed or repaired before an instance of a stored choice can be made; None if
-        nothing must.
+        """Describe what must be installed or repaired before an instance of a stored choice can be made. Return None if
+        the instance can be made now.
 
         The text is a noun phrase that can follow "it needs".
         """
@@ -55,7 +55,7 @@ class Registry(plugins.Registry[T]):
         return None
 
     def get(self, name: str) -> type[T]:
-        """Return the class with a name.
+        """Return the class that is registered as ``name``.
 
         Raises:
             InvalidSpec: no class has this name, or its package is broken; the message lists the known names.
@@ -69,7 +69,7 @@ class Registry(plugins.Registry[T]):
         """Make an instance of the chosen class, a frozen dataclass whose fields are the settings.
 
         Raises:
-            InvalidSpec: an unknown name, an unknown setting, or an invalid value.
+            InvalidSpec: the name or a setting is unknown, or a value is invalid.
         """
         kind, settings = self.get(choice.name), dict(choice.settings)
         with guarded(f"{self.kind} {choice.name}", InvalidSpec):
@@ -84,8 +84,8 @@ def guarded(what: str, failure: type[SurrogymError], *, interrupts: bool = False
     The message of the failure begins with ``what``. It includes the type of the error, except that of a ``ValueError``
     if ``failure`` is ``InvalidSpec``, because plug-ins raise ``ValueError`` on purpose to refuse a specification.
 
-    A ``SurrogymError`` passes unchanged. ``KeyboardInterrupt`` passes unless ``interrupts`` is True. Requests of a
-    server set it, because no person has pressed Ctrl-C there.
+    A ``SurrogymError`` passes unchanged. ``KeyboardInterrupt`` passes unless ``interrupts`` is True. A server sets
+    ``interrupts`` in requests, where a ``KeyboardInterrupt`` can't come from Ctrl-C.
     """
     try:
         yield
@@ -118,7 +118,9 @@ def _check_settings(kind: type, settings: dict[str, float | bool | str]) -> None
     for field in fields:
         needed = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
         if needed and field.name not in settings:
-            raise ValueError(f"expected the setting {field.name}, which has no default; its settings are {names}")
+            raise ValueError(
+                f"expected a value for {field.name}, which has no default, got none; all settings are {names}"
+            )
     types = _types(kind)
     for name, given in settings.items():
         expected = TYPES.get(types.get(name))

@@ -16,14 +16,14 @@ logger = logging.getLogger(__name__)
 
 
 def keep_private(settings: Settings) -> None:
-    """Create a missing SQLite file readable for its owner alone, and log a warning for each secret file that others
-    can read.
+    """Create a missing SQLite file that only its owner can read, and log a warning for each secret file that others can
+    read: database, token file and TLS key.
 
-    SQLite gives the files ``-wal`` and ``-shm`` the mode of the database. An existing database keeps its mode.
+    SQLite gives the files ``-wal`` and ``-shm`` beside a database its file mode. An existing database keeps its mode.
     """
     database = _sqlite_file(settings.database_url)
     if database is not None:
-        with suppress(OSError):  # the file exists, or opening the database later raises the error
+        with suppress(OSError):  # raised if the file exists; other errors come again when the database is opened
             database.parent.mkdir(parents=True, exist_ok=True)
             os.close(os.open(database, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600))
     for path in (database, settings.token_file, settings.tls_key):
@@ -35,6 +35,6 @@ def _sqlite_file(url: str) -> Path | None:
     try:
         parsed = sa.make_url(url)
     except sa.exc.ArgumentError:
-        return None  # opening the database will report the invalid address
+        return None  # the address is invalid, which is reported when the database is opened
     is_file = parsed.get_backend_name() == "sqlite" and parsed.database not in (None, "", ":memory:")
     return Path(str(parsed.database)) if is_file else None

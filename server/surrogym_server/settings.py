@@ -27,7 +27,9 @@ LogLevel = Literal["critical", "error", "warning", "info", "debug"]
 
 def _without_path(url: str) -> str:
     if not re.fullmatch(r"https?://[^/@?#]+/?", url):
-        raise ValueError(f"expected an address such as https://surrogates.example.org, without a path, got {url!r}")
+        raise ValueError(
+            f"expected an address without a path, such as https://surrogates.example.org, got {url!r}: remove the path"
+        )
     return url
 
 
@@ -37,76 +39,115 @@ class Settings(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, hide_input_in_errors=True)
 
     host: str = "127.0.0.1"
-    port: Annotated[int, Field(ge=0, le=65_535, description="0 takes any free port")] = 8000
+    port: Annotated[int, Field(ge=0, le=65_535, description="port to listen on; 0 takes any free port")] = 8000
     database: str = Field(default="surrogym.db", min_length=1, description="SQLite file, or a SQLAlchemy URL")
     files: Annotated[
         Path | None,
         Field(description="folder for the files of policies. None: beside a SQLite file, or in PostgreSQL"),
     ] = None
     synchronous: Annotated[
-        Synchronous, Field(description="of a SQLite file: full survives a loss of power, normal a crash alone")
+        Synchronous,
+        Field(description="SQLite only: with full, data survive a loss of power, with normal a crash alone"),
     ] = "full"
     public_url: Annotated[
         str | None,
         AfterValidator(_without_path),
-        Field(description="address that browsers know, behind a proxy"),
+        Field(description="address under which browsers reach this server behind a proxy"),
     ] = None
     tokens: dict[str, Role] = Field(default_factory=dict, description="role of each bearer token")
     token_file: Path | None = Field(default=None, description="file with one token a line, alone or as role:token")
     insecure: bool = Field(default=False, description="allow another address than loopback without a token")
-    tls_certificate: FilePath | None = Field(default=None, description="chain of certificates, as PEM")
-    tls_key: FilePath | None = Field(default=None, description="its private key, as PEM")
-    device: Annotated[Literal["cpu", "cuda"], Field(description="what steps sessions; fits use the CPU")] = "cpu"
+    tls_certificate: FilePath | None = Field(default=None, description="file with the certificate chain, as PEM")
+    tls_key: FilePath | None = Field(default=None, description="file with the certificate's private key, as PEM")
+    device: Annotated[
+        Literal["cpu", "cuda"], Field(description="device that computes steps of sessions; fits use the CPU")
+    ] = "cpu"
     threads: Annotated[
-        int, Field(ge=1, le=1024, description="of one torch operation, and of a compiled step of a large model")
+        int, Field(ge=1, le=1024, description="threads of one torch operation, and of a compiled step of a large model")
     ] = 1
-    engine: Annotated[Literal["local", "ray"], Field(description="where sessions are")] = "local"
-    ray_address: Annotated[str, Field(min_length=1, description="of the cluster; auto finds it")] = "auto"
-    ray_hosts: Annotated[int, Field(ge=1, le=1_000, description="processes that hold sessions, each with a CPU")] = 2
-    ray_fit_gpus: Annotated[float, Field(ge=0, description="of the cluster's GPUs, for each fit")] = 0.0
+    engine: Annotated[
+        Literal["local", "ray"], Field(description="where sessions run: in this process, or in a Ray cluster")
+    ] = "local"
+    ray_address: Annotated[
+        str, Field(min_length=1, description="address of the Ray cluster; auto finds a running one")
+    ] = "auto"
+    ray_hosts: Annotated[
+        int,
+        Field(ge=1, le=1_000, description="number of processes in the Ray cluster that run sessions, each on a CPU"),
+    ] = 2
+    ray_fit_gpus: Annotated[
+        float, Field(ge=0, description="number of GPUs of the Ray cluster that each fit reserves; 0 reserves none")
+    ] = 0.0
     ray_checkpoint_seconds: Annotated[
-        float, Field(ge=0.01, le=3_600, description="between checkpoints of a session")
+        float, Field(ge=0.01, le=3_600, description="seconds between two checkpoints of a session in the Ray cluster")
     ] = 1.0
     ray_lease_seconds: Annotated[
-        float, Field(ge=1, le=3_600, description="after which the sessions of a dead host go on")
+        float, Field(ge=1, le=3_600, description="seconds after which another process continues a dead one's sessions")
     ] = 10.0
-    session_idle_seconds: Annotated[float, Field(gt=0)] = 3_600.0
-    fit_seconds: Annotated[float, Field(gt=0, description="of one fit; one that takes longer is ended")] = 3_600.0
-    fit_workers: Annotated[int, Field(ge=1, le=256, description="fits at once, each in a process")] = 1
-    max_body_bytes: Annotated[int, Field(ge=1_024)] = 32 * 1024 * 1024
-    max_bodies_bytes: Annotated[int, Field(ge=1_024, description="of all requests at once")] = 256 * 1024 * 1024
-    max_connections: Annotated[int, Field(ge=1)] = 16_384
-    request_seconds: Annotated[float, Field(gt=0, description="for a request to arrive whole")] = 30.0
-    max_sessions: Annotated[int, Field(ge=1)] = 256
-    max_sessions_mib: Annotated[int, Field(ge=1, description="memory of the lanes of all sessions")] = 2_048
-    max_waiting: Annotated[int, Field(ge=1, description="requests of sessions, at work or waiting")] = 1_024
-    max_lanes: Annotated[int, Field(ge=1, le=MAX_LANES, description="of one session")] = MAX_LANES
-    policies_mib: Annotated[int, Field(ge=1, description="files of the policies of one surrogate, together")] = 1_024
-    sweep_seconds: Annotated[float, Field(gt=0, description="between looks at leases and sessions")] = 1.0
-    log_level: LogLevel = "info"
-    log_format: Annotated[LogFormat, Field(description="a line of text for each record, or a JSON object")] = "text"
+    session_idle_seconds: Annotated[
+        float, Field(gt=0, description="seconds without a request after which a session expires")
+    ] = 3_600.0
+    fit_seconds: Annotated[
+        float, Field(gt=0, description="seconds that a fit may take; a fit that takes longer is stopped")
+    ] = 3_600.0
+    fit_workers: Annotated[
+        int, Field(ge=1, le=256, description="number of fits that run at the same time, each in a process")
+    ] = 1
+    max_body_bytes: Annotated[
+        int, Field(ge=1_024, description="largest size of one request body, frame or file, in bytes")
+    ] = 32 * 1024 * 1024
+    max_bodies_bytes: Annotated[
+        int, Field(ge=1_024, description="largest size of all request bodies at the same time, in bytes")
+    ] = 256 * 1024 * 1024
+    max_connections: Annotated[int, Field(ge=1, description="largest number of open connections")] = 16_384
+    request_seconds: Annotated[
+        float, Field(gt=0, description="seconds within which a request must arrive completely")
+    ] = 30.0
+    max_sessions: Annotated[int, Field(ge=1, description="largest number of open sessions")] = 256
+    max_sessions_mib: Annotated[
+        int, Field(ge=1, description="largest memory of all sessions together, lanes and kept replies, in MiB")
+    ] = 2_048
+    max_waiting: Annotated[
+        int, Field(ge=1, description="largest number of requests of sessions that run or wait at the same time")
+    ] = 1_024
+    max_lanes: Annotated[
+        int, Field(ge=1, le=MAX_LANES, description="largest number of lanes (parallel environments) of one session")
+    ] = MAX_LANES
+    policies_mib: Annotated[
+        int, Field(ge=1, description="largest size of all files of a surrogate's policies together, in MiB")
+    ] = 1_024
+    sweep_seconds: Annotated[
+        float, Field(gt=0, description="seconds between two searches for expired leases and sessions")
+    ] = 1.0
+    log_level: Annotated[LogLevel, Field(description="lowest level of the records that are logged")] = "info"
+    log_format: Annotated[
+        LogFormat, Field(description="text: each log record is a line of text; json: it is a JSON object")
+    ] = "text"
 
     @model_validator(mode="after")
     def _closed_by_default(self) -> Self:
         short = [token for token in self.tokens if len(token) < MIN_TOKEN_LENGTH]
         if short:
             raise ValueError(
-                f"expected tokens of at least {MIN_TOKEN_LENGTH} characters, got {len(short[0])}: choose longer ones"
+                f"expected tokens of at least {MIN_TOKEN_LENGTH} characters, got one of {len(short[0])}: choose longer "
+                "tokens"
             )
         if not (self.tokens or self.insecure or self.loopback):
-            raise ValueError(f"host {self.host} is not loopback: expected a token (or --insecure), got none")
+            raise ValueError(
+                f"host {self.host} can be reached from other machines: expected a token (or --insecure), got none"
+            )
         return self
 
     @model_validator(mode="after")
     def _certificate_with_its_key(self) -> Self:
         if (self.tls_certificate is None) != (self.tls_key is None):
             came = "the key" if self.tls_certificate is None else "the certificate"
-            raise ValueError(f"TLS: expected a certificate and its key, got {came} alone: give both")
+            raise ValueError(f"TLS: expected a certificate and its private key, got {came} alone: give both")
         return self
 
     @property
     def loopback(self) -> bool:
-        """Whether the server's address can be reached from this machine alone."""
+        """Whether only programs on this machine can reach the server's address (loopback)."""
         if self.host in LOCAL_NAMES:
             return True
         try:
@@ -116,18 +157,19 @@ class Settings(BaseModel):
 
     @property
     def host_names(self) -> tuple[str, ...]:
-        """Host names by which clients address this server: its own, and that of ``public_url`` behind a proxy."""
+        """Host names under which clients reach this server: ``host``, and the host of ``public_url`` if it is set."""
         public = None if self.public_url is None else urlsplit(self.public_url).hostname
         return (self.host,) if public is None else (self.host, public)
 
     @property
     def database_url(self) -> str:
-        """The database as a SQLAlchemy URL; a plain path means a SQLite file."""
+        """Address of the database as a SQLAlchemy URL. A setting ``database`` without "://" is the path of a SQLite
+        file."""
         return self.database if "://" in self.database else f"sqlite:///{self.database}"
 
 
 def read_settings(environment: Mapping[str, str], **options: Any) -> Settings:
-    """Read the settings from environment variables; options that are not None override them.
+    """Read the settings from environment variables. ``options`` that are not None replace these.
 
     Args:
         environment: usually ``os.environ``. ``SURROGYM_TOKEN`` is an admin token, ``SURROGYM_TOKENS`` a list

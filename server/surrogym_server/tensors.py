@@ -16,12 +16,12 @@ from torch import Tensor
 T = TypeVar("T")
 
 CPU = torch.device("cpu")
-STEEPEST = 2.0  # largest absolute rate g of the transformation ``bend``
-EDGE = 2.0  # |z| beyond which ``bend`` is linear or constant instead of exponential
+STEEPEST = 2.0  # a fit searches rates g of the transformation ``bend`` between minus this number and this number
+EDGE = 2.0  # the transformation ``bend`` of inputs z is exponential for |z| up to this number
 
 
 def to_device(value: T, device: torch.device) -> T:
-    """Copy a value to a device: its tensors, also those inside of dataclasses, tuples and mappings.
+    """Return a copy of ``value`` with all its tensors on a device, also those in dataclasses, tuples and mappings.
 
     Each ``torch.device`` in the value is replaced by ``device`` too, because later tensors are created there.
     """
@@ -43,13 +43,13 @@ def to_device(value: T, device: torch.device) -> T:
 
 
 def cached(make: Callable[[Any], T]) -> cached_property[T]:
-    """Make a ``cached_property`` of a method that returns tensors. It runs outside inference mode, so that autograd
-    can use the cached tensors later."""
+    """Decorate a method that returns tensors, to make it a ``cached_property``. The method runs outside torch's
+    inference mode, so that autograd can use the cached tensors later."""
     return cached_property(torch.inference_mode(False)(make))
 
 
 def in_blocks(rows: int, function: Callable[..., tuple[Tensor, ...]], *tensors: Tensor | None) -> tuple[Tensor, ...]:
-    """Apply ``function`` to blocks of at most ``rows`` rows of the tensors (m, ...), and concatenate its results.
+    """Apply ``function`` to blocks of at most ``rows`` of the m rows of ``tensors`` (m, ...). Concatenate the results.
 
     An argument that is None is passed as None with every block.
     """
@@ -78,17 +78,17 @@ def bend(z: Tensor, rates: Tensor) -> Tensor:
     side.
     """
     size, sign = rates.abs(), rates.sign()
-    along = (z * sign).clamp_min(-EDGE)  # increases towards the steep side of the exponential
+    along = (z * sign).clamp_min(-EDGE)  # z, with its sign changed where the rate is negative; constant below -EDGE
     beyond = (along - EDGE).clamp_min(0)
     bent = torch.expm1(size * along.clamp_max(EDGE)) / torch.where(size == 0, 1.0, size)
     return torch.where(rates == 0, z, sign * (bent + torch.exp(size * EDGE) * beyond))
 
 
 def amplitude(w: Tensor, rates: Tensor) -> Tensor:
-    """Return the factor a(z) = prod_j e^(g_j z_j) = prod_j (1 + g_j w_j), of shape (...).
+    """Return the product over d inputs z_j of e^(g_j z_j) = 1 + g_j w_j, shape (...).
 
     Args:
-        w: inputs (..., d) as ``bend`` transformed them.
+        w: inputs (..., d), transformed by ``bend`` with the same rates.
         rates: the rates g (d,).
     """
     grown: Tensor = (1 + w * rates).prod(-1)

@@ -48,8 +48,8 @@ def test_the_design_uses_an_installed_acquisition_plugin(plugin_server: ServerPr
         (
             "focused_variance",
             {},
-            "acquisition focused_variance: expected the setting coordinate, which has no default; "
-            "its settings are coordinate, near, width",
+            "acquisition focused_variance: expected a value for coordinate, which has no default, got none; "
+            "all settings are coordinate, near, width",
         ),
         (
             "focused_variance",

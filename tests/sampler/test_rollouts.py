@@ -173,9 +173,10 @@ def test_a_rollout_with_a_jump_or_steps_after_termination_is_refused(api, asked)
     def step(number, x, x_next, terminated=False):
         return NewSample(**values, step=number, coordinates=[x], next_coordinates=[x_next], terminated=terminated)
 
-    with pytest.raises(InvalidInput, match=r"samples.1.coordinates: expected \[0.1\], where step 0 ended, got \[0.2\]"):
+    expected = r"samples.1.coordinates: expected \[0.1\], where step 0 of the same query ended, got \[0.2\]"
+    with pytest.raises(InvalidInput, match=expected):
         api.add_samples(asked, "worker", [step(0, 0.0, 0.1), step(1, 0.2, 0.3)])
-    with pytest.raises(InvalidInput, match="after the end of an episode"):
+    with pytest.raises(InvalidInput, match="after the end of the episode in step 0"):
         api.add_samples(asked, "worker", [step(0, 0.0, 0.1, True), step(1, 0.1, 0.2)])
     with pytest.raises(InvalidInput, match="at most 4"):
         api.add_samples(asked, "worker", [step(i, float(i), i + 1.0) for i in range(5)])
@@ -186,7 +187,7 @@ def test_a_rollout_with_a_jump_or_steps_after_termination_is_refused(api, asked)
 def test_a_rollout_query_of_wrong_kind_or_length_is_refused(api, rail):
     with pytest.raises(InvalidInput, match="can't be set to a state"):
         api.add_queries(rail, [[0.0]], [[0.0]])
-    with pytest.raises(InvalidInput, match="at most 20 actions in each, got 21"):
+    with pytest.raises(InvalidInput, match="at most 20 actions in a rollout, got 21"):
         api.add_queries(rail, rollouts=[[LEFT] * 21])
     with pytest.raises(InvalidInput, match=r"entry 0 in \[-1, 1\], got 3"):
         api.add_queries(rail, rollouts=[[LEFT], [[3.0]]])

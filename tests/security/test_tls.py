@@ -77,5 +77,5 @@ def test_a_tls_server_does_not_answer_plain_http(server: ServerProcess):
 
 @pytest.mark.parametrize("alone", ["tls_certificate", "tls_key"])
 def test_a_tls_certificate_without_key_or_key_without_certificate_is_refused(certificate: Path, alone: str):
-    with pytest.raises(InvalidInput, match="expected a certificate and its key"):
+    with pytest.raises(InvalidInput, match="expected a certificate and its private key"):
         read_settings({}, **{alone: certificate})

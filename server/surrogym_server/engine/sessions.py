@@ -264,7 +264,7 @@ class LiveSessions:
             return live
         if id in self._expired:
             raise SessionExpired(f"session {id!r} was idle for more than {self.idle_seconds:g} s: open a new one")
-        raise UnknownSession(f"no session {id!r}: open a new one")
+        raise UnknownSession(f"expected the id of an open session, got {id!r}: open a new session")
 
     def _check_memory(self, nbytes: int) -> None:
         most, total = self._limits.nbytes, sum(live.nbytes for live in self._live.values())

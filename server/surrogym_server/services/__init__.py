@@ -1,1 +1,2 @@
-"""Use cases of the API. They call the core, the engine and the storage, and depend on neither HTTP nor wire types."""
+"""Functions behind the API's endpoints. They call the storage, the session engine and the modelling code, and know
+neither HTTP nor the types of JSON bodies."""

@@ -1,4 +1,4 @@
-"""Callers that called recently, such as samplers. They are kept in memory, and shown in the dashboard."""
+"""Clients that called the server recently, such as samplers. They are kept in memory, and shown in the dashboard."""
 
 from __future__ import annotations
 
@@ -11,25 +11,26 @@ from typing import Generic, TypeVar
 Clock = Callable[[], float]
 T = TypeVar("T")
 
-ALIVE_SECONDS = 75.0  # a caller without a call for longer is inactive; a long poll may last 60 s
-FORGET_AT = 256  # inactive callers are removed only when more callers are stored; a search at each call would be slow
-MOST_NAMES = 1_000  # largest number of active callers shown for a surrogate; further ones are served, but not shown
+ALIVE_SECONDS = 75.0  # a client counts as inactive if its last call began longer ago; a long poll lasts up to 60 s
+FORGET_AT = 256  # inactive clients are removed only when more clients are stored: a search at each call would be slow
+MOST_NAMES = 1_000  # the dashboard shows at most this many active clients of a surrogate; the server serves all
 
 
 class Alive(Generic[T]):
-    """Time of the last call of each caller, and the status (``T``) that the caller reported in this call.
-    Thread-safe."""
+    """Record of the clients that call the server for a surrogate: the time of each client's last call, and the status
+    (``T``) that the client reported in it. Thread-safe."""
 
     def __init__(self, clock: Clock = time.monotonic) -> None:
         self._clock = clock
-        self._heard = defaultdict[str, dict[str, tuple[float, T]]](dict)  # by surrogate and name of the caller
+        # Time of the last call and reported status, by names of the surrogate and of the client.
+        self._heard = defaultdict[str, dict[str, tuple[float, T]]](dict)
         self._forget_at = FORGET_AT
         self._lock = threading.Lock()
 
     def note(self, surrogate: str, name: str, status: T) -> bool:
-        """Record a call of the caller ``name``. Return whether the caller is new or was inactive before the call.
+        """Record a call of the client ``name``. Return whether the client is new or was inactive before the call.
 
-        A new caller is not recorded while ``MOST_NAMES`` others of the surrogate are active; the result is then False.
+        A new client is not recorded while ``MOST_NAMES`` others of the surrogate are active; the result is then False.
         """
         now = self._clock()
         with self._lock:
@@ -46,7 +47,7 @@ class Alive(Generic[T]):
         return now - before >= ALIVE_SECONDS
 
     def alive(self) -> list[tuple[str, str, T]]:
-        """Return the surrogate, the name and the status of each active caller, sorted by surrogate and name."""
+        """Return (surrogate, name, status) of each active client, sorted by surrogate and name."""
         now = self._clock()
         with self._lock:
             heard = {surrogate: self._active(names, now) for surrogate, names in self._heard.items()}
@@ -68,7 +69,7 @@ class Alive(Generic[T]):
 
 
 class Samplers(Alive[None]):
-    """Time of the last call of each sampler, by surrogate."""
+    """Record of the samplers that call the server, with the time of each sampler's last call, by surrogate."""
 
     def heard(self, surrogate: str, sampler: str) -> None:
         self.note(surrogate, sampler, None)

@@ -23,7 +23,7 @@ Define = Callable[[dict[str, Any]], EnvironmentDefinition]
 
 
 class Definitions:
-    """Environment definitions of stored surrogates by name; each is built once and cached.
+    """Cache of the environment definitions of stored surrogates, by name. Each is built when it is first needed.
 
     The package that provides a surrogate's model family or acquisition may have been uninstalled. ``get`` works
     without the package and is enough to read samples and states. ``for_model`` and ``for_design`` check that it is
@@ -37,7 +37,7 @@ class Definitions:
         self._lock = Lock()
 
     def get(self, name: str) -> EnvironmentDefinition:
-        """Return the definition of a surrogate. Raises ``UnknownSurrogate``."""
+        """Return the environment definition of the surrogate ``name``. Raises ``UnknownSurrogate``."""
         entry = self._cache.get(name)
         if entry is not None and entry[0] == self._storage.surrogates.standing(name).id:
             return entry[1]
@@ -53,7 +53,7 @@ class Definitions:
             return definition
 
     def for_model(self, name: str) -> EnvironmentDefinition:
-        """Return the definition of a surrogate for a caller that loads a model.
+        """Return the environment definition of a surrogate, for a caller that will load a model.
 
         Raises:
             UnknownSurrogate: there is no surrogate of this name.
@@ -64,7 +64,7 @@ class Definitions:
         return definition
 
     def for_design(self, name: str) -> EnvironmentDefinition:
-        """Return the definition of a surrogate for a caller that fits a model and chooses queries.
+        """Return the environment definition of a surrogate, for a caller that will fit a model and choose queries.
 
         Raises:
             UnknownSurrogate: there is no surrogate of this name.
@@ -85,7 +85,7 @@ class Definitions:
                 self.for_design(summary.name)
             except NotInstalled as error:
                 sentences.append(str(error))
-            except SurrogymError:  # the surrogate was just deleted, or is damaged, which each request for it reports
+            except SurrogymError:  # just deleted, or its specification is damaged, which requests for it report
                 continue
         return sentences
 
@@ -96,19 +96,23 @@ def _require(name: str, lack: str | None) -> None:
 
 
 def check_coordinates(definition: EnvironmentDefinition, what: str, rows: Array) -> Array:
-    """Return ``rows`` if they are coordinates of shape (n, C), else raise ``InvalidInput``; ``what`` is their name in
-    the message."""
+    """Return ``rows`` unchanged if their shape is (n, C), that of n states with C coordinates; otherwise raise
+    ``InvalidInput``. ``what`` is the array's name in the message."""
     names = definition.coordinate_names
     if rows.ndim != 2 or rows.shape[1] != len(names):
-        raise InvalidInput(f"{what}: expected (n, {len(names)}), one entry for each of {list(names)}, got {rows.shape}")
+        raise InvalidInput(
+            f"{what}: expected shape (n, {len(names)}), one column for each of {list(names)}, got {rows.shape}"
+        )
     return rows
 
 
 def check_points(definition: EnvironmentDefinition, q: Array, u: Array) -> tuple[Array, Array]:
-    """Check coordinates q (n, C) and actions u (n, F), and return both; actions as the model encodes them.
+    """Check coordinates q (n, C) and actions u (n, F) of n steps. Return the coordinates, and the actions in the form
+    in which the model takes them.
 
     Raises:
-        InvalidInput: a wrong shape, different numbers of coordinates and actions, or an action out of bounds.
+        InvalidInput: an array has a wrong shape, the numbers of states and actions differ, or an action is out of
+            bounds.
     """
     q = check_coordinates(definition, "coordinates", q)
     if len(q) != len(u):
@@ -119,11 +123,11 @@ def check_points(definition: EnvironmentDefinition, q: Array, u: Array) -> tuple
 
 
 def check_steps(definition: EnvironmentDefinition, queries: Sequence[Query]) -> list[Query]:
-    """Check queries of single steps, and return them with actions as the model encodes them.
+    """Check queries (requested real steps) that are single steps, and return them, with actions as float64.
 
     Raises:
-        InvalidInput: a wrong shape, a state to which the original environment can't be set, or an action out of
-            bounds.
+        InvalidInput: coordinates or actions have a wrong shape, the original environment can't be set to a state, or
+            an action is out of bounds.
     """
     q = check_settable(definition, np.array([query.coordinates for query in queries]))
     u = model_actions(definition.action, np.array([query.action for query in queries]))
@@ -131,25 +135,28 @@ def check_steps(definition: EnvironmentDefinition, queries: Sequence[Query]) -> 
 
 
 def check_rollouts(definition: EnvironmentDefinition, queries: Sequence[Query]) -> list[Query]:
-    """Check queries of rollouts, and return them with actions as the model encodes them.
+    """Check queries (requested real steps) that are rollouts, sequences of actions, and return them, with actions as
+    float64.
 
     Raises:
-        InvalidInput: a rollout that is too long, or actions of a wrong shape or out of bounds.
+        InvalidInput: a rollout is too long, or actions have a wrong shape or are out of bounds.
     """
     longest = definition.max_rollout or 0
     for query in queries:
         if query.steps > longest:
-            raise InvalidInput(f"rollouts: expected at most {longest} actions in each, got {query.steps}: split it")
+            raise InvalidInput(
+                f"rollouts: expected at most {longest} actions in a rollout, got {query.steps}: split the rollout"
+            )
     actions = (model_actions(definition.action, np.array(query.actions)) for query in queries)
     return [Query.rollout(u.tolist(), query.snapshot) for u, query in zip(actions, queries, strict=True)]
 
 
 def check_settable(definition: EnvironmentDefinition, q: Array) -> Array:
-    """Check that the original environment can be set to coordinates (n, C), and return them.
+    """Check that the original environment can be set to each of n states q (n, C), and return q.
 
     Raises:
-        InvalidInput: a wrong shape, or a value beyond the coordinate's bound, or beyond its sampling range on a side
-            without a bound.
+        InvalidInput: q has a wrong shape, or a value is beyond its coordinate's bound, or beyond the sampling range on
+            a side without a bound.
     """
     q = check_coordinates(definition, "coordinates", q)
     for index, coordinate in enumerate(definition.coordinates):

@@ -1,4 +1,5 @@
-"""The designer: fits each surrogate that is due, stores the model and the next queries, and wakes waiting samplers."""
+"""The designer: fits a model to the samples of each surrogate that needs a new one, stores the model and the next
+queries, and wakes waiting samplers."""
 
 from __future__ import annotations
 
@@ -43,15 +44,17 @@ logger = logging.getLogger(__name__)
 
 FIT_LEASE_SECONDS = 30.0
 RENEWALS_PER_LEASE = 3
-ATTEMPTS = 5  # largest number of attempts at a fit whose process died, or whose result could not be stored
-LONG_SECONDS = 60.0  # a fit that takes longer is logged as a warning
-PASSED_SECONDS = 5.0  # a fit that takes longer no longer occupies one of the ``fit_workers`` places
-MOST_PASSED = 3  # largest number of long fits that run beyond ``fit_workers``; each has a process
-PAUSE_SECONDS = 1.0  # shortest time between two renewals of a fit's lease
+ATTEMPTS = 5  # a fit is tried this many times if its process dies or its result can't be stored, then counts as failed
+LONG_SECONDS = 60.0  # if a fit runs longer than this, a warning is logged
+# A fit that runs longer than this frees its place among the ``fit_workers`` fits that run at the same time.
+PASSED_SECONDS = 5.0
+MOST_PASSED = 3  # at most this many long fits run in addition to the ``fit_workers`` others, each in its own process
+PAUSE_SECONDS = 1.0  # a running fit renews its lease at most once in this many seconds
 
 
 class _Turn:
-    """Place of a fit among the fits that run at the same time. A fit that runs long frees its place for another fit."""
+    """Place of a fit among the limited number of fits that run at the same time. ``let_others_pass`` exchanges it for
+    one of the places for long fits, so that another fit can start."""
 
     def __init__(self, usual: asyncio.Semaphore, passed: asyncio.Semaphore) -> None:
         self._usual, self._passed, self._current = usual, passed, usual
@@ -64,7 +67,8 @@ class _Turn:
         self._current.release()
 
     async def let_others_pass(self) -> None:
-        """After ``PASSED_SECONDS``, free the place for another fit, once fewer than ``MOST_PASSED`` long fits run."""
+        """Wait for ``PASSED_SECONDS``, and until fewer than ``MOST_PASSED`` long fits run. Then free the fit's usual
+        place for another fit."""
         await asyncio.sleep(PASSED_SECONDS)
         await self._passed.acquire()
         self._current = self._passed
@@ -78,7 +82,7 @@ class DesignerSettings:
     Attributes:
         owner: name of this server in the lease of a fit.
         threads: number of torch threads in a fit.
-        look_seconds: time between searches for surrogates that became due without a notice.
+        look_seconds: time between searches for surrogates that need a fit, in case no notice announced them.
         fit_seconds: a fit that takes longer is stopped and counts as failed.
         fit_workers: number of fits that run at a time, long ones not counted.
     """
@@ -94,7 +98,7 @@ class Designer:
     """Fits each surrogate that is due, which means that a new model has to be fitted. Each fit runs under a lease,
     which only one server can hold at a time."""
 
-    def __init__(  # eight parameters: seven objects of the server that a fit reads or notifies, and the settings
+    def __init__(  # not grouped into one object, because each parameter comes from a different part of the server
         self,
         storage: Storage,
         definitions: Definitions,
@@ -126,8 +130,9 @@ class Designer:
         self._metrics = metrics
         self._settings = settings
         self._usual, self._passed = asyncio.Semaphore(settings.fit_workers), asyncio.Semaphore(MOST_PASSED)
-        self._tasks: dict[str, asyncio.Task[None]] = {}  # running and waiting fits, by surrogate
-        self._unavailable: dict[str, int] = {}  # number of consecutive lost fits, by surrogate
+        self._tasks: dict[str, asyncio.Task[None]] = {}  # the running or waiting fit of each surrogate, by its name
+        # Number of successive fits of a surrogate, by its name, whose process died or whose result was not stored.
+        self._unavailable: dict[str, int] = {}
 
     async def run(self) -> None:
         """Fit surrogates as they become due, until cancelled. A surrogate whose fit is cancelled stays due."""
@@ -138,7 +143,7 @@ class Designer:
                         await self._begin_all_due()
                     except Unavailable as error:
                         logger.warning("the storage is unavailable or damaged, so the design waits: %s", error)
-                    except Exception:  # an error with one surrogate must not stop the fits of the others
+                    except Exception:  # any error is logged, so that fits of other surrogates continue
                         logger.exception("the search for due fits failed; it is repeated shortly")
                     await listener.wait(self._settings.look_seconds)
         finally:
@@ -148,7 +153,7 @@ class Designer:
             await asyncio.gather(*tasks, return_exceptions=True)
 
     async def fit_all_due(self) -> None:
-        """Fit each surrogate that is due, and return when all these fits have ended."""
+        """Fit a new model for each surrogate that is due (needs one), and return when all fits have ended."""
         await self._begin_all_due()
         await asyncio.gather(*self._tasks.values())
 
@@ -170,7 +175,7 @@ class Designer:
                 await self._fit(name, turn)
         except Damaged as error:
             logger.warning("the design of %s waits: %s", name, error)
-        except SurrogymError as error:  # the surrogate is deleted or leased by another server, or no storage answers
+        except SurrogymError as error:  # surrogate deleted or fitted by another server, or the storage does not answer
             logger.debug("%s is not fitted: %s", name, error)
         except Exception:
             logger.exception("the fit of %s could not be started or finished; it is tried again shortly", name)
@@ -196,7 +201,8 @@ class Designer:
         """
         if checkpoint is not None and self._storage.occupancy.get(name, checkpoint) is None:
             raise InvalidInput(
-                f"expected the name of a submitted occupancy, got {checkpoint!r}: submit it from a session first"
+                f"checkpoint: expected the name under which a session submitted its visited states, got "
+                f"{checkpoint!r}: submit them first"
             )
         if checkpoint is None and (latest := self._storage.occupancy.latest(name)) is not None:
             checkpoint = latest.checkpoint
@@ -231,8 +237,8 @@ class Designer:
             self._notices.post(name)
 
     def _may_try_again(self, name: str) -> bool:
-        """Count a fit of the surrogate that lost its process or storage. Return whether fewer than ``ATTEMPTS`` such
-        fits came in succession, so that the fit may be repeated."""
+        """Count one more fit of the surrogate ``name`` whose process died or whose result could not be stored. Return
+        whether there were fewer than ``ATTEMPTS`` such fits in succession, so that the fit may be repeated."""
         attempts = self._unavailable.pop(name, 0) + 1
         if attempts < ATTEMPTS:
             self._unavailable[name] = attempts
@@ -261,8 +267,8 @@ class Designer:
                 keeper.result()
             family = job.definition.learning.model.name
             raise PluginFailed(
-                f"the model family {family!r} took longer than {self._settings.fit_seconds:g} s, and was stopped: "
-                "surrogym serve --fit-seconds sets a longer limit"
+                f"a fit of the model family {family!r} took longer than {self._settings.fit_seconds:g} s, and was "
+                "stopped: surrogym serve --fit-seconds sets a longer limit"
             )
         finally:
             for task in (work, keeper, passing):
@@ -284,7 +290,7 @@ class Designer:
                     await asyncio.to_thread(self._storage.designs.renew, lease, FIT_LEASE_SECONDS)
                 except (LeaseExpired, UnknownSurrogate):
                     raise
-                except SurrogymError as error:  # storing the result will raise it again
+                except SurrogymError as error:  # not raised: if it persists, storing the fit's result raises it again
                     logger.debug("the right to fit %s is not renewed: %s", lease.surrogate, error)
                 if (took := time.monotonic() - began) > tell_after:
                     tell_after *= 2
@@ -314,7 +320,8 @@ class Designer:
             open_steps=sum(query.steps for query in pending if query.status != "set_aside"),
             refused=tuple(refused),
             snapshots=self._storage.snapshots.all(name) if definition.snapshots else {},
-            # The budget may have been lowered after these queries were requested.
+            # Limited by the rest of the budget, because the budget may have been lowered since the extra queries were
+            # requested.
             extra_queries=min(lease.extra_queries, max(0, record.budget - spoken)),
             occupancy=None if visits is None else visits.states,
             threads=self._settings.threads,
@@ -354,10 +361,10 @@ class Designer:
             self._storage.designs.abort(lease, error)
 
     def _give_up(self, hopeless: Sequence[str]) -> None:
-        """Set the designs of these surrogates to "failed": all their initial queries were set aside or refused, so no
-        sample will come."""
+        """Set the designs of the surrogates named in ``hopeless`` to "failed". Samplers answered none of their initial
+        queries, and all are set aside or refused, so no sample will come."""
         for name in hopeless:
-            with suppress(UnknownSurrogate):  # the surrogate was just deleted
+            with suppress(UnknownSurrogate):  # the surrogate may have been deleted since ``hopeless`` was read
                 set_aside = self._storage.queries.list(name, ("set_aside", "refused"))
                 refused = all(query.status == "refused" for query in set_aside)
                 how = "refused by the original environment" if refused else "set aside"
@@ -366,9 +373,10 @@ class Designer:
                 self._notices.post(name)
 
     def _ask_first(self, unbegun: Sequence[str]) -> None:
-        """Queue the initial queries of surrogates that were created without a budget and have one now."""
+        """Queue the initial queries of the surrogates named in ``unbegun``, which were created without a budget and
+        have one now."""
         for name in unbegun:
-            with suppress(SurrogymError):  # the surrogate was just deleted, or the storage does not answer
+            with suppress(SurrogymError):  # the surrogate may have been deleted, or the storage does not answer
                 budget = self._storage.surrogates.get(name).budget
                 self._storage.designs.ask_first(name, self._plan(self._definitions.get(name), budget))
                 self._notices.post(name)

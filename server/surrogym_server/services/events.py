@@ -15,10 +15,10 @@ from surrogym_server.storage.records import EventRecord
 T = TypeVar("T")
 
 SILENCE_SECONDS = 15.0
-CHANGE_SECONDS = 0.2  # shortest time between two pages of events, and between two results of ``changes``
+CHANGE_SECONDS = 0.2  # after sending events, a stream waits this long before it sends more, to send several together
 PAGE = 200
 RETRY_SECONDS = 2.0
-READING = 2  # reads of the database at a time; without a limit, many new streams would occupy all threads
+READING = 2  # at most this many threads read events from the database, so that many streams don't occupy all threads
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,18 +36,21 @@ class EventService:
         self._storage = storage
         self._notices = notices
         self._turn = asyncio.Semaphore(READING)
-        self._shared: dict[str, tuple[tuple[int, int], asyncio.Task[Page]]] = {}  # last page of each surrogate
+        # The last page of each surrogate by name, with (id after which it begins, number of the notice before it).
+        self._shared: dict[str, tuple[tuple[int, int], asyncio.Task[Page]]] = {}
 
     async def newest(self, name: str) -> int:
         """Return the id of a surrogate's last event, 0 if it has none. Raises ``UnknownSurrogate``."""
         newest = await self._read(lambda: self._storage.events.newest([name]))
         if name not in newest:
-            raise UnknownSurrogate(f"expected the name of a surrogate, got {name!r}, which does not exist")
+            raise UnknownSurrogate(
+                f"expected the name of a surrogate, got {name!r}, which does not exist: correct or register it"
+            )
         return newest[name]
 
     async def changes(self) -> AsyncIterator[bool]:
-        """Yield True after events of any surrogate, and False after ``SILENCE_SECONDS`` without one, until the server
-        stops."""
+        """Yield True when events of any surrogate have come, and False after each ``SILENCE_SECONDS`` without an event,
+        until the server stops."""
         with self._notices.listen() as listener:
             while not self._notices.closing:
                 changed = await listener.wait(SILENCE_SECONDS)
@@ -69,7 +72,7 @@ class EventService:
                         page = await self._page(name, after, version)
                     except UnknownSurrogate:
                         return
-                    except Unavailable:  # the stream continues once the storage is back
+                    except Unavailable:  # the stream waits, and continues when the storage answers again
                         await asyncio.sleep(RETRY_SECONDS)
                         continue
                     if page.events:
@@ -86,9 +89,10 @@ class EventService:
                 self._shared.pop(name, None)
 
     async def _page(self, name: str, after: int, version: int) -> Page:
-        """Return a surrogate's next events with an id above ``after``.
+        """Return the next events of the surrogate ``name`` with an id above ``after``, at most ``PAGE``.
 
-        Streams share a page if they request the same events and ``version``, the number of the last notice, is equal.
+        ``version`` is the number of the last notice that the stream has got. Streams with equal arguments share one
+        read of the database.
         """
         position, task = self._shared.get(name, (None, None))
         if task is None or position != (after, version):

@@ -12,10 +12,10 @@ from surrogym_server.services.notices import Listener, Notices
 
 T = TypeVar("T")
 
-FIRST = 4  # number of claims in a line that may ask the database at the same time
-LOOK_SECONDS = 2.0  # time between two checks whether the caller has closed its connection
+FIRST = 4  # at most this many waiting requests for the same kind of work ask the database at the same time
+LOOK_SECONDS = 2.0  # a waiting request checks this often (in seconds) whether its client has closed the connection
 
-Present = Callable[[], Awaitable[None]]  # raises if the caller has closed its connection
+Present = Callable[[], Awaitable[None]]  # function that raises an error if the client has closed its connection
 
 
 class _Line(Generic[T]):
@@ -55,11 +55,12 @@ class Lines(Generic[T]):
     async def claim(
         self, surrogate: str, kind: Hashable, ask: Callable[[], T], seconds: float, present: Present | None = None
     ) -> T:
-        """Ask for work, and wait for it at most ``seconds``. Return an answer with work, or else the last answer.
+        """Ask for work, and wait for it at most ``seconds``. Return the first answer that contains work, or the last
+        answer if none did.
 
         Args:
             surrogate: name of the surrogate whose notices announce new work.
-            kind: kind of work; claims of the same kind wait in one line.
+            kind: kind of work; claims of the same kind wait in one queue.
             ask: asks the database for work; called in a thread.
             seconds: longest wait.
             present: raises if the caller has closed its connection; called before each call of ``ask``.
@@ -84,7 +85,8 @@ class Lines(Generic[T]):
                 line.first.release()
 
     async def _answer(self, line: _Line[T], ask: Callable[[], T]) -> T:
-        """Return the line's last answer if no notice has come since it was given; else call ``ask``."""
+        """Return the last answer without work that any claim in ``line`` got, if no notice has come since; otherwise
+        ask the database by calling ``ask``."""
         if line.answer is not None and line.version == line.heard.version:
             return line.answer
         version, answer = line.heard.version, await asyncio.to_thread(ask)

@@ -17,4 +17,5 @@ class ProcessMetrics:
     fits: Durations = field(default_factory=Durations)
     failed_fits: int = 0
     expired_leases: int = 0
-    requests: dict[tuple[str, str, int], Durations] = field(default_factory=dict)  # by method, route and status
+    # Durations of HTTP requests, by (method, route, status code).
+    requests: dict[tuple[str, str, int], Durations] = field(default_factory=dict)

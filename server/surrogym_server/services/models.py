@@ -1,4 +1,4 @@
-"""Use cases of models: list, export, import, and predict at given points."""
+"""Functions on the models of a surrogate: list, export and import models, and predict at given points."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def load_model(storage: Storage, definitions: Definitions, surrogate: int, versi
         with plugin_calls(definition, interrupts=True):
             return from_bytes(definition, data)
     except InvalidInput as error:
-        raise Damaged(f"model {version} of {name!r} can't be read: {error}") from error
+        raise Damaged(f"model {version} of surrogate {name!r} can't be read: {error}") from error
 
 
 def stored_tolerances(storage: Storage, surrogate: int, version: int) -> tuple[float, ...]:

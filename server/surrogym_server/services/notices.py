@@ -10,7 +10,8 @@ from itertools import chain, islice
 
 from surrogym_server.storage.announcements import Alone, Announcements
 
-AT_ONCE = 50  # listeners woken in one iteration of the event loop, so that other requests are answered in between
+# At most this many listeners are woken in one iteration of the event loop. In between it can answer other requests.
+AT_ONCE = 50
 
 
 class Listener:
@@ -23,7 +24,7 @@ class Listener:
 
     @property
     def version(self) -> int:
-        """Number of the last notice to this listener. If it is the same at two times, no notice came in between."""
+        """Number of the last notice to this listener. If the number has not changed, no notice has come meanwhile."""
         return self._audience.version
 
     def wake(self) -> None:
@@ -33,7 +34,7 @@ class Listener:
         """Wait at most ``seconds`` for a notice, and return whether one has come. A notice that came since the last
         call counts."""
         with suppress(TimeoutError):
-            async with asyncio.timeout(seconds):  # wait_for of Python 3.11 can swallow a cancellation
+            async with asyncio.timeout(seconds):  # not asyncio.wait_for, which can lose a cancellation in Python 3.11
                 await self._event.wait()
         noticed = self._event.is_set()
         self._event.clear()
@@ -45,7 +46,7 @@ class Audience:
 
     def __init__(self, version: int) -> None:
         self.version = version
-        self.listeners: dict[Listener, None] = {}  # a dictionary as an ordered set
+        self.listeners: dict[Listener, None] = {}  # the keys are the listeners: a set that keeps their order
 
 
 class Notices:
@@ -62,7 +63,7 @@ class Notices:
         self._loop = asyncio.get_running_loop()
         self._audiences: dict[str, Audience] = {}
         self._everything = Audience(0)
-        self._newest: dict[str, int | None] = {}  # id of each surrogate's newest event at the last comparison
+        self._newest: dict[str, int | None] = {}  # id of each surrogate's newest event at the last call of ``compare``
         self._count = 0
         self.closing = False
         self._announcements.listen(self._hear)
@@ -80,7 +81,8 @@ class Notices:
 
     @contextmanager
     def listen(self, surrogate: str | None = None) -> Iterator[Listener]:
-        """Return a context that listens to one surrogate, or to all surrogates."""
+        """Return a context with a listener to notices of one surrogate, or of all surrogates if ``surrogate`` is
+        None."""
         audience = self._everything
         if surrogate is not None:
             audience = self._audiences.setdefault(surrogate, Audience(self._next()))
@@ -95,7 +97,7 @@ class Notices:
 
     @property
     def listened(self) -> list[str]:
-        """Names of the surrogates that have a listener of their own."""
+        """Names of the surrogates to which at least one listener listens. Listeners to all surrogates don't count."""
         return [*self._audiences]
 
     def compare(self, newest: dict[str, int]) -> None:
@@ -112,8 +114,9 @@ class Notices:
                 self._wake(name)
 
     def _hear(self, surrogate: str | None) -> None:
-        """Wake this process's listeners to a surrogate. None stands for lost notices and wakes all listeners."""
-        with suppress(RuntimeError):  # the event loop has ended, so there is no listener any more
+        """Wake the listeners of this process to ``surrogate``. None means that notices may have been lost, and wakes
+        all listeners."""
+        with suppress(RuntimeError):  # raised if the event loop is closed: no listener waits any more
             if surrogate is None:
                 self._loop.call_soon_threadsafe(self._wake_all)
             else:

@@ -1,4 +1,5 @@
-"""The queue of queries for samplers: claim with a long poll, renew, fail, add by hand."""
+"""The queue of queries (requested real steps). Samplers claim queries from it, renew their leases and report failures;
+people and audits add queries."""
 
 from __future__ import annotations
 
@@ -82,7 +83,8 @@ class QueryService:
     ) -> QueryRecord:
         """End the lease of a query that a sampler could not answer, with the sampler's ``error``.
 
-        ``begun`` is True if a real step may have been taken, ``refused`` if the original environment refused the query.
+        ``begun`` is True if a real step may have been taken, and ``refused`` is True if the original environment
+        refused the query.
 
         Raises:
             UnknownQuery: the surrogate has no such query.
@@ -101,8 +103,8 @@ class QueryService:
         ``key`` is the idempotency key: a repeat with the same key adds nothing.
 
         Raises:
-            InvalidInput: a wrong shape, a value out of bounds, or a kind of query that the original environment can't
-                answer.
+            InvalidInput: an array has a wrong shape, a value is out of bounds, or the original environment can't answer
+                this kind of query.
             IdempotencyConflict: the same key came with other queries.
             BeyondBudget: all audits of the surrogate together would take more real steps than its budget, and more than
                 128.
@@ -112,8 +114,8 @@ class QueryService:
         if definition.max_rollout is None:
             if kinds != {"step"}:
                 raise InvalidInput(
-                    "expected coordinates and actions, got rollouts: the original environment can be set to any state, "
-                    "so send single steps"
+                    "expected coordinates and actions of single steps, got rollouts: the original environment can be "
+                    "set to any state, so send single steps"
                 )
             queries = check_steps(definition, queries)
         else:
@@ -140,7 +142,8 @@ class QueryService:
         return withdrawn
 
     def list(self, name: str, statuses: Sequence[QueryStatus]) -> list[QueryRecord]:
-        """Return the queries with one of the ``statuses``, oldest first; all queries if ``statuses`` is empty."""
+        """Return the queries of the surrogate ``name`` whose status is in ``statuses``, or all if this is empty, oldest
+        first."""
         return self._storage.queries.list(name, statuses)
 
 

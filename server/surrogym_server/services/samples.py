@@ -1,4 +1,4 @@
-"""Use cases of samples: add them, read them, and count real steps."""
+"""Functions on the samples (results of real steps) of a surrogate: add and read samples, and count real steps."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from surrogym_server.storage.records import LedgerRecord, LogPart, NewSample, Sa
 from surrogym_shared.nouns import Vector
 
 PAGE = 10_000
-BATCH = 500  # steps of a log that one transaction stores
-LOG = "log"  # name of the sampler of logged steps
+BATCH = 500  # steps of a log are stored in batches of this size, each in one database transaction
+LOG = "log"  # steps of a log are stored with this name in place of a sampler's name
 
 
 @dataclass(frozen=True)
@@ -28,13 +28,13 @@ class Added:
     ids: tuple[int, ...]
     duplicates: int
     ledger: LedgerRecord
-    digest: str | None = None  # hash of a log's steps so far, see ``storage.records.AddedSamples``
+    digest: str | None = None  # hash of all steps of a log up to the last stored one; None for steps of no log
     restart: str | None = None
 
 
 @dataclass(frozen=True)
 class AddedLog:
-    stored: int  # steps of the log that were not stored before
+    stored: int  # number of steps of the log that this call has stored, because they were not stored before
     duplicates: int
 
 
@@ -58,7 +58,7 @@ class SampleService:
         key: str | None,
         log: LogPart | None = None,
     ) -> Added:
-        """Store real steps, all or none. They are committed when the call returns.
+        """Store real steps, either all or, if an error is raised, none. They are in the database when the call returns.
 
         Args:
             name: name of the surrogate.
@@ -69,9 +69,9 @@ class SampleService:
                 a log, the initial queries that it makes unnecessary are withdrawn.
 
         Raises:
-            InvalidInput: a wrong shape, an action out of bounds, or a missing key. The message names the sample by its
-                index.
-            UnknownQuery: the surrogate has no such query.
+            InvalidInput: an array has a wrong shape, an action is out of bounds, or the key is missing. The message
+                names the sample by its index.
+            UnknownQuery: the surrogate has no query with the id in a sample.
             ForeignLease: the token is not that of a lease of this query.
             IdempotencyConflict: the same key came with other samples.
         """
@@ -80,8 +80,8 @@ class SampleService:
         check_trajectories(checked)
         if key is None and log is None and any(sample.query_id is None for sample in checked):
             raise InvalidInput(
-                "samples without a query_id: expected an idempotency_key, a text of your own that names this "
-                "request, got none"
+                "idempotency_key: expected one, because some samples have no query_id, got none: add a text of your "
+                "own that names this request"
             )
         added = self._storage.samples.add(name, sampler, checked, key=key, log=log)
         if log is not None and log.complete and added.restart is None:
@@ -129,7 +129,7 @@ class SampleService:
         return self._storage.samples.page(name, after, limit)
 
     def snapshots(self, name: str) -> dict[str, Vector]:
-        """Return the coordinates (C,) of each snapshot that samplers hold, by the snapshot's name."""
+        """Return the coordinates (C,) of each snapshot (saved state) to which samplers can return, by its name."""
         return self._storage.snapshots.all(name)
 
     def drop_snapshots(self, name: str, snapshots: Sequence[str]) -> int:
@@ -157,12 +157,12 @@ class SampleService:
 
 
 def check_trajectories(samples: Sequence[NewSample]) -> None:
-    """Check that each step of a rollout begins where the previous step ended, and that no step follows the end of an
-    episode.
+    """Check that each step of a rollout begins at the state in which its previous step ended, and that no step follows
+    the end of an episode.
 
     Raises:
-        InvalidInput: a step begins elsewhere or follows the end of an episode; the message names the sample by its
-            index.
+        InvalidInput: a step begins at another state or follows the end of an episode; the message names the sample by
+            its index.
     """
     steps = {(s.query_id, s.lease_token, s.step): s for s in samples}
     for index, sample in enumerate(samples):
@@ -171,12 +171,13 @@ def check_trajectories(samples: Sequence[NewSample]) -> None:
             continue
         if before.terminated or before.truncated:
             raise InvalidInput(
-                f"samples.{index}: expected no step after the end of an episode, got step {sample.step}: leave it out"
+                f"samples.{index}: expected no step after the end of the episode in step {before.step}, got step "
+                f"{sample.step}: leave it out"
             )
         if before.next_coordinates != sample.coordinates:
             raise InvalidInput(
-                f"samples.{index}.coordinates: expected {list(before.next_coordinates)}, where step {before.step} "
-                f"ended, got {list(sample.coordinates)}"
+                f"samples.{index}.coordinates: expected {list(before.next_coordinates)}, where step {before.step} of "
+                f"the same query ended, got {list(sample.coordinates)}"
             )
 
 
@@ -184,7 +185,8 @@ def _checked(definition: EnvironmentDefinition, index: int, sample: NewSample) -
     where = f"samples.{index}"
     if (sample.query_id is None) != (sample.lease_token is None):
         raise InvalidInput(
-            f"{where}: expected query_id and lease_token together, got one of them: send both, as the claim gave them"
+            f"{where}: expected both query_id and lease_token, or neither, got one of them: send both, as the reply to "
+            "the claim of the query has them"
         )
     check_coordinates(definition, f"{where}.coordinates", np.array([sample.coordinates]))
     check_coordinates(definition, f"{where}.next_coordinates", np.array([sample.next_coordinates]))
@@ -200,4 +202,4 @@ def _checked(definition: EnvironmentDefinition, index: int, sample: NewSample) -
 def _check_observation(definition: EnvironmentDefinition, where: str, observation: tuple[float, ...] | None) -> None:
     size = len(definition.observation_names)
     if observation is not None and len(observation) != size:
-        raise InvalidInput(f"{where}: expected {size} entries, got {len(observation)}")
+        raise InvalidInput(f"{where}: expected {size} numbers, one for each observation entry, got {len(observation)}")

@@ -1,4 +1,5 @@
-"""Use cases of sessions besides steps: open, describe, submit occupancy, close, save at shutdown, restore at start."""
+"""Functions on sessions other than steps: open, describe and close a session, store the states that it visited, and
+save all sessions when the server stops and restore them when it starts."""
 
 from __future__ import annotations
 
@@ -17,7 +18,7 @@ from surrogym_server.services.definitions import Definitions
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import SavedSession
 
-MOST_STARTS = 10_000  # largest number of real states that a session gets as starts of its episodes
+MOST_STARTS = 10_000  # if episodes start at states of real steps, a session gets at most this many of these states
 
 logger = logging.getLogger(__name__)
 
@@ -48,13 +49,14 @@ class SessionService:
         """Return a session's present state.
 
         Raises:
-            UnknownSession: the session does not exist, or its session host died and the results of its last requests
-                are lost.
+            UnknownSession: the session does not exist, or the process that ran it died and its last steps are lost.
             SessionExpired: the session was idle for too long.
         """
         info = await self._engine.describe(id)
-        if info.behind:  # a client that asks for the description has not kept its requests to repeat them
-            raise UnknownSession(f"session {id!r} has lost its last replies with its session host: open a new one")
+        if info.behind:  # such a session needs its client's last requests again, but this client does not have them
+            raise UnknownSession(
+                f"session {id!r} has lost its last steps, because the process that ran it died: open a new session"
+            )
         return info
 
     async def coordinates(self, id: str) -> Array:
@@ -76,7 +78,7 @@ class SessionService:
             UnknownSurrogate: another server deleted the surrogate.
         """
         visits = await self._engine.submit(id)
-        # Another surrogate may have the session's name by now, so the surrogate is found by its id.
+        # The surrogate is found by its id, because it may have been deleted and another one may have its name.
         name = await asyncio.to_thread(self._storage.surrogates.name_of, visits.surrogate_id)
         await asyncio.to_thread(self._storage.occupancy.put, name, checkpoint, visits.states)
         return len(visits.states), visits.confidence_index
@@ -121,9 +123,10 @@ class SessionService:
         return Open(surrogate, record.id, definition, opening, rewards, starts)
 
     def _starts(self, surrogate: str, opening: Opening) -> Array | None:
-        """Return the states (n, C) of real steps at which the session may start episodes, at most ``MOST_STARTS``.
+        """Return the states (n, C) of n real steps of the surrogate, at which the session may start episodes. If there
+        are more than ``MOST_STARTS``, return that many, evenly spaced in their order.
 
-        Returns None if the session's settings start no episode at such states.
+        Return None if the setting ``start_visited`` is 0, so that no episode starts at such a state.
         """
         if opening.settings.start_visited == 0:
             return None

@@ -1,4 +1,4 @@
-"""Use cases of surrogates: create, describe, change, delete."""
+"""Functions on surrogates: create, preview, describe, list, change and delete them."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ Plan = Callable[[EnvironmentDefinition, int], tuple[Query, ...]]
 Complete = Callable[[dict[str, Any]], dict[str, Any]]
 
 ABSENT = object()
-READS = 3  # largest number of attempts to read a consistent status while fits are stored
-SHOWN = 120  # largest number of characters of a value in an error message
+READS = 3  # a surrogate's status is read at most this many times, until no fit is stored between its parts
+SHOWN = 120  # a value of a specification is cut to this many characters in an error message
 
 
 @dataclass(frozen=True)
@@ -37,8 +37,8 @@ class Listed:
     """Entry in the list of surrogates, with the active samplers and the number of open sessions."""
 
     summary: SurrogateSummary
-    samplers: tuple[str, ...]  # names of the samplers that called within the last minute or so
-    sessions: int  # number of open sessions
+    samplers: tuple[str, ...]  # names of the surrogate's samplers that called the server within about a minute
+    sessions: int  # number of open sessions of the surrogate
 
 
 @dataclass(frozen=True)
@@ -48,16 +48,16 @@ class SurrogateStatus(Listed):
     record: SurrogateRecord
     outputs: tuple[str, ...]
     model: ModelRecord | None
-    budget_left: int  # real steps that may still be requested within the budget
+    budget_left: int  # number of real steps that the design may still request before its budget is spent
 
 
 @dataclass(frozen=True)
 class Checked:
-    """Preview of a registration, of which nothing is stored."""
+    """Preview of the registration of a surrogate. Nothing of it is stored."""
 
-    initial: int  # number of real steps of the initial queries
+    initial: int  # number of real steps that the first queries of the design would take
     outputs: tuple[str, ...]
-    exists: bool  # whether the surrogate exists with the same specification
+    exists: bool  # whether a surrogate of this name and specification exists already
 
 
 class SurrogateService:
@@ -165,7 +165,7 @@ class SurrogateService:
         """
         outputs = self._definitions.get(name).outputs
         if unknown := sorted(set(tolerances or ()) - set(outputs)):
-            raise InvalidInput(f"tolerances: unknown output {unknown[0]!r}, expected some of {list(outputs)}")
+            raise InvalidInput(f"tolerances: expected names of outputs, which are {list(outputs)}, got {unknown[0]!r}")
         self._storage.surrogates.change(name, paused=paused, budget=budget, target=target, tolerances=tolerances)
         self._notices.post(name)
         return self.status(name)
@@ -190,13 +190,14 @@ class SurrogateService:
         )
 
     def _read(self, name: str) -> tuple[SurrogateSummary, ModelRecord | None, int]:
-        """Return a surrogate's summary, its latest model, and the real steps left in its budget, all of one moment.
+        """Return a surrogate's summary, the record of its latest model, and the real steps that its budget has left.
 
-        If a fit is stored between the three reads, all are repeated, at most ``READS`` times.
+        If a fit is stored between these three reads, they are repeated, so that they fit together, at most ``READS``
+        times.
         """
         for _ in range(READS):
             left = self._storage.designs.left(name)
-            # The summary is read before the model, so that the model is not older than the summary.
+            # The summary must be read before the model. Otherwise the model could be older than the summary.
             summary = self._storage.surrogates.summary(name)
             try:
                 model = self._storage.models.get(name)
@@ -209,8 +210,8 @@ class SurrogateService:
 
 
 def check_same(name: str, had: Any, got: Any) -> None:
-    """Raise ``SpecConflict`` if the stored specification and the new one differ. The message names the first
-    difference."""
+    """Raise ``SpecConflict`` if the stored specification ``had`` of the surrogate ``name`` differs from the new one,
+    ``got``. The message names the first difference."""
     if had != got:
         where, old, new = difference(had, got)
         raise SpecConflict(
@@ -220,7 +221,8 @@ def check_same(name: str, had: Any, got: Any) -> None:
 
 
 def difference(had: Any, got: Any, where: str = "") -> tuple[str, Any, Any]:
-    """Return the first place where two JSON values differ, such as ``coordinates.0.name``, and both values there."""
+    """Return the path to the first difference between two JSON values, such as ``coordinates.0.name``, and both values
+    at this path. ``where`` is the path to ``had`` and ``got`` themselves."""
     if isinstance(had, dict) and isinstance(got, dict):
         pairs = [(key, had.get(key, ABSENT), got.get(key, ABSENT)) for key in {**had, **got}]
     elif isinstance(had, list) and isinstance(got, list) and len(had) == len(got):

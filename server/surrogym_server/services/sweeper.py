@@ -17,7 +17,7 @@ from surrogym_server.storage.port import Storage
 
 logger = logging.getLogger(__name__)
 
-EVENTS_KEPT = 10_000  # number of newest events of a surrogate that are kept
+EVENTS_KEPT = 10_000  # of each surrogate, this many events are kept in the database, the newest ones
 PRUNE_SECONDS = 60.0
 
 
@@ -31,9 +31,9 @@ class Sweeper:
         notices: Notices,
         others: Sequence[Callable[[], Awaitable[None]]] = (),
     ) -> None:
-        """Keep the storage and the engine on which the periodic work is done.
+        """Keep the objects of the server on which the periodic work is done.
 
-        ``seconds`` is the time between sweeps, and ``others`` are functions of optional features for each sweep.
+        ``seconds`` is the time between two sweeps. ``others`` are functions of optional features that each sweep calls.
         """
         self._storage = storage
         self._engine = engine
@@ -75,12 +75,12 @@ class Sweeper:
             await sweep()
         except SurrogymError as error:
             logger.warning("a sweep stopped early; it is repeated shortly: %s", error)
-        except Exception:  # an error in one sweep must not stop the later ones
+        except Exception:  # any error is logged, so that later sweeps take place
             logger.exception("a sweep failed; it is repeated shortly")
 
     def _prune(self) -> None:
-        """Every ``PRUNE_SECONDS``, remove the events of each surrogate beyond the newest ``EVENTS_KEPT``, and finish
-        deletions of surrogates that a crash interrupted."""
+        """Remove old events, so that each surrogate keeps the newest ``EVENTS_KEPT``, and finish deletions of
+        surrogates that a crash interrupted. Do nothing if the last time was less than ``PRUNE_SECONDS`` ago."""
         now = time.monotonic()
         if now - self._pruned < PRUNE_SECONDS:
             return

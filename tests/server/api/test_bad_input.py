@@ -161,19 +161,19 @@ def sample(**changes: Any) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"coordinates": [0.1]}, "samples.0.coordinates: expected (n, 2)"),
-        ({"next_coordinates": [0.1, 0.2, 0.3]}, "samples.0.next_coordinates: expected (n, 2)"),
+        ({"coordinates": [0.1]}, "samples.0.coordinates: expected shape (n, 2)"),
+        ({"next_coordinates": [0.1, 0.2, 0.3]}, "samples.0.next_coordinates: expected shape (n, 2)"),
         ({"action": [0.1, 0.2]}, "action: expected shape (1, 1), got (1, 2)"),
         ({"reward": 1e200}, "less than or equal to 1000"),
         ({"next_coordinates": [0.1, -1e308]}, "greater than or equal to -1000"),
         ({"action": [2.5]}, "action: expected entry 0 in [-2, 2], got 2.5"),
-        ({"observation": [1.0]}, "samples.0.observation: expected 3 entries, got 1"),
+        ({"observation": [1.0]}, "samples.0.observation: expected 3 numbers, one for each observation entry, got 1"),
         ({"reward": float("nan")}, "samples.0.reward: expected a finite number, got nan"),
         ({"coordinates": [float("inf"), 0.0]}, "samples.0.coordinates.0: expected a finite number, got inf"),
         ({"reward": "1.0"}, "samples.0.reward: expected a number, got '1.0'"),
         ({"terminated": 1}, "samples.0.terminated: expected true or false, got 1"),
         ({"mood": "good"}, "samples.0.mood: expected no entry of this name, got 'good'"),
-        ({"query_id": 1}, "query_id and lease_token together"),
+        ({"query_id": 1}, "expected both query_id and lease_token, or neither, got one"),
     ],
 )
 def test_an_invalid_sample_is_refused_and_nothing_is_stored(
@@ -218,7 +218,7 @@ def test_reusing_an_idempotency_key_with_another_sample_is_refused(client: httpx
 @pytest.mark.parametrize(
     ("body", "said"),
     [
-        ({"coordinates": [[0, 0, 0]], "action": [[0]]}, "coordinates: expected (n, 2)"),
+        ({"coordinates": [[0, 0, 0]], "action": [[0]]}, "coordinates: expected shape (n, 2)"),
         ({"coordinates": [[0, 9]], "action": [[0]]}, "'theta_dot': expected a value in [-8, 8], got 9"),
         ({"coordinates": [[4, 0]], "action": [[0]]}, "'theta': expected a value in [-3.1416, 3.1416], got 4"),
         ({"coordinates": [[0, 0], [0]], "action": [[0], [0]]}, "coordinates: expected rows of one length"),

@@ -39,7 +39,7 @@ def test_the_serve_command_refuses_a_port_in_use_in_one_sentence(server_process:
 @pytest.mark.parametrize(
     ("options", "environment", "said"),
     [
-        (["--host", "0.0.0.0"], {}, "host 0.0.0.0 is not loopback: expected a token"),
+        (["--host", "0.0.0.0"], {}, "host 0.0.0.0 can be reached from other machines: expected a token"),
         (["--port", "70000"], {}, "setting port"),
         (["--token-file", "/no/such/file"], {}, "/no/such/file"),
         ([], {"WEB_CONCURRENCY": "4"}, "expected one server process, got WEB_CONCURRENCY=4"),

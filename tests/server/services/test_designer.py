@@ -280,7 +280,7 @@ def test_a_fit_beyond_the_time_limit_is_stopped_with_an_error_naming_the_option(
     record = answered.surrogates.get(NAME)
     assert (record.phase, runner.ended) == ("failed", 1)
     assert record.error == (
-        "the fit failed: the model family 'gaussian_process' took longer than 0.2 s, and was stopped: "
+        "the fit failed: a fit of the model family 'gaussian_process' took longer than 0.2 s, and was stopped: "
         "surrogym serve --fit-seconds sets a longer limit"
     )
 

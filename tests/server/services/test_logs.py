@@ -108,7 +108,7 @@ def test_a_log_of_a_part_of_the_range_leaves_some_initial_queries(storage: Stora
     [
         ({"action": (9.0,)}, r"samples\.2: action: expected entry 0 in \[-2, 2\], got 9$"),
         ({"action": (0.0, 0.0)}, r"samples\.2: action: expected shape \(1, 1\)"),
-        ({"coordinates": (0.0,)}, r"samples\.2\.coordinates: expected \(n, 2\)"),
+        ({"coordinates": (0.0,)}, r"samples\.2\.coordinates: expected shape \(n, 2\)"),
     ],
 )
 def test_a_log_with_an_invalid_row_is_refused_with_index_and_reason(
