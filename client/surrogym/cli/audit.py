@@ -1,4 +1,4 @@
-"""``surrogym audit``: compare a few real steps on a policy's way with the model."""
+"""``surrogym audit``: compare a few real steps, in states that a policy visits, with the model."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""The commands as a person meets them: grouped in the help, with options for experts in a section of their own, and a
-sentence about what takes the place of an option that was removed."""
+"""The help of the command line, with commands in groups and options for experts in a section of their own; and errors
+that name the replacement of an option that was removed."""
 
 from __future__ import annotations
 

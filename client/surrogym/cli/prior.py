@@ -117,7 +117,8 @@ def command(
 
 @dataclass(frozen=True)
 class _Target:
-    """A surrogate whose prior the command sets, with its view at the start of the command."""
+    """A surrogate whose prior the command sets, and the server's description of it (``view``) at the start of the
+    command."""
 
     api: Api
     calls: PriorCalls

@@ -104,7 +104,7 @@ def command(
 
 
 def _logs(log: Path, mapping: Path | None, spec: EnvironmentSpec, *, follow: bool) -> Iterator[ReadLog]:
-    """Yield the log once, or with ``follow`` or from standard input, repeatedly with its latest rows."""
+    """Yield the log once. With ``follow``, or from standard input, yield its latest rows each time it has grown."""
     from surrogym_trainer.watching.logs import chunks_of_file, chunks_of_stream, read_growing, read_once
 
     if str(log) == "-":

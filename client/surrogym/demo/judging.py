@@ -1,5 +1,5 @@
-"""Evaluation of a policy in the original environment, from its own starts and, if the task has others, from those as
-well."""
+"""Evaluation of a policy in the original environment, from the declared starts and, if the task has further starts,
+from those as well."""
 
 from __future__ import annotations
 

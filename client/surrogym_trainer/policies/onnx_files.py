@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from surrogym_client.errors import SurrogymClientError
 from surrogym_trainer.policies.predict import Predict
 
-MAX_BYTES = 256 * 1024 * 1024  # largest size of a file
-LANES = 1_024  # largest number of observations in one call of the network; more are split
+MAX_BYTES = 256 * 1024 * 1024  # largest size of a policy's ONNX file
+LANES = 1_024  # largest number of observations in one call of the network; more observations take several calls
 MAX_NUMBERS = 64 * 1024 * 1024  # largest number of numbers in all arrays of one call together, including the weights
 INPUT, OUTPUT = "observation", "action"
 

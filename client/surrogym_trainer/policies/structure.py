@@ -35,7 +35,7 @@ from surrogym_trainer.policies.networks import PaperPolicy, Standardise
 from surrogym_trainer.policies.saved_settings import PolicySettings
 
 ENTRY = "surrogym-policy.json"
-MAX_BYTES = 256 * 1024 * 1024  # largest total size of a file's entries
+MAX_BYTES = 256 * 1024 * 1024  # largest total size of the unpacked entries of a policy's file
 WEIGHTS = ".pth"
 PICKLED = ":serialized:"
 DECAYING = "decaying"

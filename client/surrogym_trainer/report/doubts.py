@@ -10,7 +10,7 @@ from surrogym_trainer.report.known import PREFERRED, Known
 from surrogym_trainer.report.prediction import outcome_of
 from surrogym_trainer.report.wording import starts_of
 
-FEW = 30  # number of episodes below which an average is unreliable
+FEW = 30  # the report says that an average over fewer episodes than this is unreliable
 
 
 def tested(known: Known) -> str:

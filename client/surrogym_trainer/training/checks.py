@@ -40,7 +40,7 @@ class Checks:
 
     def __init__(self, untrained: Returns, saved: Returns | None = None) -> None:
         self.untrained = float(untrained.mean())
-        self.latest: float | None = None  # imagined return of the last check
+        self.latest: float | None = None  # mean return of the policy in the last check (imagined return)
         self.returns_of_best: Returns | None = None  # (episodes,) returns of the best policy so far
         self._half_way = self.untrained if saved is None else (self.untrained + float(saved.mean())) / 2
         # return that the best quarter of the episodes of a check reaches: with an untrained network (few), and the

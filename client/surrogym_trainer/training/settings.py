@@ -161,7 +161,7 @@ class TrainResult:
     lost_episodes: int  # number of episodes that ended because the server lost the session
     settings: dict[str, Any]
     episode_penalty: float | None = None  # mean penalty of the last 100 training episodes; None without a penalty
-    networks: int = 1  # number of networks in the last training; more than one if some learned nothing
+    networks: int = 1  # number of networks that the last training began; above 1 if some learned nothing
     gaining: bool = False  # whether the best policy was still improving when the training ended
     untrained: float | None = None  # imagined return of an untrained network; None if not measured
     visited_confidence: tuple[float | None, ...] = ()  # confidence index over the visited states of each round

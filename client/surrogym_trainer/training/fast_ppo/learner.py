@@ -68,11 +68,11 @@ class Objective:
 class Batch:
     """Transitions to learn from, one in each of B rows."""
 
-    observations: Array  # (B, D) standardised observations
-    actions: Array  # (B, F) actions taken
+    observations: Array  # (B, D) standardised observations of B transitions, D entries each
+    actions: Array  # (B, F) actions taken, F entries each
     log_probabilities: Array  # (B,) log probabilities of the actions when they were taken
-    advantages: Array  # (B,) estimated advantages
-    returns: Array  # (B,) targets of the critic, from scaled rewards
+    advantages: Array  # (B,) estimated advantage of each of the B actions
+    returns: Array  # (B,) value that the critic learns for each of the B observations, from scaled rewards
 
     def at(self, rows: NDArray[np.int64] | slice) -> Batch:
         """Return the batch of the selected rows."""

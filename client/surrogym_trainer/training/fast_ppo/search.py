@@ -57,9 +57,8 @@ FINE = 0.1  # learning rate in the stage ``refine``, as a share of that in the s
 QUIET = 0.1
 # the stage ``refine`` first collects observations, without learning, in at most this share of the suggested steps
 LOOKS = 1 / 8
-CRITIC_ROLLOUTS = (
-    8  # before the actor learns in the stage ``refine``, only the critic learns in this number of rollouts
-)
+# before the actor learns in the stage ``refine``, only the critic learns in this number of rollouts
+CRITIC_ROLLOUTS = 8
 STAGE_SEED = 2_000_003  # the seed of the actions' noise grows by this number from one stage to the next
 
 

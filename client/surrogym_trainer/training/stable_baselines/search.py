@@ -50,7 +50,7 @@ class StableBaselinesSearch(PolicySearch):
 
     algorithm: ClassVar[type[BaseAlgorithm]]
     policy: ClassVar[type[BasePolicy] | str]
-    lanes: ClassVar[int]  # default number of lanes
+    lanes: ClassVar[int]  # default number of virtual environments that step together
     tracked = True
     whole_episodes = False
 
