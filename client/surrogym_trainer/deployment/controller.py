@@ -23,7 +23,7 @@ from surrogym_shared.spec.actions import Action
 Array = NDArray[np.float64]
 Activation = Literal["none", "tanh", "relu"]
 
-# bits of a controller's status; 0 means that the action is the policy's
+# bits of a controller's status, one for each kind of fault; 0 means that the policy acts
 NOT_FINITE, OUT_OF_RANGE, LATE, NO_ACTION = 1, 2, 4, 8
 LIMITED = 16  # status of a step in which the fallback for the specification's limits acts instead of the policy
 PERIODS = 2  # default timeout, in sampling periods; above 1, because the duration of a period varies

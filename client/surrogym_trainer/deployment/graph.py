@@ -74,7 +74,7 @@ def description(controller: Controller) -> dict[str, Any]:
 
 
 def _limits(guard: Guard, names: tuple[str, ...]) -> dict[str, Any]:
-    """Return the limits, which the network does not keep by itself, as a JSON object."""
+    """Return the limits of a controller as a JSON object. The network does not keep them by itself."""
     return {
         "limits": [
             {"name": limit.term.name, "is": _term(limit.term, names), "margin": limit.margin}
@@ -88,7 +88,8 @@ def _limits(guard: Guard, names: tuple[str, ...]) -> dict[str, Any]:
 
 
 def _rates(controller: Controller) -> dict[str, Any]:
-    """Return the rates of the action, which the network does not keep by itself, as a JSON object."""
+    """Return the largest change per step (rate) of each action entry that has one, as a JSON object. The network does
+    not keep the rates by itself."""
     return {
         "rates": [{"entry": rate.entry, "largest_change": rate.change} for rate in controller.rates],
         "keeping_rates": "not inside: an entry of the action may change by at most largest_change in a step",

@@ -46,8 +46,7 @@ class Decided(NamedTuple):
 
     memory: Memory
     action: Array  # (N, F) action that each of N controllers takes
-    # (N,) status of each of N controllers: the bits of its faults, or LIMITED; 0 if the action is the policy's
-    status: Ints
+    status: Ints  # (N,) status of each of N controllers: the bits of its faults, or LIMITED; 0 if the policy acts
 
 
 def begin(controller: Controller, number: int = 1) -> Memory:
@@ -83,7 +82,8 @@ def decide(controller: Controller, memory: Memory, measurements: Array, age: Arr
 
 
 def within_rates(controller: Controller, coordinates: Array, action: Array) -> Array:
-    """Return the actions that keep the rates at coordinates (N, C) and are nearest to ``action`` (N, F)."""
+    """Return the actions (N, F) that are nearest to ``action`` (N, F) and do not change faster than the controller's
+    rates allow. Coordinates (N, C) contain each controller's last action as lags."""
     kept = action.copy()
     for rate in controller.rates:
         last = coordinates[:, rate.last]

@@ -133,7 +133,7 @@ def _guard(controller: Controller, prefix: str) -> dict[str, str]:
 
 
 def _rates(controller: Controller) -> str:
-    """Return the lines that cut off what an entry of the action changes by too much in one step."""
+    """Return the C lines that limit the change of each action entry in a step to its rate; empty without rates."""
     lines = []
     for rate in controller.rates:
         last = f"controller->coordinates[{rate.last}]"

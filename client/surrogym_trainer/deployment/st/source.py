@@ -184,7 +184,7 @@ END_IF
 
 
 def _rates(controller: Controller, real: str) -> Iterable[dict[str, str]]:
-    """Yield what the template ``RATED`` needs for each entry of the action with a rate."""
+    """Yield the values of the template ``RATED`` for each entry of the action with a largest change per step (rate)."""
     for rate in controller.rates:
         yield {"entry": str(rate.entry), "last": str(rate.last), "change": _number(rate.change, real)}
 
