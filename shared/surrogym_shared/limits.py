@@ -5,6 +5,7 @@ Shapes: n states, C coordinates, L limits, F action entries.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 from itertools import product
 from typing import Protocol
@@ -81,6 +82,19 @@ def nearest(spec: EnvironmentSpec, coordinates: Array) -> tuple[Limit, float]:
     every = room(spec, coordinates[None])[0]
     index = int(np.argmin([r / (limit.margin or 1.0) for r, limit in zip(every, limits_of(spec).keep, strict=True)]))
     return limits_of(spec).keep[index], float(every[index])
+
+
+def left_too_often(left: int, episodes: int, share: float, level: float) -> bool:
+    """Return whether too many episodes left a limit: an exact one-sided binomial test, at a level such as 0.01, of
+    ``left`` of so many episodes against the allowed share."""
+    if left == 0 or share >= 1:
+        return False
+    constant, odds = math.lgamma(episodes + 1) + episodes * math.log1p(-share), math.log(share) - math.log1p(-share)
+    tail = (
+        math.exp(constant + k * odds - math.lgamma(k + 1) - math.lgamma(episodes - k + 1))
+        for k in range(left, episodes + 1)
+    )
+    return math.fsum(tail) < level
 
 
 class Step(Protocol):

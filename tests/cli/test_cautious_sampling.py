@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shlex
 from pathlib import Path
 from typing import Any
@@ -106,6 +107,24 @@ def test_sampling_a_program_with_limits_warns_before_it_starts_that_only_the_pro
     said = on_server("sample", name + "-program", "--exec", command, "--max-queries", "1").err
     assert said.index("only the program itself can fall back") < said.index("answered")
     assert "kill" not in on_server("sample", cart, *CART, "--max-queries", "1").err
+
+
+def test_a_sampler_whose_rollouts_leave_a_limit_more_often_than_allowed_ends_before_the_next_query(
+    on_server: Any, name: str
+) -> None:
+    leaving = ("--env", "support.limited:LeavingCart")
+    on_server("register", name, *leaving)
+    said = on_server("sample", name, *leaving, "--until-done")
+    assert said.code != 0
+    stopped = re.search(
+        r"(\d) of (\d) rollouts of this sampler left a limit \(rail: \1\), which is more than", said.err
+    )
+    assert stopped is not None
+    assert "choose a larger margin, a smaller range of actions, or a fallback that holds" in said.err
+    view = json.loads(on_server("status", name, "--json").out)
+    assert (view["ledger"]["unresolved"], view["queries"]["leased"]) == (0, 0)
+    assert view["queries"]["answered"] == int(stopped[2])
+    assert view["queries"]["pending"] > 0
 
 
 def test_the_status_command_shows_how_the_real_steps_kept_each_limit(on_server: Any, cart: str) -> None:

@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 from pydantic import ValidationError
+from scipy.stats import binomtest
 
 from support.limited import BRAKE, LIMITS, RAIL, SPEC, with_limits
-from surrogym_shared.limits import fallback_action, falls_back, nearest, past, room
+from surrogym_shared.limits import fallback_action, falls_back, left_too_often, nearest, past, room
 from surrogym_shared.spec import Coordinate, DiscreteAction, EnvironmentSpec, Limit, Limits, Term, Uniform
 
 X = Term.linear(x=1.0)
@@ -114,3 +115,11 @@ def test_a_one_sided_limit_has_infinite_distance_on_the_other_side() -> None:
     one = with_limits(LIMITS.model_copy(update={"keep": (limit(low=None),)}))
     assert room(one, np.array([[-1e6, 0.0]]))[0, 0] == pytest.approx(1e6 + 1)
     assert not falls_back(one, np.array([[-1.0, 0.0]]), np.array([[-1e6, 0.0]])).any()
+
+
+@pytest.mark.parametrize(("episodes", "share"), [(1, 0.02), (7, 0.02), (40, 0.3), (2_000, 0.01), (50, 1.0)])
+def test_limits_are_left_too_often_by_the_exact_binomial_test(episodes: int, share: float) -> None:
+    for left in range(min(episodes, 60) + 1):
+        probability = binomtest(left, episodes, share, alternative="greater").pvalue
+        for level in (0.01, 0.05):
+            assert left_too_often(left, episodes, share, level) == (probability < level)

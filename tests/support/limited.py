@@ -97,6 +97,17 @@ class SlowCart(Cart):
         return super().step(action)
 
 
+class LeavingCart(PatientCart):
+    """A strong cart whose limit most steps leave."""
+
+    def __init__(self) -> None:
+        rail = RAIL.model_copy(update={"low": -0.2, "high": 0.2, "margin": 0.05})
+        super().__init__(with_limits(Limits(keep=(rail,), fallback=(Term.constant(1.0),))))
+
+    def step(self, action):
+        return super().step(4 * np.asarray(action))
+
+
 class FreeCart(Cart):
     """A cart that declares no limits."""
 

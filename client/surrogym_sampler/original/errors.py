@@ -11,6 +11,7 @@ OriginalError
 ├── SnapshotNotKept         a state can't be saved or written; no query will begin there
 ├── UnusableFolder          snapshots can't be kept in this folder; nothing was begun
 ├── MachineFails            the environment failed at several different queries in a row; the worker stops
+├── LimitsLeft              more rollouts left a limit than is allowed; the worker stops
 ├── EvaluationFailed        the environment or the policy failed after real steps had been taken
 └── StepFailed              the environment did not give a step; the query fails, the worker continues
     ├── StepTimedOut        it took longer than its limit and was killed; the next step starts a fresh one
@@ -72,6 +73,11 @@ class UnusableFolder(OriginalError):
 
 class MachineFails(OriginalError):
     """The environment failed at several different queries in a row. The claimed queries were returned to the queue."""
+
+
+class LimitsLeft(OriginalError):
+    """More rollouts of a sampler left a limit than its specification allows. The claimed queries were returned to the
+    queue."""
 
 
 class EvaluationFailed(OriginalError):

@@ -1,16 +1,23 @@
-"""Distinction between a broken machine and single failing queries, so that a broken machine does not use up the
-attempts of every query."""
+"""Reasons for a sampler to stop by itself: a machine that fails at every query, so that it does not use up the attempts
+of each, and limits that do not hold."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
-from surrogym_sampler.original.errors import MachineFails
+import numpy as np
+
+from surrogym_sampler.original.errors import LimitsLeft, MachineFails
+from surrogym_shared.limits import left_too_often, limits_of, room
+from surrogym_shared.spec import EnvironmentSpec
+from surrogym_shared.wire import NewSample
 
 FIRST_FEW = 4  # a machine that has never answered counts as broken after this number of different failed queries
 MANY = 8  # a machine that has answered before counts as broken after this number of failed queries in a row
 # Wait in seconds after a failure: the first, doubled with each failure, to the longest.
 FIRST_DELAY, LONGEST_DELAY = 1.0, 30.0
+FEWEST_LEFT = 2  # smallest number of rollouts beyond a limit after which a sampler may stop
+LEFT_LEVEL = 0.01  # probability that a sampler stops although at most twice the allowed share of rollouts leave a limit
 
 
 class Failures:
@@ -56,3 +63,40 @@ class Failures:
                 f"own, and no other query was begun; the last error was: {self._last}; repair it, and start the "
                 "sampler again"
             )
+
+
+class Violations:
+    """The rollouts of one sampler that left a limit of the environment's own specification.
+
+    A sampler stops if they are more than twice the allowed share of episodes explains.
+    """
+
+    def __init__(self, spec: EnvironmentSpec) -> None:
+        self._spec = spec
+        self._rollouts = self._left = 0
+        self._limits = np.zeros(0 if spec.limits is None else len(spec.limits.keep), dtype=int)  # (L,) rollouts
+        self._too_many = False
+
+    def rollout(self, steps: Sequence[NewSample]) -> None:
+        """Note the real steps of a rollout."""
+        if self._spec.limits is None or not steps:
+            return
+        reached = np.array([step.next_coordinates for step in steps])
+        left = (room(self._spec, reached) < 0).any(axis=0)
+        self._rollouts += 1
+        self._left += bool(left.any())
+        self._limits += left
+        share = 2 * self._spec.limits.probability
+        self._too_many = self._left >= FEWEST_LEFT and left_too_often(self._left, self._rollouts, share, LEFT_LEVEL)
+
+    def check(self) -> None:
+        """Raise ``LimitsLeft`` if too many rollouts left a limit, before further queries begin."""
+        if not self._too_many:
+            return
+        limits = limits_of(self._spec)
+        each = ", ".join(f"{limit.name}: {n}" for limit, n in zip(limits.keep, self._limits, strict=True) if n)
+        raise LimitsLeft(
+            f"{self._left} of {self._rollouts} rollouts of this sampler left a limit ({each}), which is more than "
+            f"the allowed {100 * limits.probability:g} % explain, so no other query was begun: choose a larger margin, "
+            "a smaller range of actions, or a fallback that holds, and register it under another name"
+        )

@@ -22,7 +22,7 @@ from surrogym_sampler.original.protocol import (
     RolloutEnvironment,
 )
 from surrogym_sampler.original.rollouts import answering
-from surrogym_sampler.queries.failures import Failures
+from surrogym_sampler.queries.failures import Failures, Violations
 from surrogym_sampler.queries.leases import AWAY, ONE_ATTEMPT, LeaseEnded, Leases
 from surrogym_sampler.queries.pipeline import Pipeline
 from surrogym_sampler.queries.query_limits import check_environment, check_query
@@ -84,7 +84,8 @@ class Sampler:
     sampler may have taken the query. A step that is running then is finished and sent.
 
     After failures at several different queries in a row, the sampler waits longer and longer, and then ends. So a fault
-    of the machine does not use up the three attempts that each query has.
+    of the machine does not use up the three attempts that each query has. It also ends if too many rollouts left
+    a limit.
 
     The server is not trusted with the environment. Each query is checked against the environment's own specification.
     One that it does not allow is returned as not begun, and nothing is sent to the environment.
@@ -129,6 +130,7 @@ class Sampler:
         self._phase: Phase | None = None
         self._spec: EnvironmentSpec
         self._own: EnvironmentSpec
+        self._violations: Violations
         self._leases: Leases
         self._pipeline = Pipeline(self._settle, self._return)
         self._started = time.monotonic()
@@ -151,6 +153,7 @@ class Sampler:
             ServerUnreachable, Unavailable: the server, or its storage, did not answer for too long.
             UnknownEnvironment: the environment can't be made, or does not fit the surrogate.
             MachineFails: the environment failed at several queries in a row.
+            LimitsLeft: more rollouts left a limit than the allowed share of episodes explains.
         """
         self._started, self._broken_off = time.monotonic(), False
         self._check()
@@ -195,6 +198,7 @@ class Sampler:
         self._environment = answering(self._environment)
         self._spec, self._own = self._api.surrogate(self._surrogate).spec, self._environment.spec()
         check_environment(self._surrogate, self._spec, self._own)
+        self._violations = Violations(self._own)
 
     def _wait_seconds(self) -> float:
         """Return the seconds that the next claim waits for queries."""
@@ -221,6 +225,7 @@ class Sampler:
         left, self._begun = list(queries), None
         try:
             while left:
+                self._violations.check()
                 self._failures.check([query.id for query in left])
                 self._pause(self._within_time(self._failures.delay()))
                 if self._stopped() or self._out_of_time():
@@ -244,6 +249,8 @@ class Sampler:
         ahead = self._limit(running=1) if flows and last else 0
         claim = partial(self._claim, ahead, 0.0, ONE_ATTEMPT) if ahead > 0 else None
         answer = self._pipeline.step(partial(self._step, query), claim)
+        if query.kind == "rollout":
+            self._violations.rollout(answer.taken)
         self._pipeline.send(partial(self._deliver, answer), clean=flows and answer.clean, last=last)
 
     def _step(self, query: Query) -> _Answer:

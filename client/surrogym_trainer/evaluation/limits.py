@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from surrogym_shared.limits import limits_of, past, room
+from surrogym_shared.limits import left_too_often, limits_of, past, room
 from surrogym_shared.spec import EnvironmentSpec
 
 LEVEL = 0.05  # if a policy keeps its limits as declared, they count as broken with at most this probability
@@ -45,10 +45,7 @@ class LimitsKept:
     @property
     def broken(self) -> bool:
         """Whether more episodes left a limit than the declared probability explains, at a level of 5 %."""
-        from scipy.stats import binomtest
-
-        found = binomtest(self.violations, self.episodes, self.probability, alternative="greater")
-        return self.violations > 0 and bool(found.pvalue < LEVEL)
+        return left_too_often(self.violations, self.episodes, self.probability, LEVEL)
 
     def summary(self) -> dict[str, Any]:
         """Return the counts and the interval, as JSON."""
