@@ -12,7 +12,7 @@ SWING_UP_STEPS = 40  # time limit of an episode, in steps of 0.1 s
 
 def register() -> None:
     """Register this package's environments with Gymnasium. Repeating it is harmless."""
-    import gymnasium  # imported late, so that reading the names does not load it
+    import gymnasium  # imported here, so that importing this module does not load Gymnasium
 
     for environment_id, module in ((ENVIRONMENT_ID, "gym_factories"), (FILE_ID, "file_factories")):
         if environment_id not in gymnasium.registry:

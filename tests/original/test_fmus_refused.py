@@ -70,7 +70,7 @@ def test_a_damaged_fmu_file_is_refused_with_the_fault(tanks: Path, tmp_path: Pat
         ({"actions": {"pump": [1, 0]}}, r"expected low < high, got \[1, 0\]"),
         ({"actions": ["flow"]}, "of the continuous inputs of .*pump.*, got flow"),
         ({"coordinates": []}, "expected continuous variables of .*, got none"),
-        ({"steps": 1.0}, "expected fmu, and optionally step, actions, coordinates and start"),
+        ({"steps": 1.0}, "expected the key fmu, and optionally step, actions, coordinates and start"),
         ({"actions": ["pump", "pump"]}, "actions: expected each variable once, got 'pump' twice"),
         ({"coordinates": ["lower", "lower"]}, "coordinates: expected each variable once, got 'lower' twice"),
         ({"step": -1.0}, "step: expected a number greater than 0"),

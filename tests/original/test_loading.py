@@ -168,8 +168,11 @@ def test_environment_names_that_cannot_be_loaded_are_refused(own_module, name, m
 @pytest.mark.parametrize(
     ("code", "message"),
     [
-        ("import sys; sys.exit('no licence')", r"ends ended while it was imported: SystemExit: no licence \(ends.py:1"),
-        ("import sys; Cart = sys.exit", "ends:Cart ended while it was made: SystemExit"),
+        (
+            "import sys; sys.exit('no licence')",
+            r"ends called sys.exit while it was imported: SystemExit: no licence \(ends.py:1",
+        ),
+        ("import sys; Cart = sys.exit", "ends:Cart called sys.exit while it was made: SystemExit"),
     ],
 )
 def test_the_error_for_an_environment_module_that_calls_exit_names_it(tmp_path, monkeypatch, code, message):

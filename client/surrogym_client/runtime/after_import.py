@@ -39,7 +39,7 @@ class _Finder:
         sys.meta_path.remove(self)
         spec = PathFinder.find_spec(fullname, path, target)
         if spec is not None and spec.loader is not None:
-            # _Loader has the two methods that Python calls.
+            # The cast is safe, because _Loader has the two methods that Python calls.
             spec.loader = cast("Loader", _Loader(spec.loader, self._function))
         return spec
 

@@ -39,7 +39,7 @@ TOKEN_FILE_VARIABLE = "SURROGYM_TOKEN_FILE"
 _NOT_SENT = (httpx.ConnectError, httpx.ConnectTimeout, httpx.PoolTimeout, StreamUnavailable)
 _TIMEOUTS = (httpx.TimeoutException, TimeoutError)
 _GATEWAY_STATUSES = (502, 503, 504)
-_KEEPALIVE_SECONDS = 3.0  # shorter than the server's 5 s, so that a request rarely meets a closing connection
+_KEEPALIVE_SECONDS = 3.0  # idle connections are kept for this time; the server closes them after 5 s
 
 
 @dataclass(frozen=True)
@@ -198,7 +198,7 @@ class Connection:
             try:
                 return attempt()
             except (httpx.TransportError, OSError, Unavailable) as failure:
-                # The connection of a failed request is closed, so that a late reply is never taken for another's.
+                # The connection of a failed request is closed, so that its late reply is not read for another request.
                 delays = (retries or self.retries).delays() if delays is None else delays
                 pause = next(delays, None) if _may_repeat(failure, repeatable) else None
                 if pause is None:
@@ -282,7 +282,7 @@ def _checked(url: str) -> str:
 def _new_client(url: str, token: str | None) -> httpx.Client:
     headers = {"Authorization": f"Bearer {token}"} if token else {}
     limits = httpx.Limits(keepalive_expiry=_KEEPALIVE_SECONDS)
-    trusted = httpx.create_ssl_context()  # SSL_CERT_FILE also applies to loopback hosts, unlike proxies
+    trusted = httpx.create_ssl_context()  # SSL_CERT_FILE holds for loopback hosts too, proxies don't
     return httpx.Client(headers=headers, limits=limits, verify=trusted, trust_env=not _is_loopback(url))
 
 

@@ -22,7 +22,7 @@ from surrogym_shared.port import Bools, PolicyRollout, ResetResult, StepResult
 Array = NDArray[Any]
 Seeds = int | Sequence[int] | None
 
-UNREADABLE = (msgspec.DecodeError, FrameError)  # raised by the readers if the body is not a reply
+UNREADABLE = (msgspec.DecodeError, FrameError)  # errors that decoding raises if a body is not a reply
 
 R = TypeVar("R", frames.ResetReply, frames.StepReply, frames.RolloutReply, frames.PolicyReply)
 
@@ -133,7 +133,7 @@ class JsonForm:
     media_type = "application/json"
 
     def reset(self, seq: int, seed: Seeds, mask: Bools | None, shape: Shape) -> bytes:
-        del shape  # the server checks the shape
+        del shape  # not needed: JSON shows the shape, and the server checks it
         body = {"seq": seq, "seed": _plain(seed), "mask": _listed(mask)}
         return _ENCODER.encode({name: value for name, value in body.items() if value is not None})
 

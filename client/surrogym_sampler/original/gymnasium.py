@@ -151,7 +151,8 @@ def unpacked(snapshot: bytes, shape: tuple[int, ...]) -> NDArray[Any]:
         state: NDArray[Any] = np.load(io.BytesIO(snapshot), allow_pickle=False)
     except (ValueError, EOFError, OSError) as error:
         raise StepFailed(
-            f"expected a snapshot with an array of shape {shape}, got one that can't be read ({error}): delete it"
+            f"expected a snapshot with an array of shape {shape}, got a snapshot that can't be read ({error}): delete "
+            "it"
         ) from error
     if state.shape != shape:
         raise StepFailed(

@@ -232,7 +232,7 @@ def load_factory(name: str) -> Any:
         raise UnknownEnvironment(f"expected package.module:factory, got {name!r}: {error}") from error
     except SystemExit as error:
         raise UnknownEnvironment(
-            f"{module_name} ended while it was imported: {sentence(error)}; remove the call of sys.exit"
+            f"{module_name} called sys.exit while it was imported: {sentence(error)}; remove the call"
         ) from error
     if not callable(factory):
         raise UnknownEnvironment(
@@ -297,7 +297,7 @@ def _made(name: str) -> Any:
         return factory()
     except SystemExit as error:
         raise UnknownEnvironment(
-            f"{name} ended while it was made: {sentence(error)}; remove the call of sys.exit"
+            f"{name} called sys.exit while it was made: {sentence(error)}; remove the call"
         ) from error
 
 

@@ -171,7 +171,7 @@ class OriginalPort:
 
     def _lanes(self, session: str) -> list[_Lane]:
         if session not in self._sessions:
-            raise ValueError(f"expected an open session, got {session!r}, which is closed or unknown: open one")
+            raise ValueError(f"expected an open session, got {session!r}, which is closed or unknown: open a session")
         return self._sessions[session]
 
 

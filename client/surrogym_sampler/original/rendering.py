@@ -72,8 +72,9 @@ class _Own:
         picture = np.asarray(self._environment.picture(coordinates))
         if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3:
             raise NotRenderable(
-                f"expected picture() to return (height, width, 3) of uint8, got {picture.shape} of {picture.dtype}: "
-                "convert it"
+                f"expected picture() to return an array (height, width, 3) of uint8, got {picture.shape} of "
+                f"{picture.dtype}: "
+                "convert the picture"
             )
         return picture
 

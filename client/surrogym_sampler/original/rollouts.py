@@ -173,8 +173,8 @@ def answering(environment: object) -> Environment:
         )
     if rates(environment.spec()) and not isinstance(environment, FromReset):
         raise UnknownEnvironment(
-            "the action has a rate, which Surrogym keeps in an environment with reset, step and coordinates: expected "
-            f"these methods, got a {type(environment).__name__} that takes steps itself"
+            "the action has a rate, which Surrogym keeps only in an environment with reset, step and coordinates: "
+            f"expected these methods, got a {type(environment).__name__} without: write them, or remove the rate"
         )
     query = environment.spec().query
     needed, methods = (

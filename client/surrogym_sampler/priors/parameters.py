@@ -117,8 +117,8 @@ def adjustable(simulator: Any) -> Adjustable:
 
 
 def read_parameters(texts: Sequence[str], plant: Adjustable) -> tuple[Parameter, ...]:
-    """Read the parameters to be calibrated, each as ``Parameter.parse`` does. Raises ``ValueError`` if one is invalid
-    or given twice."""
+    """Read the parameters to be calibrated, each from a text ``NAME`` or ``NAME=LOW..HIGH``. Raises ``ValueError`` if a
+    text is invalid or a parameter is given twice."""
     present = plant.parameters()
     read = tuple(Parameter.parse(text, present) for text in texts)
     names = [parameter.name for parameter in read]

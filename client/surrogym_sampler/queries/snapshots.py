@@ -36,7 +36,7 @@ class Bounds:
 
 @dataclass(frozen=True)
 class _Kept:
-    """What is known about a snapshot's file without reading its state."""
+    """Facts about a snapshot's file, which are known without reading the saved state in it."""
 
     coordinates: tuple[float, ...]  # (C,) coordinates of the saved state
     size: int  # size of the file in bytes

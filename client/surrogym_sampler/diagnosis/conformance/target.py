@@ -55,7 +55,8 @@ class Target:
             return self
         self._close()
         raise SurrogymClientError(
-            f"expected an unused surrogate name, got {self.surrogate!r}, which exists on this server: choose another"
+            f"expected an unused surrogate name, got {self.surrogate!r}, which exists on this server: choose another "
+            "name"
         )
 
     def __exit__(self, *_: object) -> None:

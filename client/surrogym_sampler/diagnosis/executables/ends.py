@@ -1,5 +1,5 @@
-"""Checks that a program ends on the request ``close``, and when its standard input ends. With limits, it then applies
-their fallback first."""
+"""Checks that a program ends on the request ``close``, and when its standard input ends. If the specification
+declares limits, the fallback controller then has to act first."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from surrogym_sampler.original.executables.messages import action_entries, short
 from surrogym_sampler.original.limits.guard import MOST_STEPS, rest_seconds
 
 END_SECONDS = 2.0
-EXAMPLE = '{"fallback": 12}'  # the last line of a program whose fallback took 12 steps
-ACTIONS = 3  # number of actions after which the fallback has to bring the machine to rest
+EXAMPLE = '{"fallback": 12}'  # last line that a program prints after 12 steps of its fallback controller
+ACTIONS = 3  # number of random actions before the input ends and the fallback controller has to act
 SEEDS = 5
 
 
@@ -23,9 +23,9 @@ def the_end_of_its_input_ends_the_program(subject: Subject) -> None:
 
 def without_input_the_fallback_of_limits_acts(subject: Subject) -> None:
     if subject.spec.limits is None:
-        raise LeftOut("its specification declares no limits")
+        raise LeftOut("the program's specification declares no limits")
     if not any(_in_motion(subject, seed) for seed in range(SEEDS)):
-        raise LeftOut(f"each of {SEEDS} episodes ended within {ACTIONS} steps")
+        raise LeftOut(f"all {SEEDS} test episodes ended within {ACTIONS} random steps, before the input could be ended")
     seconds = rest_seconds(subject.spec) + subject.seconds
     subject.program.end_input()
     subject.program.surplus(seconds)
@@ -37,7 +37,7 @@ def without_input_the_fallback_of_limits_acts(subject: Subject) -> None:
     if not 1 <= _steps(printed) <= MOST_STEPS:
         raise Mismatch(f"expected one line such as {EXAMPLE} with 1 to {MOST_STEPS} steps, got {short(printed)}")
     if ended is None:
-        raise Mismatch(f"expected the program to end within {END_SECONDS:g} s after this line, got one that still runs")
+        raise Mismatch(f"expected the program to end within {END_SECONDS:g} s after this line, got a running program")
 
 
 def close_ends_the_program(subject: Subject) -> None:
@@ -55,7 +55,7 @@ def _exit_code(subject: Subject, more_seconds: float = 0.0) -> int:
 
 
 def _in_motion(subject: Subject, seed: int) -> bool:
-    """Begin an episode and act a few times. Returns whether the episode continues."""
+    """Begin an episode, take ``ACTIONS`` random steps, and return whether the episode continues."""
     subject.reset(seed)
     for _ in range(ACTIONS):
         reply = subject.ask("step", action=action_entries(subject.spec.action, subject.random_action()))
@@ -65,7 +65,7 @@ def _in_motion(subject: Subject, seed: int) -> bool:
 
 
 def _steps(line: bytes) -> int:
-    """Return the number of steps of the fallback in the last line of a program; 0 if it is another line."""
+    """Return the number of steps of the fallback controller that a printed line states; 0 if it states none."""
     try:
         steps = json.loads(line)["fallback"]
     except (ValueError, LookupError, TypeError, RecursionError):

@@ -1,4 +1,4 @@
-"""Refusals of environments that no specification can express, before their real steps if possible.
+"""Checks that refuse an environment which no specification can express, if possible before its real steps.
 
 Shapes: n steps, R resets, V variables of the state.
 """

@@ -1,4 +1,4 @@
-"""Sentences for the findings of a description."""
+"""Sentences that say what was found about an environment while its specification was drafted."""
 
 from __future__ import annotations
 

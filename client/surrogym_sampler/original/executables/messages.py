@@ -93,7 +93,7 @@ def numbers(reply: Reply, key: str, size: int) -> Array:
     """
     came = reply.get(key)
     if not isinstance(came, list) or len(came) != size or not all(map(_is_number, came)):
-        raise _wrong(f"{size} finite numbers", reply, key)
+        raise _wrong(f"expected {size} finite numbers for {key!r}", reply, key)
     return np.array(came, dtype=np.float64)
 
 
@@ -104,7 +104,7 @@ def number(reply: Reply, key: str) -> float:
         StepFailed: the reply has no such number.
     """
     if not _is_number(reply.get(key)):
-        raise _wrong("a finite number", reply, key)
+        raise _wrong(f"expected a finite number for {key!r}", reply, key)
     return float(reply[key])
 
 
@@ -116,7 +116,7 @@ def truth(reply: Reply, key: str) -> bool:
     """
     came = reply.get(key)
     if not isinstance(came, bool):
-        raise _wrong("true or false", reply, key)
+        raise _wrong(f"expected true or false for {key!r}", reply, key)
     return came
 
 
@@ -128,7 +128,7 @@ def text(reply: Reply, key: str) -> str:
     """
     came = reply.get(key)
     if not isinstance(came, str):
-        raise _wrong("a text", reply, key)
+        raise _wrong(f"expected a text for {key!r}", reply, key)
     return came
 
 
@@ -160,8 +160,8 @@ def specification_in(reply: Reply) -> EnvironmentSpec:
 
 
 def _wrong(expected: str, reply: Reply, key: str) -> StepFailed:
-    """Return the error for an entry ``key`` of an answer that is not what was ``expected``."""
-    return StepFailed(f"expected {expected} for {key!r} in the program's answer, got {_got(reply, key)}; {CHECK}")
+    """Return the error for an answer whose entry ``key`` can't be used; its message begins with ``expected``."""
+    return StepFailed(f"{expected} in the program's answer, got {_got(reply, key)}; {CHECK}")
 
 
 def _is_number(value: object) -> bool:

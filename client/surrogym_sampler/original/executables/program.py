@@ -72,8 +72,8 @@ class Program:
         return self._process is not None and self._process.poll() is None
 
     def grant(self, seconds: float) -> None:
-        """Let the program run some seconds longer after this process was killed, because the fallback of its limits
-        acts then. This also holds after the program is started again."""
+        """Let the program run these seconds longer after this process was killed, so that its fallback controller can
+        act. This also holds after the program is started again."""
         self._grace += seconds
         if self._guard is not None and self._process is not None:
             self._guard.dismiss()

@@ -58,7 +58,7 @@ class Fmu(SavingSimulator):
         if len(state) > MAX_DIMENSIONS:
             raise UnknownEnvironment(
                 f"{archive.path} has {len(state)} variables that describe its state: expected at most "
-                f'{MAX_DIMENSIONS}; choose some by "coordinates" in a JSON file'
+                f'{MAX_DIMENSIONS}; choose some as "coordinates" in a JSON file that names the FMU'
             )
         outputs = archive.of_causality("output") or state
         self._state, self._size = state, len(state)

@@ -69,7 +69,7 @@ def read_choices(name: str) -> tuple[Path, Choices]:
     except ValidationError as error:
         wrong = first_fault(error) if error.errors()[0]["loc"] else "not a JSON object"
         raise UnknownEnvironment(
-            f"{path}: {wrong}; expected fmu, and optionally step, actions, coordinates and start"
+            f"{path}: {wrong}; expected the key fmu, and optionally step, actions, coordinates and start"
         ) from error
     except ValueError as error:
         raise UnknownEnvironment(f"{path} is not JSON: {error}; correct the file at this position") from error

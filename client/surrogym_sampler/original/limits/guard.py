@@ -25,8 +25,8 @@ STILL = 1e-3  # a machine rests if no coordinate changes by more than this share
 
 
 def rest_seconds(spec: EnvironmentSpec) -> float:
-    """Return the longest time in seconds that the fallback of a specification's limits takes, besides its last step; 0
-    without limits."""
+    """Return the longest time in seconds for which a specification's fallback controller acts, without the duration of
+    its last step; 0 without limits."""
     return 0.0 if spec.limits is None else MOST_STEPS * (spec.sampling_period or 0.0)
 
 
@@ -44,7 +44,8 @@ class Guard:
         self._at = np.zeros(len(spec.coordinates))
         self._change = np.zeros(len(spec.coordinates))  # (C,) absolute change of each coordinate in the last step
         self._margins = margins(spec)
-        self._room = self._room_before = np.full(len(self._margins), np.inf)  # (L,) to the limits
+        # Distances (L,) to the L limits in the last state, and in the state before it.
+        self._room = self._room_before = np.full(len(self._margins), np.inf)
         self._fastest = np.zeros(len(spec.coordinates))  # (C,) largest change of each coordinate in a step
         self._measured = True  # whether all coordinates of the last state are finite
 

@@ -34,7 +34,7 @@ def read_parameters(path: Path) -> dict[str, Any]:
         if key in given:
             _check_range(path, key, given[key])
     if not _numbers(given["x0"]):
-        raise _expected(path, "x0", "a list of finite numbers", given["x0"])
+        raise _expected(path, "expected x0 to be a list of finite numbers", given["x0"])
     _check_schedule(path, "SP", given["SP"], given["N"])
     if given.get("disturbances") is not None:
         _check_schedule(path, "disturbances", given["disturbances"], given["N"])
@@ -75,30 +75,36 @@ def check_model(where: str, given: Mapping[str, Any], info: Mapping[str, Any]) -
 
 def _check_times(path: Path, given: Mapping[str, Any]) -> None:
     if not isinstance(given["model"], str):
-        raise _expected(path, "model", "the name of a model, such as cstr", given["model"])
+        raise _expected(path, "expected model to be the name of a model, such as cstr", given["model"])
     count = given["N"]
     if not isinstance(count, int) or isinstance(count, bool) or not FEWEST <= count <= MOST:
-        raise _expected(path, "N", f"a whole number from {FEWEST} to {MOST:,}", count)
+        raise _expected(path, f"expected N to be a whole number from {FEWEST} to {MOST:,}", count)
     if not _number(given["tsim"]) or given["tsim"] <= 0:
-        raise _expected(path, "tsim", "a positive number", given["tsim"])
+        raise _expected(path, "expected tsim to be a positive number", given["tsim"])
 
 
 def _check_range(path: Path, key: str, given: Any) -> None:
     low, high = (given.get("low"), given.get("high")) if isinstance(given, dict) else (None, None)
     if low is None or high is None or not _numbers(low) or not _numbers(high) or len(low) != len(high):
-        raise _expected(path, key, "an object with low and high, two lists of finite numbers of the same length", given)
+        raise _expected(
+            path,
+            f"expected {key} to be an object with low and high, two lists of finite numbers of the same length",
+            given,
+        )
     if not all(a < b for a, b in zip(low, high, strict=True)):
-        raise _expected(path, f"low of {key}", "below the corresponding high value", given)
+        raise _expected(path, f"expected low of {key} to be below the corresponding high value", given)
 
 
 def _check_schedule(path: Path, key: str, given: Any, count: int) -> None:
     if not isinstance(given, dict) or not given:
         raise _expected(
-            path, key, 'an object that gives at least one name a list of numbers, such as {"T": [1, 2]}', given
+            path,
+            f'expected {key} to be an object that gives at least one name a list of numbers, such as {{"T": [1, 2]}}',
+            given,
         )
     for name, values in given.items():
         if not _numbers(values):
-            raise _expected(path, f"{key} of {name}", "a list of finite numbers", values)
+            raise _expected(path, f"expected {key} of {name} to be a list of finite numbers", values)
         if len(values) < count:
             raise UnknownEnvironment(
                 f"{path}: expected {key} of {name} to have a value for each of the N = {count} samples, "
@@ -126,7 +132,7 @@ def _number(given: Any) -> bool:
         return False
 
 
-def _expected(path: Path, key: str, what: str, got: Any) -> UnknownEnvironment:
+def _expected(path: Path, expected: str, got: Any) -> UnknownEnvironment:
     text = json.dumps(got)
     shown = text if len(text) <= SHOWN else f"{text[:SHOWN]}..."
-    return UnknownEnvironment(f"{path}: expected {key} to be {what}, got {shown}; correct the file")
+    return UnknownEnvironment(f"{path}: {expected}, got {shown}; correct the file")
