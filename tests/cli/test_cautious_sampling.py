@@ -76,7 +76,7 @@ def test_sampling_with_approve_shows_each_query_before_asking_for_approval(
     assert "(initial): 1 step from a reset" in said.err
 
 
-def test_ending_the_question_of_approve_ends_the_sampler_without_counting_a_step(
+def test_interrupting_the_approval_question_ends_the_sampler_without_counting_a_step(
     monkeypatch: pytest.MonkeyPatch, on_server: Any, cart: str
 ) -> None:
     questions: list[str] = []
@@ -127,7 +127,7 @@ def test_a_sampler_whose_rollouts_leave_a_limit_more_often_than_allowed_ends_bef
     assert view["queries"]["pending"] > 0
 
 
-def test_the_status_command_shows_how_the_real_steps_kept_each_limit(on_server: Any, cart: str) -> None:
+def test_the_status_command_shows_how_many_real_steps_were_beyond_each_limit(on_server: Any, cart: str) -> None:
     assert "limit rail" not in on_server("status", cart).out
     assert on_server("sample", cart, *CART, "--max-queries", "2").code == 0
     shown = on_server("status", cart).out

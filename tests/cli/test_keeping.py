@@ -22,7 +22,7 @@ def episodes(returns: list[float]) -> Evaluation:
     [([np.inf, -1.0], "reward.0"), ([0.0] * 10_001, "returns")],
     ids=["a return that is not finite", "more episodes than one request holds"],
 )
-def test_real_episodes_the_server_cannot_store_are_reported_and_not_kept(
+def test_real_episodes_that_the_server_refuses_are_reported_and_not_saved_in_a_file(
     returns: list[float], named: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     policy = tmp_path / "policy.zip"
@@ -33,7 +33,7 @@ def test_real_episodes_the_server_cannot_store_are_reported_and_not_kept(
     assert not waiting_path(policy).exists()
 
 
-def test_unsent_real_episodes_of_all_controllers_are_kept_beside_the_policy(tmp_path: Path):
+def test_real_episodes_that_could_not_be_sent_are_saved_in_a_file_beside_the_policy(tmp_path: Path):
     policy, result = tmp_path / "policy.zip", episodes([-1.0, -2.0])
     _keep(policy, [("policy", result), ("zero", result)], EvaluationSettings(episodes=2), "Line-v0", None, quiet=True)
     assert waiting_path(policy).read_text().count('"controller"') == 2

@@ -112,7 +112,7 @@ def test_evaluating_with_learn_all_adds_every_step_to_a_surrogate_without_a_mode
 
 
 @pytest.mark.timeout(600)
-def test_real_steps_a_killed_server_did_not_store_are_kept_and_stored_later(
+def test_real_steps_that_a_killed_server_did_not_store_are_saved_in_a_file_and_sent_later(
     surrogym, policy, diary, name, tmp_path, monkeypatch
 ):
     """They were lost, and the exit status was 0."""
@@ -152,7 +152,7 @@ def test_real_steps_a_killed_server_did_not_store_are_kept_and_stored_later(
         server.stop()
 
 
-def test_a_file_of_kept_real_steps_is_not_overwritten(tmp_path):
+def test_a_file_of_real_steps_not_yet_sent_is_not_overwritten(tmp_path):
     spec = Machine.spec(None)
     step = NewSample(coordinates=[0.0], action=[1.0], next_coordinates=[0.1], reward=0.0, terminated=False)
     files = [write_steps(tmp_path / "policy.zip", spec, [step] * count) for count in (1, 2)]
@@ -160,13 +160,13 @@ def test_a_file_of_kept_real_steps_is_not_overwritten(tmp_path):
     assert [len(read_log(file, Options(spec=spec)).table) for file in files] == [1, 2]
 
 
-def test_kept_real_steps_go_to_the_working_folder_if_the_policys_is_unwritable(tmp_path, monkeypatch):
+def test_unsent_real_steps_are_saved_in_the_working_folder_if_the_policys_is_unwritable(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     step = NewSample(coordinates=[0.0], action=[1.0], next_coordinates=[0.1], reward=0.0, terminated=False)
     assert write_steps(tmp_path / "gone" / "policy.zip", Machine.spec(None), [step]) == Path("policy.steps.npz")
 
 
-def test_real_steps_of_an_interrupted_evaluation_are_kept_in_a_reported_file(tmp_path, capsys):
+def test_real_steps_of_an_interrupted_evaluation_are_saved_in_a_file_that_it_names(tmp_path, capsys):
     """Ctrl-C while the steps were sent lost the others."""
     learning = Learning("pend", "--learn-all", Machine.spec(None), "http://127.0.0.1:9")
     path = np.array([[0.0], [0.1], [0.2]])

@@ -35,7 +35,7 @@ def test_the_recommended_evaluation_of_a_user_defined_environment_class_contains
     assert said.endswith("; next: surrogym evaluate 'my tank.zip' --env tank:Tank")
 
 
-def test_a_training_explains_why_it_took_fewer_steps_than_requested():
+def test_a_training_explains_why_it_took_fewer_real_steps_than_requested():
     result = replace(RESULT, virtual_steps=24576, settings={"n_steps": 128, "num_envs": 64})
     assert "24576 virtual steps (30000 asked for; they are taken in rollouts of 8192) in" in words_of_result(
         result, asked=30_000
@@ -84,12 +84,12 @@ def test_a_training_that_still_improves_shows_how_to_continue():
     assert "; it still improved at the end, and --start-from p.zip continues it; next: surrogym evaluate" in words
 
 
-def test_the_training_result_reports_replaced_networks():
+def test_the_training_result_reports_networks_that_were_replaced_because_they_did_not_learn():
     assert "; 1 network replaced because of slow learning; next" in words_of_result(replace(RESULT, networks=2))
     assert "; 2 networks replaced because of slow learning; next" in words_of_result(replace(RESULT, networks=3))
 
 
-def test_the_command_recommended_after_an_interrupted_training_keeps_its_closed_loop_options():
+def test_the_command_recommended_after_an_interrupted_training_repeats_its_improve_and_rounds_options():
     words = words_of_interruption(RESULT, "cart --improve 5 --rounds 3")
     assert words.endswith("to continue: surrogym train cart --improve 5 --rounds 3 --start-from p.zip --out p.zip")
 

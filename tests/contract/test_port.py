@@ -153,7 +153,7 @@ def test_an_episode_is_truncated_where_the_model_is_too_uncertain(port: Surrogat
     assert len(result.final_lanes) == (N if mode == "same_step" else 0)
 
 
-def test_a_wide_trusted_range_ends_no_episode(port: SurrogatePort, opened: Opened):
+def test_a_large_limit_on_the_models_uncertainty_ends_no_episode(port: SurrogatePort, opened: Opened):
     wide, none = opened(trust=1_000.0), opened()
     assert_same(port.reset(wide), port.reset(none))
     ours, theirs = port.step(wide, actions(1)[0]), port.step(none, actions(1)[0])

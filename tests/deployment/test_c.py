@@ -118,14 +118,14 @@ def test_a_c_controller_gives_the_reference_actions_for_random_measurements(
     assert np.mean(close) >= (0.98 if single else 1.0)
 
 
-def test_test_vectors_and_random_measurements_reach_the_limits_of_a_controller(tmp_path: Path):
+def test_test_vectors_and_random_measurements_trigger_the_limits_of_a_controller(tmp_path: Path):
     controller = made(tmp_path, "limits")
     assert sum(vector.status == LIMITED for vector in vectors_of(controller)) >= 3
     assert "ARM_LIMITED = 16" in header(controller, tmp_path)
     assert "LIMITED" not in header(made(tmp_path, "history"), tmp_path)
 
 
-def test_a_controller_with_limits_decides_as_the_guard_of_an_evaluation(tmp_path: Path):
+def test_a_controller_with_limits_applies_the_fallback_exactly_where_an_evaluation_does(tmp_path: Path):
     spec = limited(plant(**HISTORY))
     controller, guard, rng = controller_of(network(tmp_path, spec, (16,))), Guard(spec), np.random.default_rng(0)
     memory, fell = begin(controller), []

@@ -87,7 +87,7 @@ def looked_at(rail=Rail, **options) -> Access:
         return examine(environment, factory().spec())
 
 
-def test_an_exact_environment_is_diagnosed_as_settable_with_counted_steps() -> None:
+def test_an_environment_that_can_be_set_exactly_is_diagnosed_as_settable() -> None:
     access = looked_at()
     assert (access.set_error, access.repeat_error, access.reset_error, access.memory_error) == (0, 0, 0, 0)
     assert access.mode == "set any state"
@@ -184,7 +184,7 @@ def test_the_diagnosis_notes_an_environment_that_ignores_its_seed(query: str) ->
     assert not steady["resets"].notable
 
 
-def test_a_reset_only_gymnasium_environment_is_diagnosed_in_that_mode() -> None:
+def test_a_gymnasium_environment_that_can_only_be_reset_is_diagnosed_as_reset_only() -> None:
     """Its simulator gave a state to save, and failed when it had to return to it."""
     simulator = ResetOnly("Spring", Spring(), 60)
     spec = Rail(query="rollout").spec().model_dump() | {

@@ -99,7 +99,7 @@ def test_an_environment_with_a_complete_state_needs_no_history():
     machine.close()
 
 
-def test_the_declared_lags_of_a_specification_are_counted():
+def test_the_numbers_of_lagged_actions_and_changes_in_a_specification_are_found():
     assert declared(SPEC) == (0, 0)
     assert declared(with_history(SPEC, changes=3, actions=2, largest={"angle": 1.0}, at_start={"angle": 1.0})) == (3, 2)
 

@@ -43,7 +43,7 @@ def test_errors_within_the_tolerance_never_fail_an_audit():
     assert judge(compared(errors, deviation=1e-9), PROMISE, PROMISE, UNTRAINED).passed
 
 
-def test_errors_within_the_tolerance_but_above_the_predicted_deviation_are_surprising():
+def test_errors_beyond_the_predicted_deviation_are_noted_although_the_audit_passes():
     """A heavier pendulum's errors were 2.4 times the model's claim, within the tolerance, and nothing asked further."""
     claimed, rng = np.array([0.2, 0.2]), np.random.default_rng(0)
     right = [compared(rng.normal(0, 0.2, (8, 2)), deviation=1e-9) for _ in range(500)]
@@ -104,7 +104,7 @@ def test_with_few_visited_states_an_audit_checks_each_of_them_once():
     assert len(places(pendulum(), q + 1e3, np.zeros((3, 1)), 8, np.random.default_rng(0))) == 0
 
 
-def test_audit_gaps_are_the_widest_unsampled_ranges_of_single_inputs():
+def test_an_audit_tests_the_model_in_the_widest_ranges_of_an_input_without_samples():
     """Samples everywhere but beyond a speed of 4, and with small torques alone. Angles have no end, so no gap there."""
     rng = np.random.default_rng(0)
     q, u = rng.uniform([-np.pi, -8], [np.pi, 8], (1_000, 2)), rng.uniform(-2, 2, (1_000, 1))
@@ -114,7 +114,7 @@ def test_audit_gaps_are_the_widest_unsampled_ranges_of_single_inputs():
     assert q[second, 1] > 7.9, "a quarter of the speeds"
 
 
-def test_audit_gaps_are_within_the_sampling_range_and_limited_in_number():
+def test_audit_points_in_gaps_between_samples_are_within_the_sampling_range_and_few():
     q, u = np.array([[0.0, 0.0], [0.1, 2.0], [0.0, 80.0]]), np.zeros((3, 1))
     samples = np.array([[0.0, 0.1]]), np.zeros((1, 1))
     assert gaps(pendulum(), q, u, samples, 1) == [1]

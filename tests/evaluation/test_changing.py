@@ -12,13 +12,13 @@ NAMES = [machine.name for machine in MACHINES]
 
 
 @pytest.mark.parametrize("machine", MACHINES, ids=NAMES)
-def test_each_study_machine_is_unchanged_without_a_fault_mechanism(machine: Machine) -> None:
+def test_each_simulated_machine_of_the_drift_study_is_unchanged_without_a_fault(machine: Machine) -> None:
     definition_from_spec(machine.spec)
     assert parameters_of(machine, RIGHT, 1.0) == dict(machine.real)
 
 
 @pytest.mark.parametrize("machine", MACHINES, ids=NAMES)
-def test_every_fault_mechanism_changes_the_steps_of_its_study_machine(machine: Machine) -> None:
+def test_every_fault_of_the_drift_study_changes_the_steps_of_its_machine(machine: Machine) -> None:
     rng = np.random.default_rng(0)
     low, high = np.array(list(machine.ranges.values())).T
     q, u = rng.uniform(low, high, (50, len(low))), rng.uniform(-1, 1, (50, machine.actions))
@@ -38,7 +38,7 @@ def test_a_shifted_sensor_offsets_both_states_of_a_step() -> None:
     assert seen.reward == pytest.approx(real.reward)
 
 
-def test_the_batched_returns_of_a_study_machine_equal_single_steps() -> None:
+def test_returns_of_a_simulated_machine_computed_in_batches_equal_those_of_single_steps() -> None:
     (machine,) = [machine for machine in MACHINES if machine.name == "pole"]
     rng = np.random.default_rng([3, 77])
     low, high = np.array(list(machine.start.values())).T

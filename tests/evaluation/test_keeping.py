@@ -29,7 +29,7 @@ def named(name: str) -> EnvironmentSpec:
 
 
 @pytest.mark.parametrize("first", [-0.9, 50.0], ids=["in the sampling range", "far outside, and against its ends"])
-def test_real_steps_kept_in_a_file_are_read_back_bit_exactly(tmp_path: Path, first: float):
+def test_real_steps_saved_in_a_file_are_read_back_bit_exactly(tmp_path: Path, first: float):
     """A policy may lead far from the sampling range. A log of unknown origin there would be refused."""
     taken = steps_from(first)
     log = read_log(write_steps(tmp_path / "policy.zip", SPEC, taken), Options(spec=SPEC))
@@ -51,13 +51,13 @@ def test_a_log_of_unknown_origin_is_checked_against_the_sampling_range(tmp_path:
 
 
 @pytest.mark.parametrize("name", ["q_0", "obs.left", "next_x", "action_x", "time"])
-def test_kept_real_steps_are_read_back_for_any_coordinate_name(tmp_path: Path, name: str):
+def test_real_steps_saved_in_a_file_are_read_back_for_any_coordinate_name(tmp_path: Path, name: str):
     """next.q_0 was read as the next value of a state called 0."""
     spec = named(name)
     assert len(read_log(write_steps(tmp_path / "policy.zip", spec, steps_from(0.0)), Options(spec=spec)).steps) == 50
 
 
-def test_rewriting_kept_real_steps_replaces_the_file_content(tmp_path: Path):
+def test_saving_real_steps_to_an_existing_file_replaces_its_content(tmp_path: Path):
     file = write_steps(tmp_path / "policy.zip", SPEC, steps_from(0.0))
     rewrite_steps(file, SPEC, steps_from(0.0)[:3])
     assert len(read_log(file, Options(spec=SPEC)).steps) == 3

@@ -150,7 +150,7 @@ def test_a_declared_history_for_an_environment_with_settable_states_is_refused()
         with_history(settable, actions=1)
 
 
-def test_steps_since_reset_with_unknown_lags_are_counted():
+def test_a_further_coordinate_counts_the_steps_since_reset_whose_past_is_unknown():
     environment = answering(Moving())
     spec, counts = environment.spec(), [q[-1] for q in rolled(environment)]
     assert counts == [0, 1, 2, 2]
@@ -167,7 +167,7 @@ def test_the_declared_start_of_an_environment_with_lags_has_known_lags():
     assert (start["steps since reset"].value, start["x.change2"].high) == (2, 0.05)
 
 
-def test_a_design_with_fewer_initial_steps_than_unknown_lags_is_refused():
+def test_a_design_with_fewer_initial_steps_than_steps_with_unknown_past_is_refused():
     fields = Moving().spec().model_dump()
     with pytest.raises(ValueError, match="expected initial of more than 3, got 3"):
         EnvironmentSpec.model_validate(fields | {"design": {"initial": 3}})

@@ -20,12 +20,12 @@ def port_of(name: str) -> OriginalPort:
     return OriginalPort(spec, partial(open_episode, name, spec, partial(original.make, name)))
 
 
-def test_the_original_environment_port_implements_the_surrogate_interface():
+def test_the_original_environment_can_be_used_through_the_surrogate_interface():
     assert isinstance(port_of("Pendulum-v1"), SurrogatePort)
 
 
 @pytest.mark.parametrize("name", ["Pendulum-v1", "CartPole-v1"])
-def test_rewards_of_the_original_environment_port_equal_gymnasiums(name):
+def test_rewards_in_a_session_of_the_original_environment_equal_gymnasiums(name):
     port = port_of(name)
     env = SurrogateVecEnv.from_port(port, 2, seed=0)
     env.reset()
@@ -42,7 +42,7 @@ def test_rewards_of_the_original_environment_port_equal_gymnasiums(name):
     assert port.steps == 10
 
 
-def test_episodes_of_the_original_port_terminate_or_truncate_and_restart():
+def test_episodes_in_the_original_environment_terminate_or_truncate_and_restart():
     env = SurrogateVecEnv.from_port(port_of("CartPole-v1"), 3, seed=0, time_limit=12)
     env.reset()
     ended = []
@@ -59,14 +59,14 @@ def test_episodes_of_the_original_port_terminate_or_truncate_and_restart():
     assert all(abs(final[2]) > 0.15 for truncated, final in ended if not truncated)
 
 
-def test_starts_of_the_original_port_are_reproducible_and_start_box_widens_them():
+def test_starts_in_the_original_environment_are_reproducible_and_start_box_widens_them():
     starts = [SurrogateVecEnv.from_port(port_of("Pendulum-v1"), 200, seed=s, start_box=1.0).reset() for s in (0, 0, 1)]
     np.testing.assert_array_equal(starts[0], starts[1])
     assert (starts[0] != starts[2]).any()
     assert np.abs(starts[0][:, 2]).max() > 6
 
 
-def test_training_on_the_original_port_counts_every_real_step(tmp_path):
+def test_training_in_the_original_environment_counts_every_real_step(tmp_path):
     name = "Pendulum-v1"
     spec = original.make(name).spec().model_copy(update={"time_limit": 5})
     taken = []
@@ -87,12 +87,12 @@ def test_training_on_the_original_port_counts_every_real_step(tmp_path):
     assert result.settings["net_arch"]
 
 
-def test_the_original_port_refuses_other_autoreset_modes_than_same_step():
+def test_training_in_the_original_environment_refuses_other_autoreset_modes_than_same_step():
     with pytest.raises(ValueError, match="got disabled"):
         port_of("Pendulum-v1").open(OpenSession(autoreset_mode="disabled"))
 
 
-def test_resetting_a_closed_session_of_the_original_port_is_refused():
+def test_resetting_a_closed_session_in_the_original_environment_is_refused():
     port = port_of("Pendulum-v1")
     name = port.open(OpenSession(autoreset_mode="same_step")).id
     port.close(name)

@@ -103,7 +103,7 @@ def models(indices: list[float], error: float = 0.01) -> list[ModelView]:
         ),
     ],
 )
-def test_the_status_sentence_of_a_design_names_the_uncertain_outputs(
+def test_the_status_command_names_the_outputs_that_the_model_predicts_uncertainly(
     outputs: tuple[OutputFidelity, ...], phase: str, words: str
 ) -> None:
     assert verdict(view(*outputs, phase=phase)) == words

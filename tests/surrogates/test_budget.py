@@ -52,7 +52,9 @@ def test_training_rounds_of_a_ready_design_take_real_steps_only_after_a_failed_a
         assert words_of_rounds(api, name, queries=3, rounds=3).endswith("no real steps, unless an audit fails")
 
 
-def test_training_rounds_beyond_the_budget_require_an_admin_token(guarded: ServerProcess, owned: str) -> None:
+def test_training_rounds_that_raise_the_budget_of_real_steps_require_an_admin_token(
+    guarded: ServerProcess, owned: str
+) -> None:
     with Api(guarded.url, TOKENS["train"]) as api, pytest.raises(BudgetTooSmall, match=rf"{owned} --budget 13\b"):
         words_of_rounds(api, owned, queries=3, rounds=3)
     with Api(guarded.url, TOKENS["admin"]) as api:

@@ -302,7 +302,7 @@ def test_stable_baselines3_ppo_refuses_to_be_prolonged(surrogate):
         search_for(small(prolong=True))
 
 
-def test_policies_are_compared_in_the_judging_session_and_not_the_training_one(surrogate, tmp_path: Path):
+def test_policies_are_compared_under_the_given_evaluation_settings_and_not_those_of_training(surrogate, tmp_path: Path):
     session = {"time_limit": 4}
     asked = small(session=session, judge={"variant": "pathwise", "time_limit": 3})
     result = train(surrogate, tmp_path / "policy.zip", asked)

@@ -193,7 +193,7 @@ def test_invalid_values_are_refused_before_binary_encoding(action, mask, message
         assert len(server.received) == 1
 
 
-def test_the_valid_transport_names_are_exactly_four():
+def test_the_client_accepts_exactly_four_transport_names():
     with pytest.raises(ValueError, match="expected one of auto, stream, binary, json, got 'grpc'"):
         HttpSurrogate(None, "pendulum", transport="grpc")  # type: ignore[arg-type]
 

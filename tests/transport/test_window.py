@@ -114,7 +114,7 @@ def test_a_session_that_always_falls_back_to_an_earlier_step_raises_a_conflict()
             take(port, 2)
 
 
-def test_the_kept_requests_are_limited_in_number_and_bytes():
+def test_requests_that_a_client_keeps_for_repetition_are_limited_in_number_and_bytes():
     window, size = Window(3), MAX_BYTES // 2
     for seq, content in ((1, b"1"), (2, b"2"), (3, b"3"), (4, b"4")):
         window.keep(Sent(seq, "step", content, lambda *_: (0, None), 1.0))

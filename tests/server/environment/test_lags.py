@@ -41,7 +41,7 @@ def defined(**lags: dict[str, Any]) -> EnvironmentDefinition:
     return definition_from_spec(EnvironmentSpec.model_validate(described(**lags)))
 
 
-def test_each_kind_of_lagged_coordinate_repeats_its_source_value():
+def test_each_kind_of_lagged_coordinate_has_the_past_value_of_its_source():
     definition = defined(**LAGS)
     q = torch.tensor([[3.0, 1.0, 9.0, 0.5, 9.0, 9.0, 9.0]], dtype=torch.float64)
     u = torch.tensor([[0.25, -0.75]], dtype=torch.float64)

@@ -174,7 +174,7 @@ def test_repeated_points_let_a_warm_started_fit_detect_the_noise(rng):
     assert fit(x[:27], y[:27], FitOptions(), warm=stuck).posterior.hyper.noise_variance < 1e-2, "without, it is stuck"
 
 
-def test_a_noisy_explanation_is_found_even_if_the_fit_is_in_a_local_optimum(rng):
+def test_the_noise_of_an_output_is_found_even_if_the_fit_is_in_a_noise_free_local_optimum(rng):
     x = torch.from_numpy(rng.uniform(-1, 1, (27, 2)))
     y = x[:, 0] + 0.3 * torch.from_numpy(rng.normal(size=27))
     stuck = np.log(np.array([0.02, 0.02, 1.0, 1e-8, 1e-7]))

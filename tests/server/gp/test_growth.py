@@ -23,7 +23,7 @@ def points(count: int, seed: int = 0) -> tuple[Tensor, Tensor]:
 ALL = torch.ones(3, dtype=torch.bool)
 
 
-def test_the_gradient_of_the_objective_with_growth_rates_equals_finite_differences():
+def test_the_gradient_of_the_objective_of_a_nonstationary_process_equals_finite_differences():
     z, t = points(20)
     objective = _GrowingObjective(z, t, torch.tensor([True, True, False]), FitOptions())
     theta = 0.3 * np.random.default_rng(0).standard_normal(objective.size)
@@ -38,7 +38,7 @@ def test_the_gradient_of_the_objective_with_growth_rates_equals_finite_differenc
             assert slopes[index] == pytest.approx(difference, rel=1e-5, abs=1e-5)
 
 
-def test_posterior_and_score_of_a_process_with_growth_rates_equal_the_explicit_formulas():
+def test_posterior_and_score_of_a_nonstationary_process_equal_the_explicit_formulas():
     """k_F(z, z') = a(z) k(w(z), w(z')) a(z'), with noise a(z)^2 sigma^2."""
     z, t = points(25)
     test, _ = points(7, seed=1)
@@ -63,7 +63,7 @@ def test_posterior_and_score_of_a_process_with_growth_rates_equal_the_explicit_f
     assert found.fitted.score == pytest.approx(float(density) - beyond, abs=1e-5)
 
 
-def test_a_process_with_growth_rates_predicts_a_growing_function_better_than_a_plain_one():
+def test_a_nonstationary_process_predicts_a_growing_function_better_than_a_stationary_one():
     z, t = points(40)
     test, truth = points(500, seed=1)
     plain = fit(z, t, FitOptions())
@@ -77,13 +77,13 @@ def test_a_process_with_growth_rates_predicts_a_growing_function_better_than_a_p
     assert float(with_rates) < 0.7 * float(without)
 
 
-def test_only_allowed_inputs_get_a_growth_rate():
+def test_a_nonstationary_process_grows_only_along_the_allowed_inputs():
     z, t = points(20)
     found = fit_growing(z, t, torch.tensor([True, False, False]), FitOptions(), [fit(z, t, FitOptions()).theta])
     assert found.rates[1:] == (0.0, 0.0)
 
 
-def test_input_warping_and_amplitude_of_a_process_with_growth_rates_are_consistent():
+def test_input_warping_and_amplitude_of_a_nonstationary_process_are_consistent():
     z, rates = points(9)[0], torch.tensor([0.0, 1.3, -0.4], dtype=torch.float64)
     w = bend(z, rates)
     torch.testing.assert_close(w[:, 0], z[:, 0])
@@ -92,7 +92,7 @@ def test_input_warping_and_amplitude_of_a_process_with_growth_rates_are_consiste
     assert math.isclose(float(bend(torch.tensor([1.0]), torch.tensor([1.0]))), math.e - 1, rel_tol=1e-6)
 
 
-def test_combining_growth_rates_with_a_quadratic_kernel_is_refused():
+def test_combining_a_nonstationary_process_with_a_quadratic_kernel_is_refused():
     z, t = points(5)
     with pytest.raises(ValueError, match="quadratic"):
         fit_growing(z, t, ALL, FitOptions(quadratic=True), [])
@@ -109,6 +109,6 @@ def test_input_warping_far_outside_the_data_stays_finite_and_monotone():
     assert float(steep.diff(dim=0)) == pytest.approx(1e-6 * math.exp(4), rel=1e-4)
 
 
-def test_fitting_a_process_with_growth_rates_to_inputs_beyond_two_deviations_is_refused():
+def test_fitting_a_nonstationary_process_to_inputs_beyond_two_deviations_is_refused():
     with pytest.raises(ValueError, match="at most 2"):
         fit_growing(torch.full((3, 1), 2.5, dtype=torch.float64), torch.zeros(3), ALL[:1], FitOptions(), [])

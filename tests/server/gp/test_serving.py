@@ -72,7 +72,7 @@ def test_a_served_block_has_fewer_rows_if_the_processes_have_more_points(outputs
     assert many.rows < few.rows
 
 
-def test_in_blocks_applies_a_function_to_blocks_and_joins_the_results():
+def test_a_function_applied_in_blocks_of_rows_gives_the_joined_results():
     sizes = []
 
     def function(a: torch.Tensor, b: torch.Tensor | None) -> tuple[torch.Tensor, torch.Tensor]:

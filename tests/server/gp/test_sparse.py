@@ -110,7 +110,7 @@ def test_the_sparse_process_that_predicts_all_points_best_is_kept(
         assert condition_many(order, x, y).hyper.lengthscale is hyper.lengthscale
 
 
-def test_points_known_only_as_inequalities_count_in_choosing_a_sparse_process(
+def test_censored_points_count_in_choosing_a_sparse_process(
     drawn: tuple[Hyperparameters, Tensor, Tensor], monkeypatch: pytest.MonkeyPatch
 ):
     """Both foretell the points alike, with a linear part slightly better. Beyond them it leads away."""

@@ -103,7 +103,7 @@ def test_queries_already_asked_are_not_chosen_again(model, candidates):
     assert set(choose(model, candidates, all_but_two, points[:0], [0, 1, 2, 0, 1], TOLERANCES)) == {58, 59}
 
 
-def test_if_candidates_are_reserved_the_first_query_of_a_batch_is_one_of_them(model, candidates):
+def test_if_some_candidates_have_priority_the_first_query_of_a_batch_is_one_of_them(model, candidates):
     reserved = torch.zeros(60, dtype=torch.bool)
     reserved[[7, 31]] = True
     nothing = candidates.points[:0]

@@ -88,7 +88,7 @@ def test_candidates_and_reference_points_are_limited_in_number(model, points, rn
     assert (len(made.points), len(made.log_p), len(made.reference), len(made.weights)) == (20, 20, 10, 10)
 
 
-def test_candidates_that_end_the_episode_are_reserved_until_a_termination_was_sampled():
+def test_query_candidates_that_end_the_episode_have_priority_until_a_termination_was_sampled():
     spec = cartpole()
     steps = random_steps(spec, 60, seed=0)
     going = Samples(*(getattr(steps, n)[~steps.terminated] for n in steps.__dataclass_fields__))

@@ -27,7 +27,7 @@ def part(samples: Samples, chosen: torch.Tensor) -> Samples:
     return Samples(*(getattr(samples, name)[chosen] for name in samples.__dataclass_fields__))
 
 
-def test_without_terminated_samples_candidates_far_from_the_samples_are_reserved(steps):
+def test_without_terminated_samples_query_candidates_far_from_the_samples_have_priority(steps):
     near = part(steps, steps.q_next.abs().amax(1) < 1)
     assert not bool(near.terminated.any())
     model = learn(definition_from_spec(LEARNED), near).model
@@ -37,7 +37,7 @@ def test_without_terminated_samples_candidates_far_from_the_samples_are_reserved
     assert ending(model, near, Points(0 * steps.q, steps.u)) is None
 
 
-def test_candidates_at_an_uncertain_termination_boundary_are_reserved(steps):
+def test_query_candidates_at_an_uncertain_termination_boundary_have_priority(steps):
     some = part(steps, torch.arange(len(steps)) % 2 == 0)
     assert bool(some.terminated.any())
     model = learn(definition_from_spec(LEARNED), some).model
@@ -52,7 +52,7 @@ def test_a_declared_termination_boundary_is_never_uncertain(steps):
     assert float(in_doubt(model, steps.q_next).max()) == 0
 
 
-def test_candidates_at_an_uncertain_reward_jump_are_reserved():
+def test_query_candidates_at_an_uncertain_reward_jump_have_priority():
     seen = drifting(lambda q, _: (q[:, 0] > 0.5).double(), 12)
     model = learn(definition_from_spec(plane()), seen).model
     (jump,) = model.jumps

@@ -51,7 +51,9 @@ def away(model: GaussianProcessModel, start: torch.Tensor, actions: torch.Tensor
     return distances(model.definition, *still).amin(1)
 
 
-def test_an_excursion_rollout_stops_at_the_first_state_far_from_all_samples(model: GaussianProcessModel):
+def test_a_rollout_that_explores_away_from_the_samples_stops_at_the_first_state_far_from_all(
+    model: GaussianProcessModel,
+):
     known = torch.zeros(1, 2, dtype=torch.float64)
     found = excursion(model, known, {"top": (0.0, 0.0)}, 16, rng())
     gone = away(model, known[0], torch.tensor(found.actions, dtype=torch.float64), known)
@@ -61,14 +63,14 @@ def test_an_excursion_rollout_stops_at_the_first_state_far_from_all_samples(mode
     assert all(away(model, known[0], actions, known).amax() < FAR for actions in shorter)
 
 
-def test_an_excursion_rollout_that_stays_near_the_samples_goes_as_far_as_possible(model: GaussianProcessModel):
+def test_an_exploring_rollout_that_stays_near_the_samples_goes_as_far_as_possible(model: GaussianProcessModel):
     known = torch.zeros(1, 2, dtype=torch.float64)
     found = excursion(model, known, {"still": (0.0, 0.0), "moving": (0.0, 0.4)}, 2, rng())
     assert found.snapshot == "moving", "it moves away already"
     assert np.abs(found.actions) == pytest.approx(np.full((2, 1), 2.0)), "all the torque that there is"
 
 
-def test_an_excursion_rollout_without_snapshots_starts_at_a_reset(model: GaussianProcessModel, samples: Samples):
+def test_an_exploring_rollout_without_snapshots_starts_at_a_reset(model: GaussianProcessModel, samples: Samples):
     assert excursion(model, samples.q, {}, 4, rng()).snapshot is None
 
 
@@ -77,7 +79,7 @@ def request(samples: Samples, budget: int = 60) -> Request:
     return Request(budget=budget, target=0.9, snapshots=snapshots)
 
 
-def test_a_confident_design_with_snapshots_is_ready_only_after_an_excursion_rollout(samples: Samples):
+def test_a_confident_design_with_snapshots_is_ready_only_after_an_exploring_rollout(samples: Samples):
     first = advance(DEFINITION, samples, DesignState(), request(samples))
     assert first.verdict == "continue"
     (rollout,) = first.queries
@@ -89,7 +91,7 @@ def test_a_confident_design_with_snapshots_is_ready_only_after_an_excursion_roll
     assert advance(DEFINITION, answered, state, request(answered)).verdict == "ready"
 
 
-def test_a_design_that_cannot_afford_its_excursion_rollout_ends_over_budget(samples: Samples):
+def test_a_design_whose_budget_is_too_small_for_an_exploring_rollout_ends_over_budget(samples: Samples):
     decision = advance(DEFINITION, samples, DesignState(), request(samples, len(samples)))
     assert decision.verdict == "over_budget"
     assert not decision.queries
@@ -97,7 +99,7 @@ def test_a_design_that_cannot_afford_its_excursion_rollout_ends_over_budget(samp
     assert len(raised.queries) == 1, "once there is room, the excursion is due"
 
 
-def test_without_snapshots_or_in_preset_paper_no_excursion_rollout_is_needed(samples: Samples):
+def test_without_snapshots_or_in_preset_paper_no_exploring_rollout_is_needed(samples: Samples):
     plain = replace(DEFINITION, snapshots=False)
     assert advance(plain, samples, DesignState(), request(samples)).verdict == "ready"
     paper = replace(DEFINITION, design=replace(DEFINITION.design, stopping="confidence"))

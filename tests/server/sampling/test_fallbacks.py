@@ -38,7 +38,7 @@ def test_a_model_without_leave_one_out_predictions_reports_no_such_errors(plain,
     assert {(j.leave_one_out_error, j.leave_one_out_within_one) for j in judged} == {(None, None)}
 
 
-def test_for_models_without_variance_forecast_a_query_lowers_uncertainty_nearby(plain, candidates):
+def test_if_a_model_cannot_predict_variance_a_query_is_assumed_to_lower_uncertainty_nearby(plain, candidates):
     reference = candidates[30:]
     outlook = outlook_of(plain, candidates, reference, candidates[:0])[2]
     torch.testing.assert_close(outlook.std, 0.1 * candidates.q[:, 1].abs())
@@ -53,14 +53,14 @@ def test_for_models_without_variance_forecast_a_query_lowers_uncertainty_nearby(
     assert float(after.reduction(here).max()) == 0
 
 
-def test_for_models_without_variance_forecast_assumed_and_observed_queries_are_equivalent(plain, candidates):
+def test_if_a_model_cannot_predict_variance_pending_and_observed_queries_have_equal_effect(plain, candidates):
     observed = [o.observe(4).observe(9) for o in outlook_of(plain, candidates, candidates, candidates[:0])]
     assumed = outlook_of(plain, candidates, candidates, candidates[[4, 9]])
     for one, other in zip(observed, assumed, strict=True):
         torch.testing.assert_close(one.std, other.std)
 
 
-def test_for_models_without_variance_forecast_a_batch_of_queries_is_spread_out(plain, candidates):
+def test_if_a_model_cannot_predict_variance_a_batch_of_queries_is_spread_out(plain, candidates):
     made = Candidates(candidates, torch.zeros(60), candidates, torch.full((60,), 1 / 60, dtype=torch.float64))
     nothing = candidates[:0]
     picks = choose(plain, made, nothing, nothing, [0, 0, 0, 0], TOLERANCES)

@@ -43,13 +43,13 @@ def answered(model: GaussianProcessModel, query: Points) -> GaussianProcessModel
     return replace(model, transitions=tuple(map(extended, model.transitions)), reward=extended(model.reward))
 
 
-def test_the_variance_forecast_starts_with_the_models_predictive_deviations(model, candidates):
+def test_before_any_query_the_predicted_variances_equal_those_of_the_model(model, candidates):
     outlook = outlook_of(model, candidates, candidates[NOTHING], candidates[NOTHING])
     said = torch.stack([output.std for output in outlook], -1)
     torch.testing.assert_close(said, stds(model, candidates.q, candidates.u), rtol=1e-6, atol=1e-9)
 
 
-def test_the_predicted_variance_reduction_equals_that_after_the_answer(model, candidates, reference):
+def test_the_variance_reduction_predicted_for_a_query_equals_that_after_its_answer(model, candidates, reference):
     weights = torch.arange(1.0, 26.0, dtype=torch.float64) / 325
     outlook = outlook_of(model, candidates, reference, candidates[NOTHING])
     before = stds(model, reference.q, reference.u).square()
@@ -60,7 +60,7 @@ def test_the_predicted_variance_reduction_equals_that_after_the_answer(model, ca
         torch.testing.assert_close(said, brought, rtol=1e-4, atol=1e-10)
 
 
-def test_the_variance_forecast_treats_pending_queries_like_observed_ones(model, candidates, reference):
+def test_pending_queries_lower_the_predicted_variance_like_observed_ones(model, candidates, reference):
     weights = torch.full((25,), 1 / 25, dtype=torch.float64)
     observed = [o.observe(4).observe(9) for o in outlook_of(model, candidates, reference, candidates[NOTHING])]
     assumed = outlook_of(model, candidates, reference, candidates[[4, 9]])
@@ -81,14 +81,14 @@ def test_a_query_predicted_to_end_at_a_bound_does_not_reduce_dynamics_variance(m
     assert theta.learns.tolist() == [model.transitions[0].feature_map.lead, True]
 
 
-def test_a_constant_output_has_no_variance_forecast():
+def test_no_variance_is_predicted_for_a_constant_output():
     steps = random_steps(cartpole(), 12, seed=0)
     model = learn(definition_from_spec(cartpole()), steps).model
     points = Points(steps.q, steps.u)
     assert outlook_of(model, points, points, points)[-1] is None
 
 
-def test_the_variance_forecast_of_a_reward_uses_the_predicted_next_state(candidates):
+def test_the_predicted_variance_of_a_reward_after_the_step_uses_the_predicted_next_state(candidates):
     spec = pendulum().model_copy(update={"reward": Reward(timing="after")})
     model = learn(definition_from_spec(spec), random_steps(spec, 12, seed=0)).model
     outlook = outlook_of(model, candidates, candidates[NOTHING], candidates[NOTHING])

@@ -297,12 +297,12 @@ def counted(spec: EnvironmentSpec, steps: int) -> EnvironmentSpec:
     return EnvironmentSpec.model_validate(fields | {"coordinates": [*fields["coordinates"], count], "start": start})
 
 
-def test_initial_rollouts_are_longer_than_the_steps_with_unknown_lags():
+def test_initial_rollouts_are_longer_than_their_first_steps_with_unknown_past():
     definition = definition_from_spec(counted(SPEC, 2))
     assert [query.steps for query in first_rollouts(definition, 14, rng())] == [3, 4, 5]
 
 
-def test_planned_rollouts_are_longer_than_the_steps_with_unknown_lags():
+def test_planned_rollouts_are_longer_than_their_first_steps_with_unknown_past():
     definition = definition_from_spec(counted(SPEC, 2))
     walked = roll(SPEC, random_sequences_of(8), 0)
     known = torch.full((8, 1), 2.0, dtype=torch.float64)
@@ -320,7 +320,7 @@ def random_sequences_of(length: int) -> torch.Tensor:
     return torch.from_numpy(random_sequences(definition_from_spec(SPEC), 1, length, rng())[0])
 
 
-def test_steps_with_unknown_lags_cost_budget_but_are_not_learned_from():
+def test_first_steps_of_a_rollout_with_unknown_past_cost_budget_but_are_not_learned_from():
     definition = definition_from_spec(counted(SPEC, 2))
     walked = roll(SPEC, random_sequences_of(8), 0)
     count = torch.arange(9.0, dtype=torch.float64).clamp_max(2.0)[:, None]

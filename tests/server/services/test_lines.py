@@ -40,7 +40,7 @@ def run(test: Callable[[Shop, Notices, Callable[..., Awaitable[int | str]]], Awa
 
 @pytest.mark.parametrize("waiting", [10, MANY])
 def test_the_number_of_database_reads_does_not_grow_with_waiting_samplers(waiting: int):
-    async def test(shop: Shop, notices: Notices, claim: Callable[..., Awaitable[int | str]]) -> None:
+    async def scenario(shop: Shop, notices: Notices, claim: Callable[..., Awaitable[int | str]]) -> None:
         claims = [claim() for _ in range(waiting)]
         await asyncio.sleep(0.2)
         assert shop.asked <= FIRST
@@ -51,22 +51,22 @@ def test_the_number_of_database_reads_does_not_grow_with_waiting_samplers(waitin
         assert set(await asyncio.gather(*claims)) == {"none"}
         assert shop.asked <= 3 * FIRST
 
-    run(test)
+    run(scenario)
 
 
 def test_all_new_queries_are_handed_to_the_waiting_samplers():
-    async def test(shop: Shop, notices: Notices, claim: Callable[..., Awaitable[int | str]]) -> None:
+    async def scenario(shop: Shop, notices: Notices, claim: Callable[..., Awaitable[int | str]]) -> None:
         claims = [claim() for _ in range(MANY)]
         await asyncio.sleep(0.1)
         shop.work = list(range(MANY))
         notices.post("a")
         assert sorted(await asyncio.gather(*claims), key=int) == [*range(MANY)]
 
-    run(test)
+    run(scenario)
 
 
 def test_a_sampler_that_does_not_wait_gets_new_queries_despite_waiting_samplers():
-    async def test(shop: Shop, notices: Notices, claim: Callable[..., Awaitable[int | str]]) -> None:
+    async def scenario(shop: Shop, notices: Notices, claim: Callable[..., Awaitable[int | str]]) -> None:
         claims = [claim(1.0) for _ in range(FIRST)]
         await asyncio.sleep(0.1)
         assert await claim(0.0) == "none"
@@ -75,11 +75,11 @@ def test_a_sampler_that_does_not_wait_gets_new_queries_despite_waiting_samplers(
         assert {await claim(0.0), *(await asyncio.gather(*claims))} == {7, 8, 9, 10, 11}
         assert shop.asked == asked + 5
 
-    run(test)
+    run(scenario)
 
 
 def test_a_waiting_sampler_that_disconnected_is_given_no_query():
-    async def test(shop: Shop, notices: Notices, _: object) -> None:
+    async def scenario(shop: Shop, notices: Notices, _: object) -> None:
         async def present() -> None:
             raise ConnectionError
 
@@ -89,4 +89,4 @@ def test_a_waiting_sampler_that_disconnected_is_given_no_query():
             await lines.claim("a", None, shop.ask, PATIENCE, present)
         assert shop.work == [1]
 
-    run(test)
+    run(scenario)

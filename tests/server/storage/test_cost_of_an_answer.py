@@ -85,7 +85,7 @@ def test_reading_the_ledger_counts_only_samples_added_since_the_last_read(
     assert storage.ledger.read(name).total == storage.samples.count(name) == 2
 
 
-def test_the_short_read_of_phase_and_pause_equals_the_full_surrogate_record(
+def test_phase_and_pause_read_alone_equal_those_of_the_full_surrogate_record(
     storage: Storage, make: Callable[..., str]
 ) -> None:
     name = make()

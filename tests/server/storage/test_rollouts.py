@@ -123,7 +123,7 @@ def test_all_steps_of_a_rollout_count_as_unresolved_if_its_sampler_dies(
     assert {s.trajectory for s in late} != {first.trajectory}
 
 
-def test_rollout_queries_of_a_design_are_handed_out_as_adaptive(
+def test_rollout_queries_that_a_design_chose_are_handed_out_with_purpose_adaptive(
     storage: Storage, name: str, answer: Answer, design: Callable[..., NewDesign]
 ) -> None:
     for query in storage.queries.claim(name, "a", 2, LONG):

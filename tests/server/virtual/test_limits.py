@@ -37,7 +37,7 @@ def test_virtual_rewards_within_the_limits_are_unchanged():
     assert within(None, same) is same
 
 
-def test_the_reward_for_leaving_the_sampling_range_is_not_limited():
+def test_the_reward_for_leaving_the_sampling_range_is_exempt_from_reward_limits():
     left = np.array([True, False])
     kept = within((-2.0, 2.0), replace(transition([-200.0, -200.0]), left=left))
     assert kept.reward.tolist() == [-200.0, -2.0]

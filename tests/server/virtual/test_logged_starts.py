@@ -40,7 +40,7 @@ def test_with_start_box_half_of_the_log_surrogates_episodes_start_anywhere(of_a_
     assert 100 < elsewhere < 200
 
 
-def test_leaving_the_sampling_range_terminates_and_pays_for_the_remaining_steps(of_a_log, started):
+def test_leaving_the_logs_range_terminates_and_pays_a_reward_for_each_missing_step(of_a_log, started):
     settings, lanes = started(of_a_log, 2, time_limit=10)
     lanes = replace(lanes, q=torch.tensor([[1.5, 3.9], [0.0, 0.0]], dtype=torch.float64), elapsed=lanes.elapsed + 4)
     _, moved = step(of_a_log, settings, lanes, STILL)
@@ -50,7 +50,7 @@ def test_leaving_the_sampling_range_terminates_and_pays_for_the_remaining_steps(
     assert not moved.truncated.any()
 
 
-def test_leaving_the_trusted_range_pays_the_outside_reward(of_a_log, started):
+def test_an_episode_ended_by_the_limit_on_uncertainty_pays_the_reward_for_leaving_the_log(of_a_log, started):
     unsure = replace(of_a_log, std=0.5)
     settings, lanes = started(unsure, 2, time_limit=10, trust=0.4)
     _, moved = step(unsure, settings, lanes, STILL)
@@ -58,7 +58,7 @@ def test_leaving_the_trusted_range_pays_the_outside_reward(of_a_log, started):
     np.testing.assert_array_equal(moved.reward, [10 * OUTSIDE] * 2)
 
 
-def test_without_an_outside_reward_leaving_the_sampling_range_does_not_terminate(of_a_log, started):
+def test_without_a_reward_for_leaving_it_leaving_the_sampling_range_does_not_terminate(of_a_log, started):
     model = replace(of_a_log, definition=replace(of_a_log.definition, outside_reward=None))
     settings, lanes = started(model, 2)
     lanes = replace(lanes, q=torch.tensor([[1.5, 3.9], [0.0, 0.0]], dtype=torch.float64))

@@ -24,7 +24,7 @@ def stepped(model, started, angles, **chosen):
     return step(model, settings, replace(lanes, q=q), np.zeros((len(angles), 1)))
 
 
-def test_an_episode_is_truncated_where_any_output_leaves_the_trusted_range(unsure, started):
+def test_an_episode_is_truncated_where_any_outputs_uncertainty_exceeds_its_limit(unsure, started):
     _, transition = stepped(unsure, started, [0.1, 0.8, -2.0], trust=0.7)
     assert transition.untrusted.tolist() == transition.truncated.tolist() == [False, True, True]
     assert not transition.terminated.any()
@@ -33,7 +33,7 @@ def test_an_episode_is_truncated_where_any_output_leaves_the_trusted_range(unsur
     assert transition.untrusted.all(), "the dynamics deviate by 0.5"
 
 
-def test_the_trusted_range_is_relative_to_the_deviation_of_the_samples(unsure, started):
+def test_the_limit_on_uncertainty_is_relative_to_the_deviation_of_the_samples(unsure, started):
     class Wider(ExactModel):
         @property
         def scales(self) -> torch.Tensor:
@@ -44,19 +44,19 @@ def test_the_trusted_range_is_relative_to_the_deviation_of_the_samples(unsure, s
     assert transition.untrusted.tolist() == [False, False, True]
 
 
-def test_a_session_without_a_trusted_range_reports_none(unsure, started):
+def test_a_session_without_a_limit_on_uncertainty_reports_no_uncertain_states(unsure, started):
     _, transition = stepped(unsure, started, [0.1, 0.8, -2.0])
     assert transition.untrusted is None
     assert not transition.truncated.any()
 
 
-def test_the_trusted_range_truncates_episodes_of_the_particle_variant_too(unsure, started):
+def test_the_limit_on_uncertainty_truncates_episodes_of_the_particle_variant_too(unsure, started):
     chosen = {"variant": "probabilistic", "particles": 3, "trust": 0.4}
     _, transition = stepped(unsure, started, [0.1, 0.2, 0.3], **chosen)
     assert transition.untrusted.all()
 
 
-def test_an_environment_that_left_the_trusted_range_resets(unsure, started):
+def test_an_environment_truncated_by_the_limit_on_uncertainty_resets(unsure, started):
     lanes, transition = stepped(unsure, started, [0.1, 0.8, -2.0], trust=0.7, autoreset_mode="same_step")
     assert transition.final_lanes.tolist() == [1, 2]
     assert lanes.episode.tolist() == [0, 1, 1]

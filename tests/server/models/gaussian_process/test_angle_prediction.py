@@ -52,7 +52,7 @@ def test_no_angle_drift_is_learned_without_angles_or_with_too_few_samples(defini
     assert learn_drift(definition, random_steps(swing_up(), 11, seed=0)) == ()
 
 
-def test_angle_prediction_adds_cosine_and_sine_of_the_predicted_angle():
+def test_cosine_and_sine_of_the_predicted_next_angle_can_be_model_inputs():
     definition = definition_from_spec(acrobot())
     drift = ((0.0, 0.0, 0.2, 0.0), (0.0, 0.0, 0.0, 0.3))
     q, u = torch.tensor([[0.5, -1.0, 2.0, -3.0]], dtype=torch.float64), torch.zeros(1, 1, dtype=torch.float64)
@@ -62,7 +62,7 @@ def test_angle_prediction_adds_cosine_and_sine_of_the_predicted_angle():
     assert FeatureMap(drift=drift) in candidates(definition, follows=False, drift=drift)
 
 
-def test_angle_prediction_is_selected_for_a_fast_pole_and_lowers_the_error(definition, model):
+def test_the_predicted_next_angle_is_selected_as_input_for_a_fast_pole_and_lowers_the_error(definition, model):
     omega = model.transitions[3]
     assert omega.feature_map.drift
     test = random_steps(swing_up(), 300, seed=1)
@@ -70,7 +70,7 @@ def test_angle_prediction_is_selected_for_a_fast_pole_and_lowers_the_error(defin
     assert error[3] / omega.scale < 0.3  # 0.36 without
 
 
-def test_the_angle_prediction_setting_is_stored_with_the_model(definition, model):
+def test_a_stored_model_keeps_whether_the_predicted_next_angle_is_an_input(definition, model):
     loaded = from_bytes(definition, to_bytes(model))
     assert loaded.transitions[3].feature_map == model.transitions[3].feature_map
 

@@ -171,7 +171,7 @@ def test_an_output_predicted_precisely_drops_no_inputs():
     assert not any(output.feature_map.dropped for output in model.outputs)
 
 
-def test_the_next_limited_speed_and_inputs_with_growth_rates_are_never_dropped():
+def test_the_next_limited_speed_and_inputs_of_nonstationary_processes_are_never_dropped():
     """As long as no sample ends at the limit, the next value seems to say nothing new."""
     known = definition_from_spec(pendulum())
     output = gaussian_processes(known, random_steps(pendulum(), 4, seed=0)).transitions[0]

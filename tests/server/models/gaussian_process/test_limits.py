@@ -82,7 +82,7 @@ def test_an_output_driven_by_a_limited_speed_has_the_next_speed_as_input():
     assert not output.past_limits
 
 
-def test_with_sparse_processes_the_use_of_limit_samples_is_decided_by_residuals(monkeypatch):
+def test_a_sparse_process_decides_by_its_residuals_whether_to_use_samples_at_a_limit(monkeypatch):
     monkeypatch.setattr(sparse, "MAX_EXACT", 60)
     samples = steps(400, False, 5)
     compared: list[tuple[float, float]] = []
@@ -101,7 +101,7 @@ def test_with_sparse_processes_the_use_of_limit_samples_is_decided_by_residuals(
     assert all(ours == pytest.approx(theirs) for ours, theirs in compared)
 
 
-def test_without_samples_at_a_limit_the_model_uses_all_samples_normally():
+def test_without_samples_at_a_limit_the_model_treats_all_samples_alike():
     samples = steps(40, False, 5)
     free = ~stopped(RELIEVED, 1, samples.q_next)
     below = Samples(*(getattr(samples, name)[free] for name in Samples.__dataclass_fields__))
@@ -118,7 +118,7 @@ def test_samples_at_an_outputs_own_limit_or_a_wall_are_left_out():
 
 
 @pytest.mark.parametrize("bent", [False, True])
-def test_the_use_of_samples_at_limits_survives_storage(bent):
+def test_a_stored_model_keeps_which_outputs_use_samples_at_limits(bent):
     model = gaussian_processes(RELIEVED, steps(20, bent, 0))
     loaded = from_bytes(RELIEVED, to_bytes(model))
     assert [o.past_limits for o in loaded.transitions] == [o.past_limits for o in model.transitions]
@@ -143,7 +143,7 @@ def test_a_step_that_ended_at_a_limit_is_predicted_to_reach_it():
     assert float((VALVE - predicted[at_valve]).max()) < 0.01
 
 
-def test_samples_at_a_limit_used_as_inequalities_improve_predictions_at_the_limit(monkeypatch):
+def test_using_samples_at_a_limit_as_censored_improves_predictions_at_the_limit(monkeypatch):
     samples, test = kettle(30, 0), kettle(500, 1)
 
     def short_and_error() -> tuple[float, float]:
@@ -227,7 +227,7 @@ def test_samples_stopped_by_a_wall_are_not_used_for_the_speed():
     assert float(off) < 1e-3
 
 
-def test_a_sparse_process_uses_limit_samples_as_inequalities_too(monkeypatch):
+def test_a_sparse_process_uses_samples_at_a_limit_as_censored_too(monkeypatch):
     """Nothing was seen between the cold, where the pressure hardly rises, and the valve."""
     monkeypatch.setattr(sparse, "MAX_EXACT", 100)
     every = kettle(500, 0)

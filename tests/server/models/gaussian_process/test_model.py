@@ -153,7 +153,7 @@ def test_a_model_description_lists_outputs_features_and_length_scales(pendulum_m
     assert outputs["speed"]["rates"] == {}
 
 
-def test_a_model_description_names_dropped_features_and_growth_rates(pendulum_model):
+def test_a_model_description_names_dropped_features_and_nonstationary_processes(pendulum_model):
     speed = pendulum_model.transitions[1]
     feature_map = FeatureMap("cos_sin", dropped=(1,), rates=(0.0, 0.4, 0.0))
     described = describe(pendulum_model.definition, replace(speed, feature_map=feature_map))

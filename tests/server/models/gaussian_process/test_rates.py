@@ -73,7 +73,7 @@ def points() -> tuple[Tensor, Tensor]:
     return test.q, test.u
 
 
-def test_an_output_gets_growth_rates_only_if_evidence_favours_them(model):
+def test_an_output_gets_a_nonstationary_process_only_if_the_evidence_favours_it(model):
     amount, heat = model.transitions
     assert amount.feature_map.rates[1] > 0.3  # along the heat
     assert heat.feature_map.rates == ()
@@ -81,22 +81,22 @@ def test_an_output_gets_growth_rates_only_if_evidence_favours_them(model):
     assert any("rates" in name for name, _ in amount.scores)
 
 
-def test_small_changes_are_predicted_better_with_growth_rates(model):
+def test_small_changes_are_predicted_better_by_a_nonstationary_process(model):
     without = gaussian_processes(definition_from_spec(spec(rates=False)), steps(60, 0))
     assert without.transitions[0].feature_map.rates == ()
     assert amount_error(model, steps(400, 9)) < 0.5 * amount_error(without, steps(400, 9))
 
 
-def test_predictions_with_growth_rates_equal_those_of_the_processes(model, points):
+def test_predictions_of_a_model_with_nonstationary_processes_equal_those_of_the_processes(model, points):
     check_processes(model, points)
 
 
 @pytest.mark.parametrize("how", WAYS)
-def test_compiled_steps_with_growth_rates_equal_the_model(model, points, how):
+def test_compiled_steps_of_a_model_with_nonstationary_processes_equal_the_model(model, points, how):
     check_compiled(model, points, how)
 
 
-def test_functions_drawn_with_growth_rates_have_the_predicted_deviations(model, points):
+def test_functions_drawn_from_nonstationary_processes_have_the_predicted_deviations(model, points):
     count = 2_000
     noise = torch.randn(count, model.path_size, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     functions = model.draw(noise)
@@ -120,7 +120,7 @@ def test_the_expected_deviations_after_a_query_equal_those_of_conditioning_on_it
     torch.testing.assert_close(outlook.observe(3).std, after, rtol=1e-3, atol=1e-6)
 
 
-def test_leave_one_out_errors_with_growth_rates_equal_conditioning_without_the_point(model):
+def test_leave_one_out_errors_of_a_nonstationary_process_equal_conditioning_without_the_point(model):
     output = model.transitions[0]
     posterior = output.posterior
     squares = []
@@ -133,7 +133,7 @@ def test_leave_one_out_errors_with_growth_rates_equal_conditioning_without_the_p
     assert output.leave_one_out().error == pytest.approx((sum(squares) / len(squares)) ** 0.5, rel=1e-3)
 
 
-def test_growth_rates_survive_storage(model, points):
+def test_nonstationary_processes_survive_storage_of_the_model(model, points):
     loaded = from_bytes(REACTION, to_bytes(model))
     assert isinstance(loaded, GaussianProcessModel)
     assert loaded.transitions[0].feature_map == model.transitions[0].feature_map
@@ -143,18 +143,18 @@ def test_growth_rates_survive_storage(model, points):
 @pytest.mark.parametrize(
     "rates", [(0.1,), (0.1, float("nan"), 0.0), (0.1, 0.2, 0.3, 0.4), (0.0, 2.1, 0.0), (-2.0, -2.0, 2.0)]
 )
-def test_malformed_growth_rates_are_refused(model, rates):
+def test_a_stored_model_with_malformed_nonstationary_processes_is_refused(model, rates):
     output = model.transitions[0]
     wrong = replace(output, feature_map=replace(output.feature_map, rates=rates))
     with pytest.raises(InvalidInput, match=r"rate|amplitude"):
         require_output(REACTION, wrong)
 
 
-def test_with_few_samples_an_output_gets_no_growth_rates():
+def test_with_few_samples_every_output_gets_a_stationary_process():
     assert not gaussian_processes(REACTION, steps(20, 0)).transitions[0].feature_map.rates
 
 
-def test_an_input_with_an_outlying_sample_gets_no_growth_rate():
+def test_a_process_is_not_nonstationary_along_an_input_with_an_outlying_sample():
     samples = steps(60, 0)
     samples.q[0, 1] = -40.0
     assert not any(
@@ -162,7 +162,7 @@ def test_an_input_with_an_outlying_sample_gets_no_growth_rate():
     )
 
 
-def test_an_outlying_sample_removes_the_growth_rate_of_a_warm_start():
+def test_an_outlying_sample_makes_a_warm_started_nonstationary_process_stationary():
     """Once a sample is far out, its input may have no rate any more. The earlier rates are then no start."""
     warm = learn(REACTION, steps(60, 0)).warm
     assert any("rates" in name for name in warm)
@@ -171,19 +171,19 @@ def test_an_outlying_sample_removes_the_growth_rate_of_a_warm_start():
     assert learn(REACTION, samples, warm).model.transitions[0].feature_map.rates[1:2] in ((), (0.0,))
 
 
-def test_predictions_with_growth_rates_far_from_the_samples_are_finite(model):
+def test_predictions_of_nonstationary_processes_far_from_the_samples_are_finite(model):
     q = torch.tensor([[0.5, 1e6], [0.5, -1e6], [1e6, 0.0]], dtype=torch.float64)
     moved = model.transition(q, torch.zeros(3, 1, dtype=torch.float64), stds=True)
     assert bool(torch.isfinite(moved.q_next).all())
     assert bool(torch.isfinite(moved.std).all())
 
 
-def test_growth_rates_are_not_searched_for_a_precisely_predicted_output():
+def test_no_nonstationary_process_is_tried_for_a_precisely_predicted_output():
     learned = learn(definition_from_spec(pendulum()), random_steps(pendulum(), 20, seed=0))
     assert not any("rates" in name for name in learned.warm)
 
 
-def test_growth_rates_for_many_samples_are_found_on_a_subset(monkeypatch):
+def test_with_many_samples_a_nonstationary_process_is_chosen_on_a_subset(monkeypatch):
     monkeypatch.setattr("surrogym_server.gp.subsets.FEW", 48)
     model = gaussian_processes(REACTION, steps(56, 0))
     assert model.transitions[0].feature_map.rates[1] > 0.3
@@ -191,7 +191,7 @@ def test_growth_rates_for_many_samples_are_found_on_a_subset(monkeypatch):
     assert amount_error(model, steps(400, 9)) < 0.005
 
 
-def test_compiled_steps_with_growth_rates_and_angle_prediction_equal_the_model():
+def test_compiled_steps_with_nonstationary_processes_and_predicted_angles_equal_the_model():
     """Turned angles read all coordinates, and are computed after the inputs with rates."""
     known, samples = definition_from_spec(pendulum()), random_steps(pendulum(), 12, seed=0)
     feature_map = FeatureMap(drift=((0.02, 0.05),), rates=(0.0, 0.0, 0.7, 0.0, 0.0, -0.4))
