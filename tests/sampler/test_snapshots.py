@@ -182,7 +182,7 @@ def test_a_snapshot_folder_keeps_states_for_the_next_sampler(tmp_path):
         (lambda file: file.unlink(), "is not in"),
         (lambda file: file.write_bytes(file.read_bytes() + b"!"), "is damaged"),
         (lambda file: file.write_bytes(b"{}"), "can't be read"),
-        (lambda file: file.write_bytes(file.read_bytes().replace(b'"form": 1', b'"form": 2')), "in form 2"),
+        (lambda file: file.write_bytes(file.read_bytes().replace(b'"form": 1', b'"form": 2')), "in file version 2"),
     ],
 )
 def test_a_modified_snapshot_file_is_treated_as_lost(tmp_path, change, message):

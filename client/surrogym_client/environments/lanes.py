@@ -189,7 +189,9 @@ class Lanes:
         if seed is None or isinstance(seed, int | np.integer):
             return self.port.reset(self.view.id, seed=seed, mask=mask)
         if len(seed) != self.num_envs:
-            raise ValueError(f"seed: expected one number, or {self.num_envs} for the lanes, got a list of {len(seed)}")
+            raise ValueError(
+                f"seed: expected one number, or a list of {self.num_envs} for the lanes, got a list of {len(seed)}"
+            )
         chosen = np.ones(self.num_envs, dtype=bool) if mask is None else mask
         seeded = chosen & [s is not None for s in seed]
         if (chosen & ~seeded).any():

@@ -275,7 +275,9 @@ def _checked(url: str) -> str:
     if parsed.scheme not in ("http", "https") or not parsed.host:
         raise ServerUnreachable(f"expected a server address like {DEFAULT_URL}, got {url!r}")
     if parsed.userinfo:  # a password in the URL would be written into cards and reports, and sent instead of the token
-        raise ServerUnreachable(f"expected an address without user and password, got one with them at {parsed.host!r}")
+        raise ServerUnreachable(
+            f"expected an address without user and password, got both for {parsed.host!r}: give a token instead"
+        )
     return url.rstrip("/")
 
 

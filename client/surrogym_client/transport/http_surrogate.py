@@ -245,19 +245,20 @@ class HttpSurrogate:
         """Send the requests from number ``behind`` on again. Their answers must be the same as before, bit for bit."""
         if (missing := window.since(behind)) is None:
             raise self._given_up(
-                live, f"needs the requests from number {behind} on again, which this client no longer keeps"
+                live,
+                f"its successor needs requests again from number {behind} on, which this client no longer keeps",
             )
         for sent in missing:
             answer, _ = self._sent(live, sent)
             if digest_of(answer) != sent.digest:
-                raise self._given_up(live, f"gives another answer to the repeated request {sent.seq}")
+                raise self._given_up(live, f"its successor gives another answer to the repeated request {sent.seq}")
 
     def _given_up(self, live: _Live, what: str) -> SurrogymClientError:
         with suppress(SurrogymClientError):
             self.connection.send("DELETE", live.route, retries=Retries(seconds=0))
         return refused_here(
             Code.UNKNOWN_SESSION,
-            f"the server process that held the session has ended, and its successor {what}: open a new session",
+            f"the server process that held the session has ended, and {what}: open a new session",
         )
 
     def _sent(self, live: _Live, sent: Sent) -> tuple[bytes, tuple[int, Any]]:

@@ -190,7 +190,7 @@ def _opened(simulator: str | OriginalEnvironment, spec: EnvironmentSpec) -> Orig
             _require_alike(spec, opened.spec())
             if not callable(getattr(opened, "step_from", None)):
                 raise UnknownEnvironment(
-                    "expected a simulator with a method step_from, which sets it to a state, got none: add it"
+                    "expected a simulator with a method step_from, which sets it to a state, got none: add the method"
                 )
         environment: OriginalEnvironment = _respecified(simulator, opened, spec)
         _require_steps(environment, spec)

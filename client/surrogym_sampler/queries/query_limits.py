@@ -57,7 +57,8 @@ def check_query(own: EnvironmentSpec, query: Query) -> None:
     """
     if query.kind != own.query:
         raise QueryRefused(
-            f"expected a {own.query} query, which the environment's specification declares, got a {query.kind} query"
+            f"expected a {own.query} query, as the environment's specification declares, got a {query.kind} query: "
+            "register the environment under another name"
         )
     if isinstance(query, StepQuery):
         names = [f"coordinate {name!r}" for name in own.coordinate_names]

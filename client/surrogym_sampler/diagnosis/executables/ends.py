@@ -37,7 +37,9 @@ def without_input_the_fallback_of_limits_acts(subject: Subject) -> None:
     if not 1 <= _steps(printed) <= MOST_STEPS:
         raise Mismatch(f"expected one line such as {EXAMPLE} with 1 to {MOST_STEPS} steps, got {short(printed)}")
     if ended is None:
-        raise Mismatch(f"expected the program to end within {END_SECONDS:g} s after this line, got a running program")
+        raise Mismatch(
+            f"expected the program to end within {END_SECONDS:g} s after this line, got a program that still runs"
+        )
 
 
 def close_ends_the_program(subject: Subject) -> None:

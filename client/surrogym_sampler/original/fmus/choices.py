@@ -86,7 +86,9 @@ def _choices(path: Path, given: _File) -> Choices:
     actions = None if given.actions is None else tuple(given.actions)
     for key, names in (("actions", actions), ("coordinates", given.coordinates)):
         if names and (twice := next((name for name in names if names.count(name) > 1), None)) is not None:
-            raise UnknownEnvironment(f"{path}: {key}: expected each variable once, got {twice!r} twice: remove one")
+            raise UnknownEnvironment(
+                f"{path}: {key}: expected each variable once, got {twice!r} twice: remove one of them"
+            )
     return Choices(given.step, actions, limits, given.coordinates, given.start)
 
 
@@ -102,8 +104,8 @@ def driven(archive: Archive, choices: Choices) -> tuple[Declared, ...]:
             kinds = sorted({v.type for v in archive.variables if v.causality == "input"})
             what = f"inputs of type {', '.join(kinds)} only" if kinds else "no scalar input"
             raise UnknownEnvironment(
-                f"expected a continuous scalar input in {archive.path} for the action, got {what}: declare one in the "
-                "model and export it anew"
+                f"expected a continuous scalar input in {archive.path} for the action, got {what}: declare an "
+                "input in the model, and export the FMU anew"
             )
         return inputs
     chosen = tuple(archive.named(name) for name in choices.actions)

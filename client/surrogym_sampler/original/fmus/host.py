@@ -107,7 +107,7 @@ class Host:
             if key not in self._kept:
                 raise Refused(
                     "the saved state was dropped from memory, and the FMU can't give states as bytes: restore a newer "
-                    "one"
+                    "state"
                 )
             instance.restore(self._kept[key])
             return self._values()
