@@ -24,8 +24,8 @@ from surrogym_shared.spec import EnvironmentSpec
 
 Bools = NDArray[np.bool_]
 
-LONGEST = 5  # largest number of earlier changes or actions that is tried
-EPISODE = 20  # largest number of steps in an episode
+LONGEST = 5  # largest number of earlier changes, and of earlier actions, in the histories that are compared
+EPISODE = 20  # largest number of steps in an episode of the test
 HELD = 4  # largest number of steps for which a random action is held
 RIDGE = 1e-6  # ridge term of the linear regression, relative to the variance of its inputs
 ENOUGH = 0.05  # a history is good enough if its error is below this share of the standard deviation of the changes

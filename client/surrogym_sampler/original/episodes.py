@@ -161,7 +161,7 @@ class RolloutEpisode(OwnEpisode):
     def __init__(self, environment: RolloutEnvironment) -> None:
         super().__init__(environment)
         self._environment = environment
-        self._rated = bool(rates(environment.spec()))  # whether the environment may apply another action than requested
+        self._rated = bool(rates(environment.spec()))  # whether a declared rate may change actions
 
     def reset(self, seed: int) -> Moment:
         return self._started(self._environment.begin(seed))

@@ -36,7 +36,8 @@ ROUNDING = 1e-14
 FIT: dict[str, Any] = {"bounds": (0.0, 1.0), "x_scale": 0.3, "ftol": 1e-12, "xtol": 1e-12, "gtol": 1e-12}
 LEAST_SHARE = 1e-3  # coordinates whose errors are below this share of the largest error all get the same weight
 
-# One step of a simulator: parameters (P,), coordinates (C,) and action (F,) to next coordinates (C,).
+# Function that takes a step of a simulator: it gets parameters (P,), coordinates (C,) and an action (F,), and returns
+# the next coordinates (C,).
 Step = Callable[[Array, Array, Array], Array]
 
 

@@ -17,7 +17,7 @@ from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.surrogate_file import SurrogateFile
 from surrogym_shared.wire import SurrogateView
 
-BATCH = 64  # number of queries in one claim
+BATCH = 64  # number of queries that are claimed at once
 LONGEST_FIT = 1_800.0  # largest number of seconds for fitting the simulator's model
 MARK = ".simulator-"  # part of the name of the temporary surrogate that learns the simulator's model
 TOKEN = 8  # number of random hexadecimal digits at the end of the temporary surrogate's name

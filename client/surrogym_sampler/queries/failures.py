@@ -16,8 +16,9 @@ FIRST_FEW = 4  # a machine that has never answered counts as broken after this n
 MANY = 8  # a machine that has answered before counts as broken after this number of failed queries in a row
 # Wait in seconds after a failure: the first, doubled with each failure, to the longest.
 FIRST_DELAY, LONGEST_DELAY = 1.0, 30.0
-FEWEST_LEFT = 2  # smallest number of rollouts beyond a limit after which a sampler may stop
-LEFT_LEVEL = 0.01  # probability that a sampler stops although at most twice the allowed share of rollouts leave a limit
+FEWEST_LEFT = 2  # a sampler stops only if at least this number of its rollouts left a limit
+# Probability that a sampler stops by mistake, although at most twice the allowed share of its rollouts leave a limit.
+LEFT_LEVEL = 0.01
 
 
 class Failures:
@@ -68,13 +69,14 @@ class Failures:
 class Violations:
     """The rollouts of one sampler that left a limit of the environment's own specification.
 
-    A sampler stops if they are more than twice the allowed share of episodes explains.
+    A sampler stops if there are more of these rollouts than twice the allowed probability of leaving a limit explains.
     """
 
     def __init__(self, spec: EnvironmentSpec) -> None:
         self._spec = spec
         self._rollouts = self._left = 0
-        self._limits = np.zeros(0 if spec.limits is None else len(spec.limits.keep), dtype=int)  # (L,) rollouts
+        # (L,) number of rollouts that left each of the L limits
+        self._limits = np.zeros(0 if spec.limits is None else len(spec.limits.keep), dtype=int)
         self._too_many = False
 
     def rollout(self, steps: Sequence[NewSample]) -> None:
@@ -98,5 +100,6 @@ class Violations:
         raise LimitsLeft(
             f"{self._left} of {self._rollouts} rollouts of this sampler left a limit ({each}), which is more than "
             f"the allowed {100 * limits.probability:g} % explain, so no other query was begun: choose a larger margin, "
-            "a smaller range of actions, or a fallback that holds, and register it under another name"
+            "a smaller range of actions, or a fallback that holds, and register "
+            "the environment under another name"
         )

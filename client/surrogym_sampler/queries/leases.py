@@ -116,6 +116,6 @@ class Leases:
             self._api.renew(self._surrogate, query.id, query.lease_token, lease_seconds=seconds, retries=ONE_ATTEMPT)
             held.ends = asked + seconds
         except AWAY:
-            return  # the next renewal tries again
+            return  # the server did not answer; the next renewal tries again
         except SurrogymClientError:
             self.release(query)  # The running step continues, because a late sample is still a true observation.

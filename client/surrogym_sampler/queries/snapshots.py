@@ -180,7 +180,7 @@ class SnapshotFolder:
                 "name another by --snapshots"
             ) from error
         for path in self._folder.glob(f"*{UNFINISHED}"):
-            with suppress(OSError):  # another sampler removed it
+            with suppress(OSError):  # another sampler has removed the file
                 if path.stat().st_mtime < now - ABANDONED_SECONDS:
                     path.unlink()
 

@@ -18,13 +18,13 @@ from surrogym_sampler.original.errors import StepFailed
 from surrogym_sampler.original.protocol import Array
 from surrogym_sampler.original.simulator import Taken
 
-PLACES = 4  # number of states in each test
+PLACES = 4  # number of explored states in each test
 EXACT = 1e-6  # a difference below this share of a variable's observed range counts as rounding
 # Setting a state works if a step after it differs from the one that an episode took there by at most this share of each
 # variable's observed range.
 SETTABLE = 1e-3
 FEW = 3.0  # two steps count as equal if they differ by at most this multiple of the noise measured in a few steps
-FARTHEST = 3.0  # largest shift of a position in a test, in the simulator's unit
+FARTHEST = 3.0  # largest distance by which a test shifts a position, in the simulator's unit
 TURN = 2 * np.pi
 PART = 1.0  # shift in radians, less than a turn, that must change something if a variable is an angle
 ANYWHERE = 32  # number of random states within the limits from which a step tests whether states stay inside

@@ -35,7 +35,7 @@ HALVINGS = 24
 COARSE = 10  # the first steps of a bisection, this many, are far enough from the boundary to test a formula of it
 # To find a neighbour of a boundary point, one end of its bisection moves by this share of the states' range.
 NEAR = 0.02
-FLAT = 1e-3  # a singular value below this share of the largest means that the points lie on more than one ellipsoid
+FLAT = 1e-3  # if a singular value is below this share of the largest one, more than one ellipsoid fits the points
 MOST = 5_000  # largest number of groups of terms in which a level or an ellipsoid is searched
 READS: dict[Timing, Callable[[Paid], Array]] = {"after": Paid.after, "before": Paid.before}
 

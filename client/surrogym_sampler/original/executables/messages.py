@@ -167,7 +167,7 @@ def _wrong(expected: str, reply: Reply, key: str) -> StepFailed:
 def _is_number(value: object) -> bool:
     try:
         return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-    except OverflowError:  # an int beyond the range of a float
+    except OverflowError:  # an integer that is too large for a float
         return False
 
 

@@ -32,7 +32,7 @@ from surrogym_sampler.original.fmus.choices import Value
 from surrogym_sampler.original.protocol import Array
 
 START_LIMIT = 120.0  # seconds within which the native code must be loaded
-HEADER = struct.Struct("<8s16sqq")  # header of a snapshot: form, the FMU's digest, steps since the start, key in memory
+HEADER = struct.Struct("<8s16sqq")  # a snapshot's version, FMU's digest, steps so far, key
 FORM = b"SGFMU\x00\x00\x01"
 COMMAND = shlex.join([sys.executable, "-m", "surrogym_sampler.original.fmus.host"])
 

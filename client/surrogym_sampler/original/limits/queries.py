@@ -76,7 +76,7 @@ class GuardedRollouts:
         self.parallel = runs_in_parallel(environment)
         self._guard = Guard(self._spec)
         self._watchdog = Watchdog(self._spec, self._guard, self._fall, waits=self.parallel)
-        self.rest_seconds = self._watchdog.rest_seconds  # additional seconds of ``close``
+        self.rest_seconds = self._watchdog.rest_seconds  # longest duration of the fallback in ``close``
 
     def spec(self) -> EnvironmentSpec:
         return self._spec

@@ -139,7 +139,7 @@ class Process(OfParts):
         self.time_limit = int(env.N) - 1  # pc-gym ends an episode one step before N samples
 
     def reset(self, seed: int | None) -> Array:
-        del seed  # a reset draws no random numbers
+        del seed  # the seed has no effect, because a reset draws no random numbers
         self._env.SP, disturbances = self._schedule
         if disturbances:
             self._env.disturbances = disturbances
