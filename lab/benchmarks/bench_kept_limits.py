@@ -4,15 +4,17 @@
     python lab/benchmarks/bench_kept_limits.py --machines rotary --no-policy --first-seed 1 --seeds 10
 
 The machines are the cart-pole swing-up on a rail of +-0.8 m, two tanks of which the upper one runs over, a levitated
-ball that must be held, and a rotary pendulum whose arm must stay within +-1.5 rad and is only seen by an encoder, one
-step late. A row has one design and one policy, with limits or without:
+ball that must be held, a reactor that must not run away, a quadrotor between floor and ceiling, and a rotary pendulum
+whose arm must stay within +-1.5 rad and is only seen by an encoder, one step late. A row has one design and one policy,
+with limits or without:
 
 - real steps and rollouts of the design, and how many rollouts left a limit;
 - the mean real return of 50 episodes of a policy trained in the model, how many of them left a limit, and the share of
   steps in which the fallback acted.
 
-A row without limits is judged by the same limits. Rows are saved in ``--out``/limits.csv, so that the same command
-continues after Ctrl-C.
+Each row is judged by the physical quantity that must stay in its range, such as the position of the cart. The declared
+limit may be of another term, such as the position plus the way of 0.1 s. Rows are saved in ``--out``/limits.csv, so
+that the same command continues after Ctrl-C.
 """
 
 from __future__ import annotations
@@ -36,7 +38,7 @@ from scipy.stats import binomtest
 
 import surrogym
 from support import levitation
-from support.changing import Machine
+from support.changing import Array, Machine, Parameters
 from surrogym_lab.reproduce.rows import read_records, write_records
 from surrogym_sampler import original
 from surrogym_sampler.original.episodes import open_episode
@@ -55,6 +57,62 @@ SEARCH = "FASTPPO"
 # Beyond 2.1 in this direction no voltage holds it any more.
 RUNS_AWAY = Term.linear(gap=1.0, speed=22.6, current=-5.2)
 HOVERING = Term.linear(gap=1.53, speed=31.5, current=-6.38)
+
+
+def _reactor(q: Array, u: Array, _: Parameters) -> tuple[Array, Array]:
+    """A stirred tank with an exothermic reaction: concentration in mol/l, temperature in K about 350. The action is the
+    coolant's temperature, 300 K +- 20 K. A concentration of 0.42 is wanted, near to where the reaction runs away."""
+    c, t, coolant = q[..., 0], q[..., 1] + 350, 300 + 20 * u[..., 0]
+
+    def rates(c: Array, t: Array) -> tuple[Array, Array]:
+        rate = 7.2e10 * np.exp(-8750 / t) * c
+        return 1 - c - rate, 350 - t + 209.2 * rate + 2.092 * (coolant - t)
+
+    for _ in range(REACTOR_PARTS):
+        first = rates(c, t)
+        half = 0.5 * REACTOR_DT / REACTOR_PARTS
+        second = rates(c + half * first[0], np.minimum(t + half * first[1], RELIEF))
+        c, t = c + 2 * half * second[0], np.minimum(t + 2 * half * second[1], RELIEF)
+    return np.stack([c, t - 350], -1), np.exp(-0.5 * ((q[..., 0] - 0.42) / 0.1) ** 2)
+
+
+def _quadrotor(q: Array, u: Array, _: Parameters) -> tuple[Array, Array]:
+    """The height of a quadrotor in m about the middle between floor and ceiling, its speed, and the acceleration of its
+    rotors, which follow the action with 0.1 s. A height above the ceiling of 1 m is wanted: 1.1 m."""
+    height, speed, push = q[..., 0], q[..., 1], q[..., 2]
+    for _ in range(QUADROTOR_PARTS):
+        push = push + 0.01 / 0.1 * (6 * u[..., 0] - push)
+        speed = speed + 0.01 * (push - 0.3 * speed * np.abs(speed))
+        height = height + 0.01 * speed
+    return np.stack([height, speed, push], -1), np.exp(-0.5 * ((q[..., 0] - 1.1) / 0.4) ** 2)
+
+
+REACTOR_DT, REACTOR_PARTS, RELIEF = 0.05, 20, 400.0  # minutes of a step, and steps of the midpoint rule; K
+QUADROTOR_PARTS = 5  # Euler steps of 0.01 s
+REACTOR = Machine(
+    "reactor",
+    {"concentration": (0.0, 1.0), "temperature": (-40, 50)},
+    {"concentration": (0.7, 0.9), "temperature": (-30, -20)},
+    _reactor,
+    real={},
+    wrong={},
+    few=(8, 16),
+    budget=120,
+    noise=0.001,
+    time_limit=100,
+)
+QUADROTOR = Machine(
+    "quadrotor",
+    {"height": (-1.5, 1.5), "speed": (-3, 3), "push": (-6, 6)},
+    {"height": (-0.2, 0.2), "speed": (-0.1, 0.1), "push": (-0.1, 0.1)},
+    _quadrotor,
+    real={},
+    wrong={},
+    few=(8, 16),
+    budget=80,
+    noise=0.001,
+    time_limit=100,
+)
 
 
 class Formula:
@@ -99,6 +157,7 @@ class Plant:
 
     make: Callable[[int], Any]  # makes the machine, of a seed
     limits: Limits
+    physical: Limit  # by which every row is judged
     budget: int
     period: float  # seconds of a step
     changes: dict[str, Any]  # of the specification
@@ -115,6 +174,7 @@ PLANTS = {
             Term.linear(x=-8.0, velocity=-6.0),
             Limit(name="rail", term=Term.linear(x=1.0, velocity=0.1), low=-0.8, high=0.8, margin=0.2),
         ),
+        Limit(name="rail", term=Term.linear(x=1.0), low=-0.8, high=0.8),
         budget=260,
         period=0.1,
         changes={},
@@ -122,6 +182,7 @@ PLANTS = {
     "tanks": Plant(
         partial(Formula, replace(levitation.TANKS, start={"upper": (-5, 0), "lower": (-5, 0)})),
         _limits(Term.constant(-1.0), Limit(name="brim", term=Term.linear(upper=1.0), high=4.0, margin=0.7)),
+        Limit(name="brim", term=Term.linear(upper=1.0), high=4.0),
         budget=60,
         period=0.5,
         changes={},
@@ -136,8 +197,32 @@ PLANTS = {
             ),
         ),
         _limits(HOVERING, Limit(name="held", term=RUNS_AWAY, low=-2.1, high=2.1, margin=1.1)),
+        Limit(name="held", term=RUNS_AWAY, low=-2.1, high=2.1),
         budget=100,
         period=0.005,
+        changes={},
+    ),
+    "reactor": Plant(
+        partial(Formula, REACTOR),
+        # Beyond 358 K at 0.5 mol/l, less 40 K for each mol/l, the coldest coolant no longer stops the reaction.
+        _limits(
+            Term.constant(-1.0),
+            Limit(name="runaway", term=Term.linear(temperature=1.0, concentration=40.0), high=28.0, margin=5.0),
+        ),
+        Limit(name="temperature", term=Term.linear(temperature=1.0), high=20.0),
+        budget=120,
+        period=3.0,
+        changes={},
+    ),
+    "quadrotor": Plant(
+        partial(Formula, QUADROTOR),
+        _limits(
+            Term.linear(height=-1.5, speed=-1.2, push=-0.1),
+            Limit(name="room", term=Term.linear(height=1.0, speed=0.3, push=0.03), low=-1.0, high=1.0, margin=0.15),
+        ),
+        Limit(name="height", term=Term.linear(height=1.0), low=-1.0, high=1.0),
+        budget=80,
+        period=0.05,
         changes={},
     ),
     "rotary": Plant(
@@ -146,6 +231,7 @@ PLANTS = {
             Term.linear(**{"arm": -0.6, "arm.change1": -4.0}),
             Limit(name="stop", term=Term.linear(**{"arm": 1.0, "arm.change1": 2.0}), low=-1.5, high=1.5, margin=0.5),
         ),
+        Limit(name="stop", term=Term.linear(arm=1.0), low=-1.5, high=1.5),
         budget=300,
         period=0.03,
         changes={},
@@ -197,15 +283,24 @@ def specifications(plant: Plant, seed: int) -> tuple[EnvironmentSpec, Environmen
     return EnvironmentSpec.model_validate({**fields, "limits": plant.limits.model_dump()}), free
 
 
+def _judging(plant: Plant, spec: EnvironmentSpec) -> EnvironmentSpec:
+    """Specification whose only limit is the physical one."""
+    limits = _limits(plant.limits.fallback[0], plant.physical)
+    judging: EnvironmentSpec = EnvironmentSpec.model_validate({**spec.model_dump(), "limits": limits.model_dump()})
+    return judging
+
+
 def run(machine: str, seed: int, *, limited: bool, policy: bool) -> Row:
     plant = PLANTS[machine]
-    judged, free = specifications(plant, seed)
-    spec = judged if limited else free
+    kept, free = specifications(plant, seed)
+    spec = kept if limited else free
+    judged = _judging(plant, kept)
 
     def made() -> Any:
         return Respecified(plant.make(seed), spec)
 
-    environment, design = keeping_limits(answering(made())), surrogym.Design(spec, threads=1)
+    environment: Any = keeping_limits(answering(made()))
+    design = surrogym.Design(spec, threads=1)
     rollouts = left = 0
     while (query := design.ask()) is not None:
         environment.begin(int(np.random.SeedSequence([seed, query.id]).generate_state(1)[0]))
