@@ -1,6 +1,6 @@
 """A policy as plain arrays, and the code by which it acts, which is the same on client and server.
 
-Shapes: N lanes, D observation entries, A outputs of the network, F action entries.
+Shapes: N lanes (environments that step together), D observation entries, A outputs of the network, F action entries.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from surrogym_shared.distributions import Bounded, Choices, Sampled, middle_and_reach
 from surrogym_shared.network import MAX_LAYERS, Activation, Layer, Network, forward, most_probable
 
-MAX_UNITS = 1_024  # most units of a layer
-MAX_PARAMETERS = 262_144  # most parameters of all layers together
-MAX_ROLLOUT = 100_000  # most steps of one request
-MAX_LANE_STEPS = 1_000_000  # most steps of all lanes together in one request
-MAX_ACTIVATIONS = 2**24  # most activations of the widest layer, summed over all lanes: 128 MiB
+MAX_UNITS = 1_024  # largest number of units in one layer of a policy network
+MAX_PARAMETERS = 262_144  # largest number of weights and biases of a policy network
+MAX_ROLLOUT = 100_000  # largest number of steps of a rollout in one request
+MAX_LANE_STEPS = 1_000_000  # largest number of steps in one request, summed over lanes
+MAX_ACTIVATIONS = 2**24  # largest product of lanes and units of the widest layer: 128 MiB of activations
 MAX_LOG_DEVIATION = 80  # largest log standard deviation whose exponential is finite in float32
 
 Array = NDArray[np.floating[Any]]
@@ -34,30 +34,31 @@ class NoiseKey(NamedTuple):
     """
 
     seed: int
-    step: int = 0  # number of the rollout's first step
-    hold: int = 1  # number of steps that share the same noise
+    step: int = 0  # number of the rollout's first step; each further step has the next number
+    hold: int = 1  # number h of steps with the same noise: steps 0 to h - 1, h to 2 h - 1, ...
 
     def later(self, steps: int) -> NoiseKey:
-        """Return the key of a rollout that begins ``steps`` steps after this key's rollout."""
+        """Return the key with the noise of this key, beginning ``steps`` steps later."""
         return self._replace(step=self.step + steps)
 
 
 class KeyedGenerator:
-    """Random generator that is reset to each key, because making a new generator for each step would be slow: it reads
-    system entropy."""
+    """Random generator that is reset to each key. A new generator for each step would be slow, because its construction
+    reads system entropy."""
 
     def __init__(self) -> None:
         self._bits = np.random.Philox(0)
         self._generator = np.random.Generator(self._bits)
 
     def at(self, key: NoiseKey) -> np.random.Generator:
-        """Return the generator, set to the step of a key. Lane i draws its noise after lane i - 1, so the noise of a
-        lane does not depend on the number of lanes after it."""
+        """Return the generator, reset to the seed and step of a key. Lane i draws its noise after lane i - 1, so the
+        noise of a lane does not depend on the number of further lanes."""
         self._bits.state = {
             "bit_generator": "Philox",
             "state": {"counter": _words(0, 0, key.step // key.hold, 0), "key": _words(key.seed, 0)},
             "buffer": _words(0, 0, 0, 0),
-            "buffer_pos": 4,  # random numbers that were buffered for another key are discarded
+            # Marks the generator's buffer of random numbers as used up, so none of an earlier key is left.
+            "buffer_pos": 4,
             "has_uint32": 0,
             "uinteger": 0,
         }
@@ -66,7 +67,7 @@ class KeyedGenerator:
 
 @dataclass(frozen=True)
 class ActingPolicy:
-    """Policy network as plain arrays. The action space determines what its outputs mean.
+    """Policy network as plain arrays. Its outputs are means of continuous actions, or scores of discrete choices.
 
     All arrays are float32 or all are float64, and the network computes in this precision.
 
@@ -75,10 +76,12 @@ class ActingPolicy:
     """
 
     mean: Array  # (D,) mean that is subtracted from an observation
-    deviation: Array  # (D,) standard deviation by which the difference is divided
+    deviation: Array  # (D,) number by which an observation minus ``mean`` is divided
     layers: tuple[Layer, ...]
     activation: Activation = "tanh"  # activation function of the hidden layers
-    log_deviations: Array | None = None  # (F,) logarithms of the standard deviations of the noise; None without noise
+    log_deviations: Array | None = (
+        None  # (F,) log standard deviations of the noise of continuous actions; None without noise
+    )
 
     def __post_init__(self) -> None:
         arrays = self._arrays_by_name()
@@ -98,7 +101,7 @@ class ActingPolicy:
                 f"{most:g} in size"
             )
         if not (self.deviation > 0).all():
-            raise ValueError(f"policy: expected a positive standard deviation, got {self.deviation.min():g}")
+            raise ValueError(f"policy: expected numbers above 0 in deviation, got {self.deviation.min():g}")
 
     @classmethod
     def of(cls, network: Network) -> Self:
@@ -154,7 +157,9 @@ class PolicyRun:
     policy: ActingPolicy
     steps: int
     noise: NoiseKey | None = None
-    until: NDArray[np.bool_] | None = None  # (N,) stop once the episodes of these lanes have ended; None: take T steps
+    until: NDArray[np.bool_] | None = (
+        None  # (N,) mask: stop once an episode has ended in each masked lane; None: T steps
+    )
 
     def __post_init__(self) -> None:
         if not 1 <= self.steps <= MAX_ROLLOUT:
@@ -169,7 +174,7 @@ class Acted(NamedTuple):
 
     action: Array  # (N, F) actions before they are clipped to their bounds
     log_probability: Array | None  # (N,) log probability of each lane's action; None without noise
-    sent: NDArray[Any]  # actions as a surrogate takes them: clipped, or numbers of choices
+    sent: NDArray[Any]  # (N, F) actions as a surrogate takes them: clipped to their bounds, or numbers of choices
 
 
 @dataclass(frozen=True)
@@ -190,19 +195,23 @@ class Actor:
     def __post_init__(self) -> None:
         policy, log = self.policy, self.policy.log_deviations
         if policy.mean.size != self.observation:
-            raise ValueError(f"policy: expected a mean of {self.observation} entries, got {policy.mean.size}")
+            raise ValueError(
+                f"policy: expected a mean of {self.observation} entries, as an observation has, got {policy.mean.size}"
+            )
         if policy.units[-1] != self._distribution.outputs:
             outputs = self._distribution.outputs
-            raise ValueError(f"policy: expected {outputs} units in the last layer, got {policy.units[-1]}")
+            raise ValueError(
+                f"policy: expected {outputs} units in the last layer, as the action space needs, got {policy.units[-1]}"
+            )
         if self.counts and log is not None:
             raise ValueError("policy: expected no log_deviations with discrete actions, got some")
         if self.noisy and not self.counts and log is None:
-            raise ValueError("policy: expected log_deviations for the noise of continuous actions, got none")
+            raise ValueError("policy: expected log_deviations with noise, got none: give them, or request no noise")
         if log is not None and log.size != len(self.low):
             raise ValueError(f"policy: expected log_deviations of {len(self.low)} entries, got {log.size}")
 
     def act(self, observation: NDArray[Any], noise: NoiseKey | None) -> Acted:
-        """Return actions for observations (N, D): noisy ones by a key, or the most probable ones if ``noise`` is None.
+        """Return the policy's actions for observations (N, D): with the noise of a key, or without noise if it is None.
 
         Raises:
             ValueError: the network's outputs are not finite.
@@ -231,7 +240,10 @@ class Actor:
 
 
 def layers_of(sizes: Sequence[int], vector: Array) -> tuple[Layer, ...]:
-    """Split a vector into layers, as views of it. ``sizes`` are the numbers of inputs, hidden units and outputs."""
+    """Split a vector of parameters into the layers of a network, which are views of the vector.
+
+    ``sizes`` are the numbers of the network's inputs, of the hidden units of each layer, and of its outputs.
+    """
     layers, begin = [], 0
     for inputs, outputs in pairwise(sizes):
         middle, end = begin + inputs * outputs, begin + (inputs + 1) * outputs

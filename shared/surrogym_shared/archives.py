@@ -22,8 +22,8 @@ INFLATED = (
     zipfile.ZIP_DEFLATED,
 )
 ARRAY = ".npy"
-SHOWN = 80  # most characters of an entry's name that an error shows
-# Errors of NumPy's reader of array headers, which parses them as Python.
+SHOWN = 80  # an error shows at most this many characters of an entry's name
+# Errors that NumPy's reader raises for a wrong array header, which it parses as Python code.
 MALFORMED = (
     ValueError,
     LookupError,
@@ -48,11 +48,11 @@ def read_entries(zipped: Path | bytes, limit: int) -> dict[str, bytes]:
 
     Args:
         zipped: path of the file, or its contents.
-        limit: most bytes that all entries together may have.
+        limit: largest number of bytes of all decompressed entries together.
 
     Raises:
         OSError: the file can't be read.
-        ValueError: the file is not a zip, is too large, or contradicts the sizes in its headers.
+        ValueError: the file is no zip file, is too large, or contradicts the sizes in its headers.
     """
     with _open_zip(zipped, limit) as archive:
         return {entry.filename: _content(archive, entry) for entry in archive.infolist()}
@@ -74,8 +74,9 @@ def read_arrays(
 
     Args:
         npz: path of the file, or its contents.
-        limit: most bytes that all arrays together may have.
-        require: called with all headers by name before any array is made; raises ValueError to refuse them.
+        limit: largest number of bytes of all decompressed arrays together.
+        require: called with the headers of all arrays by name, before any array is read; raises ValueError to refuse
+            the file.
 
     Raises:
         OSError: the file can't be read.
@@ -88,11 +89,12 @@ def read_arrays(
 
 
 def require_finite(arrays: Mapping[str, NDArray[Any]], positive: str) -> None:
-    """Raise ValueError if an array has NaN or infinity, or if the one named ``positive`` has a number of 0 or less."""
+    """Raise ValueError if an array has NaN or infinity, or if the array named ``positive`` has a number of 0 or
+    less."""
     for name, array in arrays.items():
         if not np.isfinite(array).all() or (name == positive and (array <= 0).any()):
             kind = "finite numbers above 0" if name == positive else "finite numbers"
-            raise ValueError(f"expected {name} as {kind}, got others")
+            raise ValueError(f"array {name}: expected {kind}, got others")
 
 
 @contextmanager
@@ -118,7 +120,7 @@ def _require_once(names: list[str]) -> None:
 
 
 def _stream(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> IO[bytes]:
-    """Open an entry for reading. It is decompressed up to the size in its header, and no further."""
+    """Open an entry of a zip file, from which at most the number of bytes in its header can be read."""
     if entry.compress_type not in INFLATED:
         raise ValueError(f"expected {entry.filename!r} uncompressed or deflated, got zip method {entry.compress_type}")
     return archive.open(entry)

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 COMPILERS = ("cc", "gcc", "clang")
-SECONDS = 600  # longest time of a compilation
-SHOWN = 2_000  # most characters of the compiler's output that an error shows
+SECONDS = 600  # longest time that a compilation may take
+SHOWN = 2_000  # an error shows at most this many characters of the compiler's output
 
 
 class CannotCompile(RuntimeError):
@@ -28,7 +28,7 @@ def c_compiler() -> tuple[str, ...] | None:
     if text := os.environ.get("CC", "").strip():
         try:
             command = tuple(shlex.split(text))
-        except ValueError:  # a quotation mark is not closed
+        except ValueError:  # raised if a quotation mark in the variable is not closed
             command = ()
         if not command or shutil.which(command[0]) is None:
             raise CannotCompile(f"expected the variable CC to name a C compiler on the search path, got {text!r}")
@@ -39,7 +39,9 @@ def c_compiler() -> tuple[str, ...] | None:
 def require_c_compiler() -> tuple[str, ...]:
     """Return the command of the C compiler. Raises ``CannotCompile`` if there is none."""
     if (command := c_compiler()) is None:
-        raise CannotCompile(f"expected a C compiler ({', '.join(COMPILERS)}) on the search path, got none: install one")
+        raise CannotCompile(
+            f"expected a C compiler ({', '.join(COMPILERS)}) on the search path, got none: install one or set CC"
+        )
     return command
 
 
@@ -61,7 +63,7 @@ def compile_c(command: Sequence[str], flags: Sequence[str], sources: Sequence[st
         process = subprocess.run(whole, cwd=folder, capture_output=True, text=True, timeout=SECONDS, check=False)
     except (OSError, subprocess.TimeoutExpired) as error:
         raise CannotCompile(
-            f"the C compiler {command[0]!r} can't be run: {error}; set the variable CC to another"
+            f"the C compiler {command[0]!r} can't be run: {error}; set the variable CC to another compiler"
         ) from error
     if process.returncode:
         message = process.stderr[:SHOWN].strip() or f"exit status {process.returncode}"

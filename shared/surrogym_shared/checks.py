@@ -1,5 +1,5 @@
-"""Types of numbers and names in a specification: distinct in float64, and neither text nor booleans in place of
-numbers."""
+"""Types of numbers and names in a specification. Text and booleans are not accepted as numbers, and the ends of a range
+must differ in float64."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ from typing import Annotated
 
 from pydantic import Field
 
-SHOWN = 40  # most characters of a wrong value that a message shows
-LARGEST, NARROWEST = 1e12, 1e-12  # bounds of numbers, so that squares, products and float32 observations stay finite
-RESOLUTION = 1e-9  # narrowest range relative to the size of its numbers; in a narrower one rounding errors dominate
+SHOWN = 40  # a message shows at most this many characters of a wrong value
+# Largest size of a number, and smallest width of a range, so that products stay finite.
+LARGEST, NARROWEST = 1e12, 1e-12
+RESOLUTION = 1e-9  # smallest width of a range, as a share of its numbers: in a narrower range rounding errors dominate
 
 Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST, allow_inf_nan=False, strict=True)]
 Width = Annotated[float, Field(ge=NARROWEST, le=LARGEST, allow_inf_nan=False, strict=True)]

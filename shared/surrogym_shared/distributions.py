@@ -1,6 +1,7 @@
 """Action distributions: how the outputs of an actor become a bounded normal distribution, or a choice for each entry.
 
-Shapes: B rows, A outputs of the actor, F action entries, K further parameters, which do not depend on the state.
+Shapes: B rows (observations), A outputs of the actor network, F action entries, K further parameters, which do not
+depend on the state.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 HALF_LOG_TAU = 0.5 * float(np.log(2 * np.pi))
 
-Array = NDArray[np.floating[Any]]  # float32 during training
+Array = NDArray[np.floating[Any]]  # of float32 during a training
 
 
 class Sampled(Protocol):
@@ -40,8 +41,8 @@ class Sampled(Protocol):
 
 @dataclass(frozen=True)
 class Bounded:
-    """Normal distribution of continuous actions around centre + reach tanh(outputs). The further parameters are log
-    standard deviations (F,)."""
+    """Normal distribution of continuous actions with the mean centre + reach tanh(outputs). The further parameters are
+    log standard deviations (F,)."""
 
     centre: Array  # (F,) middle of each action entry's range
     reach: Array  # (F,) half the width of each action entry's range
@@ -76,7 +77,8 @@ class Choices:
         return sum(self.counts)
 
     def sample(self, outputs: Array, further: Array, rng: np.random.Generator) -> tuple[Array, Array]:
-        with np.errstate(divide="ignore"):  # an exponential draw of 0 gives the score inf, which wins
+        # An exponential random number of 0 gives the noise inf, so that this choice is taken.
+        with np.errstate(divide="ignore"):
             gumbel = -np.log(rng.standard_exponential(outputs.shape, dtype=_kind(outputs)))
         # The largest output with Gumbel noise is a random choice with the probabilities of the softmax.
         choices = [part.argmax(1) for part in self.parts(outputs + gumbel)]

@@ -5,8 +5,9 @@ from __future__ import annotations
 import re
 from pathlib import PurePath
 
-GYMNASIUM_ID = re.compile(r"(?:[A-Za-z_][\w.]*:)?[\w./-]+-v\d+")  # package:Id-v0 is Gymnasium's own spelling
-FILES = (".fmu", ".json")  # suffixes of names that refer to files
+# Also matches package:Id-v0, Gymnasium's form with a module to import.
+GYMNASIUM_ID = re.compile(r"(?:[A-Za-z_][\w.]*:)?[\w./-]+-v\d+")
+FILES = (".fmu", ".json")  # suffixes of names that refer to a file of the original environment
 
 
 def is_name(text: str) -> bool:

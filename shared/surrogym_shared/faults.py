@@ -1,4 +1,4 @@
-"""The faults that a validation found, in words for a person who does not know pydantic."""
+"""Describe the errors of a pydantic validation in words for a person who does not know pydantic."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ REWORDED = (  # regular expressions of pydantic's messages, and their replacemen
 
 
 def first_fault(error: ValidationError, *, got: bool = False, of: type[BaseModel] | None = None) -> str:
-    """Describe the first fault of a validation error, after the path of the wrong entry, such as ``action.low.0``.
+    """Describe the first fault of a validation error: path of the wrong entry, such as ``action.low.0``, and fault.
 
     Args:
         error: error of a pydantic validation.
-        got: whether to add the wrong value.
+        got: whether the description ends with the wrong value.
         of: model of the input. With it, an unknown entry is described together with the allowed ones. It is also
             described before a missing entry, because it may be the missing one with a wrong name.
     """

@@ -1,7 +1,9 @@
 """The binary form of reset, step and rollout: msgpack maps whose arrays are raw little-endian bytes.
 
-A frame names its operation in ``op`` and carries neither dtype nor shape: both sides know them from the
-session. The same frames are HTTP bodies of type ``MEDIA_TYPE`` and messages of the stream.
+A frame names its operation in ``op``. It has no dtypes and shapes, which both sides know from the session. The same
+frames are HTTP bodies of type ``MEDIA_TYPE`` and messages of the WebSocket.
+
+Shapes: N lanes, D observation entries, F action entries, O model outputs, T steps, K lanes whose episode ended.
 
 ========================================  ===========  ==============================
 field                                     shape        dtype
@@ -16,13 +18,14 @@ model_version                             (N,)         int64
 deviation                                 (N, O)       float64
 ========================================  ===========  ==============================
 
-A rollout of a policy has ``op`` policy. Its arrays of the policy have the policy's precision, float32 or float64: mean
-and deviation (D,), log_deviations (F,), and ``parameters``: weights (I, O) and bias (O,) of each layer in order.
-``until`` (N,) is bool.
+A rollout of a policy has ``op`` policy. Its arrays have the policy's precision, float32 or float64: mean and deviation
+(D,), log_deviations (F,), and ``parameters``: for each layer in order, the weights (inputs, units) and the bias
+(units,). ``until`` (N,) is bool.
 
-The reply has the arrays above with a leading T, action (T, N, F), log_probability (T, N), and final_steps (K,) as int64
-beside final_lanes. To save bytes without a loss, action and log_probability are float32 if that represents them exactly
-(``precision``), reward_mean is left out if it equals the reward, and model_version is (N,) if it never changes.
+The reply has the arrays above with a first axis of T steps, action (T, N, F), log_probability (T, N), and final_steps
+(K,) as int64 beside final_lanes. To save bytes without a loss, action and log_probability are float32 if that
+represents them exactly (``precision``), reward_mean is left out if it equals the reward, and model_version is (N,) if
+it never changes.
 """
 
 from __future__ import annotations
@@ -63,7 +66,7 @@ class FrameError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Shape:
-    """Sizes of a session's arrays: N lanes, D observation entries, F action entries, O model outputs."""
+    """Sizes of a session's arrays: numbers of lanes, observation entries, action entries and model outputs."""
 
     lanes: int
     observation: int
@@ -173,7 +176,7 @@ class PolicyReply(Frame, frozen=True, tag="policy", kw_only=True):
 
 
 class ProblemReply(Frame, frozen=True, tag="problem"):
-    """Problem body (RFC 9457) on the stream. ``seq`` is that of the refused request, if it had one."""
+    """Error reply on the WebSocket: a problem body (RFC 9457). ``seq`` is the number of the refused request, if any."""
 
     status: int
     code: Code
@@ -211,8 +214,8 @@ def read_reply(content: bytes) -> Reply:
 
 
 def reset_request(seq: int | None, seed: int | Sequence[int] | None, mask: Bools | None) -> ResetRequest:
-    """Build the request of a reset. The seed is one integer, or one for each lane, or None.
-    ``mask`` (N,) has the lanes to reset; None resets all.
+    """Build the request of a reset. The seed is one integer, one integer for each lane, or None for no new seed.
+    ``mask`` (N,) is True for the lanes to reset; None resets all.
 
     Raises:
         FrameError: int64 can't represent a seed.
@@ -223,14 +226,15 @@ def reset_request(seq: int | None, seed: int | Sequence[int] | None, mask: Bools
 
 
 def step_request(seq: int | None, action: Array, mask: Bools | None, deviations: bool) -> StepRequest:
-    """Build the request of a step with an action (N, F). ``mask`` (N,) has the lanes to step; None steps all. With
+    """Build the request of a step with an action (N, F). ``mask`` (N,) is True for the lanes to step; None steps all.
+    With
     ``deviations``, the reply has the predicted standard deviation of each output."""
     view = None if mask is None else _flat(mask, BOOL)
     return StepRequest(seq=seq, action=_flat(action, FLOAT64), mask=view, deviations=deviations)
 
 
 def rollout_request(seq: int | None, actions: Array) -> RolloutRequest:
-    """Build the request of a rollout with actions (T, N, F)."""
+    """Build the request of a rollout with actions (T, N, F): T steps of N lanes, with F action entries."""
     return RolloutRequest(seq=seq, actions=_flat(actions, FLOAT64))
 
 
@@ -256,7 +260,7 @@ def policy_request(
 
 
 def seed_of(request: ResetRequest, shape: Shape) -> int | list[int] | None:
-    """Return the seed of a reset request: one, or one for each of N lanes, or None. Raises ``FrameError``."""
+    """Return the seed of a reset request: one integer, one for each of N lanes, or None. Raises ``FrameError``."""
     if not isinstance(request.seed, memoryview):
         return request.seed
     seeds: list[int] = _array("seed", request.seed, INT64, (shape.lanes,)).tolist()
@@ -264,7 +268,7 @@ def seed_of(request: ResetRequest, shape: Shape) -> int | list[int] | None:
 
 
 def mask_of(request: ResetRequest | StepRequest, shape: Shape) -> Bools | None:
-    """Return the mask (N,) of the lanes to reset or step; None for all. Raises ``FrameError``."""
+    """Return the mask (N,) of the lanes to reset or step; None for all lanes. Raises ``FrameError``."""
     return None if request.mask is None else _array("mask", _checked("mask", request.mask), BOOL, (shape.lanes,))
 
 
@@ -344,7 +348,9 @@ def policy_reply(seq: int, result: PolicyRollout) -> PolicyReply:
         terminated=_flat(result.terminated, BOOL),
         truncated=_flat(result.truncated, BOOL),
         model_version=_flat(versions[0] if (versions == versions[0]).all() else versions, INT64),
-        reward_mean=None if mean.tobytes() == reward.tobytes() else mean,  # compared by bytes, because 0.0 == -0.0
+        reward_mean=None
+        if mean.tobytes() == reward.tobytes()
+        else mean,  # compared by bytes, because 0.0 == -0.0 as numbers
         final_steps=_flat(result.final_steps, INT64) if has_ends else None,
         final_lanes=_flat(result.final_lanes, INT64) if has_ends else None,
         final_observation=_flat(result.final_observation, FLOAT32) if has_ends else None,
@@ -376,7 +382,7 @@ def policy_rollout(reply: PolicyReply, shape: Shape) -> PolicyRollout:
 
 
 def _versions(view: memoryview, each: tuple[int, int]) -> Array:
-    """Return model versions (T, N). If the frame has one for each lane only, repeat it for each step."""
+    """Return model versions (T, N). If the frame has only one version for each lane, repeat it for each of T steps."""
     one = each[1] * INT64.itemsize
     if view.nbytes == one:
         return np.repeat(_own("model_version", view, INT64, each[1:])[None], each[0], 0)
@@ -445,7 +451,7 @@ def _final_steps(reply: PolicyReply, steps: int, count: int) -> Array:
 
 
 def _final(step: Step | PolicyReply, shape: Shape) -> tuple[Array, Array]:
-    """Return the lanes (K,) whose episode ended, and its last observation (K, D). Both are empty if none ended."""
+    """Return the K lanes (K,) whose episode ended, and the last observations (K, D) of these episodes."""
     if step.final_lanes is None or step.final_observation is None:
         if step.final_lanes is not step.final_observation:
             raise FrameError("expected final_lanes and final_observation together, got one of them")
@@ -489,8 +495,8 @@ def _own(name: str, view: memoryview, dtype: np.dtype[Any], shape: tuple[int, ..
 
 
 def _aligned(name: str, view: memoryview, dtype: np.dtype[Any], shape: tuple[int, ...]) -> Array:
-    """Return bytes as an aligned copy. Matrix products of it are faster, and their rounding does not depend on its
-    address."""
+    """Return bytes as an array, which is an aligned copy. Matrix products of an aligned array are faster, and always
+    round in the same way."""
     return _array(name, view, dtype, shape).copy()
 
 
@@ -501,8 +507,8 @@ def _require_size(name: str, view: memoryview, dtype: np.dtype[Any], shape: tupl
 
 
 def _checked(name: str, view: memoryview) -> memoryview:
-    if bytes(view).strip(b"\x00\x01"):  # not empty if a byte is neither 0 nor 1
-        raise FrameError(f"{name}: expected bytes 0 and 1, got others")
+    if bytes(view).strip(b"\x00\x01"):  # something is left if a byte is neither 0 nor 1
+        raise FrameError(f"{name}: expected booleans as bytes of 0 or 1, got other bytes")
     return view
 
 
@@ -510,11 +516,13 @@ def _seeds(seed: int | Sequence[int]) -> memoryview:
     try:
         return np.array(seed, dtype=INT64).data
     except (OverflowError, TypeError, ValueError) as error:
-        raise FrameError(f"seed: expected 0 to 2^63 - 1, got {seed}") from error
+        raise FrameError(f"seed: expected whole numbers from 0 to 2^63 - 1, got {seed}") from error
 
 
 def _read(decoder: msgspec.msgpack.Decoder[T], content: bytes) -> T:
     try:
         return decoder.decode(content)
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
-        raise FrameError(f"expected a frame, got {len(content)} bytes that can't be read as one: {error}") from error
+        raise FrameError(
+            f"expected a binary frame (msgpack), got {len(content)} bytes that can't be read as one: {error}"
+        ) from error

@@ -1,4 +1,4 @@
-"""95 % intervals of two results of episodes: the mean return, and the share of successes."""
+"""95 % intervals of a mean (such as the mean return of episodes) and of a share (such as that of successes)."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def of_mean(values: Sequence[float]) -> Interval | None:
     if len(values) < 2:
         return None
     array = np.asarray(values, dtype=np.float64)
-    rows = max(1, 2**20 // len(array))  # number of resamples that are computed at once, in 8 MB
+    rows = max(1, 2**20 // len(array))  # number of bootstrap samples that are computed at once, which take 8 MB
     rng = np.random.default_rng(0)
     means = np.concatenate(
         [
@@ -39,8 +39,8 @@ def of_mean(values: Sequence[float]) -> Interval | None:
 
 
 def of_share(successes: int, trials: int) -> Interval | None:
-    """Return the 95 % interval of a share of successes, by Wilson's score; None without trials. 100 of 100 gives 0.963
-    to 1."""
+    """Return the 95 % interval of a share of successes, by Wilson's score; None without trials. For example, 100
+    successes in 100 trials give the interval from 0.963 to 1."""
     if not trials:
         return None
     share, spread = successes / trials, Z**2 / trials

@@ -1,16 +1,22 @@
-"""Kinds of the parts of a specification and of a session, each listed once."""
+"""Types of words that select a kind of something in a specification or a session, such as a variant."""
 
 from typing import Literal
 
 CoordinateKind = Literal["linear", "angle", "constant"]
 LagKind = Literal["change", "value", "action", "steps"]
-Function = Literal["one", "linear", "sin", "cos"]  # basis function of a summand of a term
+Function = Literal["one", "linear", "sin", "cos"]  # function phi(q) of a summand in a term of the state q
 Relation = Literal["<", "<=", ">", ">="]  # relation of the two sides of an inequality
-RewardShape = Literal["one", "linear", "absolute", "square", "bump", "ball"]  # function of a term in a declared reward
-RewardTiming = Literal["before", "after", "auto"]  # a learned reward depends on the state before or after the step
-Side = Literal["lower", "upper"]  # end of a range
+RewardShape = Literal[
+    "one", "linear", "absolute", "square", "bump", "ball"
+]  # function of the quantities in one term of a declared reward
+RewardTiming = Literal[
+    "before", "after", "auto"
+]  # whether a reward depends on the state before or after the step; auto: the data decide
+Side = Literal["lower", "upper"]  # lower or upper end of a range
 
 Variant = Literal["deterministic", "probabilistic", "pathwise"]
 AutoresetMode = Literal["next_step", "same_step", "disabled"]
-Propagation = Literal["mean", "sample"]  # how a particle moves: by the mean, or by its own posterior sample
-Weighting = Literal["inverse_variance", "uniform"]  # how the particles' rewards are averaged
+Propagation = Literal[
+    "mean", "sample"
+]  # whether a particle moves by the model's mean, or by a sample of its own from the posterior
+Weighting = Literal["inverse_variance", "uniform"]  # how the rewards of a lane's particles are averaged

@@ -1,4 +1,4 @@
-"""Limits of a specification, evaluated on states: how much room there is, and what the fallback does.
+"""Limits of a specification, evaluated at states: the distance to each limit, and the action of the fallback.
 
 Shapes: n states, C coordinates, L limits, F action entries.
 """
@@ -20,8 +20,8 @@ from surrogym_shared.terms import evaluate
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
-CORNERS = 10  # most coordinates with which every corner of the start ranges is checked
-STARTS = 1_000  # number of random start states that are checked
+CORNERS = 10  # with at most this many coordinates, all corners of the start ranges are checked
+STARTS = 1_000  # number of random start states at which the limits are checked
 
 
 def limits_of(spec: EnvironmentSpec) -> Limits:
@@ -43,14 +43,15 @@ def room(spec: EnvironmentSpec, coordinates: Array) -> Array:
 
 
 def past(spec: EnvironmentSpec, coordinates: Array) -> Bools:
-    """Return whether coordinates (n, C) lie beyond any limit, as booleans (n,)."""
+    """Return for each of n states with coordinates (n, C) whether it lies beyond any limit, as booleans (n,)."""
     return np.asarray((room(spec, coordinates) < 0).any(axis=1))
 
 
 def falls_back(spec: EnvironmentSpec, before: Array, coordinates: Array) -> Bools:
-    """Return whether the fallback acts at coordinates (n, C), one step after ``before`` (n, C), as booleans (n,).
+    """Return for each of n states whether the fallback acts there, as booleans (n,).
 
-    It acts if the distance to a limit is below its margin, now or after one more step with the same change.
+    The fallback acts if the distance to a limit is below the limit's margin, now (at ``coordinates`` (n, C)) or after
+    one more step with the same change as since the states one step earlier (``before`` (n, C)).
     """
     return is_near(margins(spec), room(spec, coordinates), room(spec, before))
 
@@ -61,9 +62,12 @@ def margins(spec: EnvironmentSpec) -> Array:
 
 
 def is_near(margin: Array, now: Array, before: Array) -> Bools:
-    """Whether (n,) a distance to a limit, ``now`` (n, L), is below its margin (L,), or would be after one more step
-    with the change from the distance ``before`` (n, L)."""
-    with np.errstate(invalid="ignore"):  # a side without an end has infinite room
+    """Return for each of n states whether the distance to any of L limits is below the limit's margin, now or after
+    one more step with the same change, as booleans (n,).
+
+    ``margin`` (L,) has the margins, ``now`` and ``before`` (n, L) the distances now and one step earlier.
+    """
+    with np.errstate(invalid="ignore"):  # a limit without ends has an infinite distance, and inf - inf is NaN
         return np.asarray((np.fmin(now, 2 * now - before) < margin).any(axis=-1))
 
 
@@ -75,7 +79,7 @@ def fallback_action(spec: EnvironmentSpec, coordinates: Array) -> Array:
 
 
 def nearest(spec: EnvironmentSpec, coordinates: Array) -> tuple[Limit, float]:
-    """Return the limit that is nearest to coordinates (C,), and the distance to it.
+    """Return the limit that is nearest to a state with coordinates (C,), and the distance to the limit.
 
     To compare the limits, each distance is divided by the margin of its limit, if it has one.
     """
@@ -98,7 +102,7 @@ def left_too_often(left: int, episodes: int, share: float, level: float) -> bool
 
 
 class Step(Protocol):
-    """A real step, of which the states are read: coordinates (C,) before and after it."""
+    """A real step, of which only the coordinates (C,) before and after the step are read."""
 
     @property
     def coordinates(self) -> ArrayLike: ...
@@ -108,7 +112,7 @@ class Step(Protocol):
 
 
 def words_of_steps(spec: EnvironmentSpec, steps: Iterable[Step]) -> list[str]:
-    """Describe how real steps kept each limit. Empty without limits, whose steps are not read, and without steps."""
+    """Describe in sentences how well real steps kept each limit. Empty without limits or without steps."""
     pairs = [] if spec.limits is None else [(step.coordinates, step.next_coordinates) for step in steps]
     if not pairs:
         return []
@@ -193,7 +197,8 @@ def _check_fallback(spec: EnvironmentSpec, declared: Limits) -> None:
         for part in term.parts:
             require_known(f"limits: fallback {number}", part.weights, spec.coordinate_names)
         constant = all(part.function == "one" for part in term.parts)
-        value = float(evaluate(spec, term, np.zeros((1, len(spec.coordinates))))[0])  # at any state, if constant
+        # Value of the fallback at one state; at every state if the term is constant.
+        value = float(evaluate(spec, term, np.zeros((1, len(spec.coordinates))))[0])
         whole = isinstance(spec.action, BoxAction) or (constant and value.is_integer())
         got = f"{value:g}" if constant else "a term of the state"
         require(whole, f"limits: expected the number of a discrete action as fallback {number}, got {got}")

@@ -1,7 +1,7 @@
 """Functions compiled by numba, kept on disk for the next process.
 
-``jit`` imports numba, and so do files and folders named ``compiled`` of server and client. All other code imports them
-lazily, if ``available`` says so, because numba does not exist for every platform.
+``jit`` imports numba, and so do files and folders named ``compiled`` of server and client. Other code imports these
+only when it needs them and ``available`` is True, because numba does not exist for every platform.
 """
 
 from __future__ import annotations

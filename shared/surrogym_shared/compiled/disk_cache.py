@@ -1,4 +1,4 @@
-"""The disk cache of compiled functions. It needs no numba, so that a server can check it before the import."""
+"""The disk cache of compiled functions. It does not import numba, so that a server can check the cache quickly."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def folder(package: str) -> Path | None:
         state = path.stat()
         own = not hasattr(os, "getuid") or (state.st_uid == os.getuid() and not state.st_mode & 0o022)
         return path if own and os.access(path, os.W_OK) else None
-    except (OSError, RuntimeError):  # no home folder, or a read-only one
+    except (OSError, RuntimeError):  # there is no home folder, or nothing can be written to it
         return None
 
 

@@ -16,7 +16,7 @@ from surrogym_shared.compiled import disk_cache
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-settings: Any = config  # numba sets its attributes from environment variables
+settings: Any = config  # numba's settings, whose attributes numba sets from environment variables
 logger = logging.getLogger(__name__)
 
 OPTIONS: dict[str, Any] = {"error_model": "numpy", "nogil": True}
@@ -24,13 +24,14 @@ INNER: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True, *
 
 
 def compiled(function: F) -> F:
-    """Compile a function that only compiled code calls. A product and a following sum may be fused into one operation,
-    which rounds once."""
+    """Compile a function that only compiled code calls. A product and a sum that follows may become one operation,
+    which
+    rounds once."""
     return cast(F, njit(fastmath={"contract"}, **INNER)(function))
 
 
 def inlined(function: F) -> F:
-    """Compile a function into its only caller."""
+    """Compile a function inline, as a part of the compiled function that calls it."""
     return cast(F, njit(fastmath={"contract"}, inline="always", **INNER)(function))
 
 
@@ -62,7 +63,7 @@ def entry(*arguments: Any) -> Callable[[F], F]:
 
 @contextmanager
 def _kept_in(folder: Path) -> Iterator[None]:
-    """Context in which functions are declared whose compiled code numba shall cache in this folder."""
+    """Context in which numba caches the code of the functions that it compiles in this folder."""
     before, settings.CACHE_DIR = settings.CACHE_DIR, str(folder)
     try:
         yield

@@ -17,8 +17,8 @@ from surrogym_shared.fmu.description import build_description, model_description
 
 FLAGS = ("-std=c99", "-O2", "-fPIC", "-shared", "-fvisibility=hidden", "-ffp-contract=off")
 WRAPPER = "fmi3.c"
-LOADS = "import ctypes, sys; ctypes.CDLL(sys.argv[1])"  # test that this machine loads the library
-EPOCH = (1980, 1, 1, 0, 0, 0)  # fixed date of all entries, so that the same block gives the same bytes
+LOADS = "import ctypes, sys; ctypes.CDLL(sys.argv[1])"  # program that tests whether this machine can load a library
+EPOCH = (1980, 1, 1, 0, 0, 0)  # fixed date of all entries of the zip file, so that equal FMUs have equal bytes
 SYSTEMS = {"linux": ("linux", ".so"), "darwin": ("darwin", ".dylib"), "win32": ("windows", ".dll")}
 MACHINES = {"amd64": "x86_64", "x86_64": "x86_64", "arm64": "aarch64", "aarch64": "aarch64"}
 
@@ -79,6 +79,6 @@ def _compiled(command: tuple[str, ...], sources: dict[str, str], names: list[str
         if subprocess.run([sys.executable, "-c", LOADS, str(library)], capture_output=True, check=False).returncode:
             raise CannotCompile(
                 f"expected a C compiler for this machine, got {command[0]}, whose library can't be loaded: set the "
-                "variable CC to another"
+                "variable CC to another compiler"
             )
         return library.read_bytes()

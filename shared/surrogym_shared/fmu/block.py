@@ -14,7 +14,7 @@ from surrogym_shared.checks import require, require_unique
 Kind = Literal["Float64", "Int32", "Boolean"]
 Causality = Literal["input", "output", "parameter"]
 KINDS: tuple[Kind, ...] = ("Float64", "Int32", "Boolean")
-NEVER, AT_START, ALWAYS = range(3)  # when a value may be set
+NEVER, AT_START, ALWAYS = range(3)  # when a simulator may set a variable: never, before the simulation, always
 TIME = "time"  # name of the independent variable, which every FMU has
 
 
@@ -23,7 +23,7 @@ class Variable:
     """One variable of an FMU.
 
     Attributes:
-        start: value at the start. None for an output that ``block_start`` calculates.
+        start: value at the start of a simulation; None for an output that ``block_start`` calculates.
         unit: unit of the value; empty if it is unknown.
     """
 
@@ -47,8 +47,8 @@ class Variable:
 class Block:
     """Content of an FMU: a model that steps at a fixed period, as C99 source.
 
-    ``sources`` define the two functions of ``block.h``, which is generated (see ``header``). Both return 0, or 1 + the
-    index of a value that they can't use.
+    ``sources`` define the two functions of the generated file ``block.h`` (see ``header``). Both return 0, or 1 + the
+    index of a variable whose value they can't use.
 
     - ``int block_start(double *values, double *memory)`` calculates the outputs at the start. It may be called again
       after a start value has changed.
@@ -60,7 +60,7 @@ class Block:
         period: seconds between two steps.
         stop: default end of a simulation, in seconds; None for none.
         sources: contents of C files and headers by name. Each file that ends in .c is compiled.
-        memory: number of float64 that a block keeps from step to step besides its values.
+        memory: number of float64 numbers that a block keeps from step to step in addition to its variables.
         acts_first: whether the outputs change at the beginning of a period, as a controller's do, or at its end.
 
     Raises:
@@ -92,7 +92,8 @@ class Block:
 
     @property
     def token(self) -> str:
-        """Token by which native code recognises its description. Only equal blocks have equal tokens."""
+        """Text in ``modelDescription.xml`` and in the native code, which shows that both belong together. Only equal
+        blocks have equal tokens."""
         parts = [self.name, self.description, repr(self.variables), repr((self.period, self.memory, self.acts_first))]
         parts += [part for name in sorted(self.sources) for part in (name, self.sources[name])]
         return "{" + hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:32] + "}"
@@ -133,7 +134,7 @@ class Names:
 
 
 def _string(text: str) -> str:
-    """Return a text as a C string literal, with quotes, trigraphs and all beyond ASCII as octal escapes."""
+    """Return a text as a C string literal. Quotes, trigraphs and characters beyond ASCII become octal escapes."""
     octal = (
         chr(byte) if (chr(byte).isalnum() and byte < 128) or byte in b" ._-" else f"\\{byte:03o}"
         for byte in text.encode()

@@ -7,7 +7,7 @@ from xml.etree.ElementTree import Element, SubElement, indent, tostring
 from surrogym_shared.fmu.block import TIME, Block, Variable
 
 FMI = "3.0"
-REFERENCE = 0  # value reference of the time; variable i has the reference i + 1
+REFERENCE = 0  # value reference (FMI's number of a variable) of the time; variable i has i + 1
 
 
 def model_description(block: Block) -> bytes:

@@ -25,8 +25,8 @@ from surrogym_shared.logs.writing import spreadsheet_cell
 from surrogym_shared.spec import BoxAction, DiscreteAction, EnvironmentSpec
 from surrogym_shared.terms import terminates
 
-SHOWN = 8  # most values in a message
-HEADING = ("line", "reason")  # first columns of a file of rejected rows; the columns of the log follow
+SHOWN = 8  # an error message shows at most this many different values of a column
+HEADING = ("line", "reason")  # first columns of a CSV file of rejected rows, before the columns of the log
 OURS = ",".join(HEADING).encode() + b","
 
 
@@ -39,7 +39,8 @@ class ReadLog:
         roles: roles of its columns.
         steps: usable steps of the log.
         spec: the specification that the log was checked against, or that was drafted from the log.
-        notes: how the file was read, conclusions about the order of the rows, and reasons for a drafted specification.
+        notes: sentences on how the file was read, on the order of the rows, and on the reasons for a drafted
+            specification.
     """
 
     table: Table

@@ -1,4 +1,4 @@
-"""Find the episodes, repeated rows and clock of a log, which tell which row continues which.
+"""Find the episodes, repeated rows and clock of a log, from which follows which row is the next state of which.
 
 A row repeats another one only by evidence of its place: the same time in the same episode, or a whole file that was
 joined to itself. Equal numbers alone are no evidence, because a plant at rest writes equal rows.
@@ -16,14 +16,16 @@ from surrogym_shared.logs.rows import Rows
 from surrogym_shared.logs.table import Bools, Floats, Ints
 from surrogym_shared.words import counted
 
-# If more than this share of the rows has the time of the row before, the clock may be coarser than the rows.
+# If more than this share of a log's rows have the same time as the row before, the clock may be coarser than the rows.
 SHARED = 0.1
-# Of the rows with the time of the row before, some differ from it in other numbers. Up to a share of REPEATS, all these
-# rows are repeats. From a share of DIFFER on, they are steps under a coarse clock. Between the two, the log is refused.
+# Of the rows that have the same time as the row before, a share differs from that row in other numbers. Up to a share
+# of REPEATS, all rows of the same time are repeats. From a share of DIFFER on, they are steps under a coarse clock.
+# Between the two shares, the log is refused.
 REPEATS, DIFFER = 0.02, 0.2
-# A coarse clock is refused if, at more than this share of its times, the number of rows is not the usual one +- 1.
+# A log with a coarse clock (several rows of the same time) is refused if the number of rows differs by more than 1 from
+# the usual number at more than this share of the times.
 IRREGULAR = 0.1
-GAP = 1.5  # from this number of ticks between two times on, rows are missing between them
+GAP = 1.5  # if two successive times are more than this many ticks of the clock apart, rows are missing between them
 
 
 @dataclass(frozen=True)
@@ -84,7 +86,8 @@ def _names(rows: Rows, names: Ints, notes: list[str]) -> Ints:
     stretch = np.cumsum(changes, dtype=np.int64)
     alternate = bool(np.median(np.bincount(stretch)) < 2) if len(rows) else False
     returned = int(stretch[-1]) + 1 - len(np.unique(names)) if len(rows) else 0
-    if rows.time is not None or alternate or not returned:  # times show where an episode begins again
+    # If there are times, they show where another episode of the same name begins.
+    if rows.time is not None or alternate or not returned:
         return names
     first: dict[int, int] = {}
     back = next(
@@ -122,7 +125,7 @@ def repeated(rows: Rows, episodes: Episodes, faults: Mapping[int, str], *, coars
     Args:
         rows: rows of the log.
         episodes: division of the rows into episodes.
-        faults: rows that are already rejected.
+        faults: reasons of the rows that are already rejected, by the row's index.
         coarse: whether several rows may have the same time; then only copies of the whole log are found.
     """
     if rows.time is None and rows.episode is None:
@@ -169,8 +172,8 @@ class Ticks:
     """A clock that is coarser than the rows: several rows have the same time.
 
     Attributes:
-        tick: time between two values of the clock.
-        interval: time between two rows.
+        tick: median time between two successive values of the clock.
+        interval: mean time between two rows.
         irregular: mask (n,) of the rows at times that have an unusual number of rows, so that rows may be missing.
     """
 

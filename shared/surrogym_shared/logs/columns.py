@@ -1,4 +1,4 @@
-"""Roles of the columns of a log, found by their names or given by a mapping."""
+"""Roles of the columns of a log (state, action, reward, ...), found by their names or declared by a mapping."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ SINGLE = {
     "episode": ("episode", "episode_id", "trajectory", "run"),
     "time": ("time", "t", "timestamp", "time_stamp", "seconds"),
 }
-# Names of a column that marks any end of an episode in Gym and Stable-Baselines3. If there is also a column of
-# timeouts, the ends that it marks don't count as terminations.
+# Names of a column that marks every end of an episode, as in Gym and Stable-Baselines3. If the log also has a column of
+# timeouts, the ends that are marked there don't count as terminations.
 EITHER_END = (
     "done",
     "dones",
 )
-SHORT_TIMES = ("s", "ms", "us", "ns")  # units that may follow t: t_s is a time, t_d is not
+SHORT_TIMES = ("s", "ms", "us", "ns")  # units of time after the letter t in a column's name: t_s is a time, t_d is not
 ACTION = re.compile(r"^(?:actions?|acts?|u)(?:[._](.+)|\[(\d+)\])?$|^actions?[\s-]+(.+)$", re.IGNORECASE)
 STATE = re.compile(r"^(?:q|states?|obs|observations?|coordinates?)(?:[._](.+)|\[(\d+)\])$", re.IGNORECASE)
 NEXT = re.compile(r"^next[._\s-]+(.+)$|^(.+)[._\s-]+next$", re.IGNORECASE)
@@ -50,9 +50,9 @@ EXPECTED = {
     "constants": NAMES,
     "discrete": "true, false, or a table of actions and the values of their choices, such as switch = [1, 2, 3]",
 }
-SHOWN = 60  # most letters of a wrong value that a message shows
-LONGEST = 64  # most letters of a coordinate's name
-MOST = 1_000  # most columns that a mapping may name for one role
+SHOWN = 60  # a message shows at most this many characters of a wrong value
+LONGEST = 64  # largest number of characters of a coordinate's name
+MOST = 1_000  # largest number of columns that a mapping may name for one role
 
 Choices = Annotated[list[float], Field(min_length=2, max_length=MOST)]
 Limits = Annotated[list[float | None], Field(min_length=2, max_length=2)]
@@ -66,8 +66,8 @@ class Roles:
         state: column of each coordinate, by the coordinate's name.
         action: column of each action entry, by the entry's name.
         following: column of each coordinate's next value, by the coordinate's name; empty without such columns.
-        reward, terminated, truncated, episode, time: column of that name's role; None without one.
-        limits: declared limits of coordinates and action entries, by name; None is no limit.
+        reward, terminated, truncated, episode, time: column with this role; None without such a column.
+        limits: declared lowest and highest value of coordinates and action entries, by name; None is no limit.
         angles: names of the coordinates that are angles; None lets the data decide.
         constants: names of coordinates that are declared as constants of an episode.
         discrete: whether the action is declared as discrete; None lets the data decide.
@@ -132,18 +132,27 @@ class LogMapping(FailFast):
 
     model_config = ConfigDict(extra="forbid")
 
-    state: Columns = Field(description="columns of the coordinates")
-    action: Columns = Field(description="columns of the action")
+    state: Columns = Field(description="column of each coordinate of the state")
+    action: Columns = Field(description="column of each entry of the action")
     next: dict[str, str] = Field(
-        default_factory=dict, max_length=MOST, description="column of each coordinate's next value, by its name"
+        default_factory=dict,
+        max_length=MOST,
+        description="column of each coordinate's next value, by the coordinate's name",
     )
     reward: str | None = Field(default=None, description="column of the reward")
-    terminated: str | None = Field(default=None, description="column that marks ends in a terminal state")
-    truncated: str | None = Field(default=None, description="column that marks other ends, such as a time limit")
+    terminated: str | None = Field(
+        default=None, description="column that marks steps which end the episode in a terminal state"
+    )
+    truncated: str | None = Field(
+        default=None,
+        description="column that marks steps which end the episode for another reason, such as a time limit",
+    )
     episode: str | None = Field(default=None, description="column of the episode's name or number")
     time: str | None = Field(default=None, description="column of the time")
     limits: dict[str, Limits] = Field(
-        default_factory=dict, max_length=MOST, description="lowest and highest value by name; null: no limit"
+        default_factory=dict,
+        max_length=MOST,
+        description="lowest and highest value of coordinates and action entries, by name; null: no limit",
     )
     angles: Annotated[list[str], Field(max_length=MOST)] | None = Field(
         default=None, description="names of the coordinates that are angles in radians; null: the data decide"
@@ -153,8 +162,8 @@ class LogMapping(FailFast):
     )
     discrete: bool | dict[str, Choices] | None = Field(
         default=None,
-        description="whether the action is the number of a choice, from 0; or the values of the choices of each action "
-        "entry, by its name, which the surrogate numbers from 0; null: the data decide",
+        description="whether the action is discrete and its values are numbers of choices from 0; or, for other "
+        "values, the values of the choices of each action entry, by its name; null: the data decide",
     )
 
 
@@ -182,7 +191,7 @@ def roles_by_name(names: Sequence[str]) -> Roles:
 
 
 def _units(names: Iterable[str], columns: Iterable[str | None]) -> dict[str, str]:
-    """Return the unit of each used column whose heading has one."""
+    """Return the unit of each used column whose heading has a unit, by the column's name."""
     headings = {name: _as_time(heading(name)) or heading(name) for name in names if name in set(columns)}
     return {name: one.unit for name, one in headings.items() if one.unit}
 
@@ -435,8 +444,8 @@ def _only(role: str, headings: Iterable[Heading], names: Sequence[str]) -> str |
 
 
 def _of_next(part: str, states: Mapping[str, str]) -> str:
-    """Return the name of the state whose next value a column has: ``q_0`` in ``next.q_0`` if there is such a state,
-    otherwise ``0``."""
+    """Return the name of the state whose next value a column has. For the column ``next.q_0`` it is ``q_0`` if there
+    is a state of this name, otherwise ``0``."""
     return part if part in states else _part(STATE.match(part)) or part
 
 

@@ -11,13 +11,13 @@ from surrogym_shared.logs.table import DATES, DURATIONS, Cells, Floats, flags, g
 
 Numbering = Literal["rows", "episodes", "gaps"]
 
-FEWEST = 4  # least number of rows from which the meaning of a column is inferred
-MOST_TURNS = 0.5  # largest share of rows at which the number of the episode changes, or a clock restarts
-EQUAL = 1e-6  # largest relative difference between the steps of a regular clock
+FEWEST = 4  # in a log with fewer rows, the meaning of a column is not inferred from its cells
+MOST_TURNS = 0.5  # a column numbers episodes, or is a clock, if it changes or restarts in at most this share of rows
+EQUAL = 1e-6  # a column grows steadily, as a clock, if its increments differ by at most this share
 
 
 def measured(cells: Cells) -> Floats | None:
-    """Return a column of numbers or times as numbers (n,); None if a cell is neither, or if there are few cells."""
+    """Return a column of numbers or times as numbers (n,); None if a cell is neither, or with fewer than 4 cells."""
     try:
         values, faults = times("", cells)
     except UnusableLog:
@@ -28,14 +28,14 @@ def measured(cells: Cells) -> Floats | None:
 def numbering(cells: Cells) -> Numbering | None:
     """Return what a column of whole numbers counts; None if it counts nothing.
 
-    ``rows``: it numbers all rows. ``episodes``: it numbers the rows of each episode, and then restarts. ``gaps``: it
-    numbers rows in one of these two ways, but some numbers are missing.
+    ``rows``: it numbers all rows. ``episodes``: it numbers the rows of each episode, and restarts with the next one.
+    ``gaps``: it numbers rows in one of these two ways, but some numbers are missing.
     """
     values = measured(cells)
     if values is None or cells.dtype.kind in (DATES, DURATIONS) or (values != np.floor(values)).any():
         return None
     plain, faults = numbers("", cells)
-    if faults or stamps(plain) is not None:  # dates don't number rows
+    if faults or stamps(plain) is not None:  # dates such as 20240331 are whole numbers, but don't number rows
         return None
     change = np.diff(values)
     if (change == 1).all():
@@ -112,8 +112,7 @@ def episodes_by(name: str, cells: Cells) -> Cells:
     values = measured(cells)
     if values is None:
         raise UnusableLog(
-            f"{name}: expected 1 in the first row of each episode and 0 in the others, or a number that starts "
-            "again in each "
-            "episode, got other cells: correct the column, or leave it out with a mapping file (--map)"
+            f"{name}: expected 1 in the first row of each episode and 0 in the others, or a number that restarts in "
+            "each episode, got other cells: correct the column, or leave it out with a mapping file (--map)"
         )
     return np.cumsum(np.concatenate([[0], np.diff(values) <= 0]))

@@ -1,4 +1,4 @@
-"""Decode the bytes of a text log. The error for another format has its name, and how to convert the file."""
+"""Decode the bytes of a text log. If they have another format, the error names it and says how to convert the file."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from surrogym_shared.logs.errors import UnusableLog
 
 MARKED = (
     (codecs.BOM_UTF8, "utf-8-sig"),
-    (codecs.BOM_UTF32_LE, "utf-32"),  # before UTF-16, whose mark is the beginning of this one
+    (codecs.BOM_UTF32_LE, "utf-32"),  # before UTF-16, whose byte order mark is the beginning of that of UTF-32
     (codecs.BOM_UTF32_BE, "utf-32"),
     (codecs.BOM_UTF16_LE, "utf-16"),
     (codecs.BOM_UTF16_BE, "utf-16"),
 )
 WINDOWS = "cp1252"
-SAMPLED = 4_096  # number of first bytes by which UTF-16 without a byte order mark is recognised
-MOST_ODD = 0.1  # largest share of zero bytes among those bytes of UTF-16 that hold Latin letters
+SAMPLED = 4_096  # UTF-16 without a byte order mark is recognised by this many bytes at the start of a log
+MOST_ODD = 0.1  # in UTF-16, at most this share of the bytes that hold Latin letters are zero
 
 AS_CSV = "save the table as CSV"
 DECOMPRESS = "decompress it first"

@@ -31,15 +31,15 @@ from surrogym_shared.spec import (
     Uniform,
 )
 
-MARGIN = 0.05  # share of the data's width that a sampling range adds on each side
-SATURATED_ROWS = 5  # fewest steps that end exactly at an extreme value before it counts as a limit
-SATURATED_SHARE = 0.002  # least share of all steps that end exactly at an extreme value before it counts as a limit
-MOST_DISCRETE = 16  # most different values of a discrete action
-FEW_EPISODES = 2  # least number of episodes from which the time limit is taken
-USUAL_LIMIT = 200  # time limit of virtual episodes if the log has too few episodes to show one
+MARGIN = 0.05  # a drafted sampling range is wider than the data by this share of their width on each side
+SATURATED_ROWS = 5  # an extreme value of a column counts as a limit only if this many steps end exactly there
+SATURATED_SHARE = 0.002  # an extreme value counts as a limit only if this share of all steps ends exactly there
+MOST_DISCRETE = 16  # an action with more different values is not drafted as discrete
+FEW_EPISODES = 2  # with fewer episodes, a log does not show the time limit and the starts of episodes
+USUAL_LIMIT = 200  # drafted time limit of virtual episodes if the log does not show one
 MOST_STARTS = 64
-FEW_STARTS = 8  # with fewer episodes, a log begins at too few states to train from
-FAR = 8.0  # distance from the median, in widths of the middle half of the data, from which a note names a value
+FEW_STARTS = 8  # if a log has fewer episodes, virtual episodes also start at other states of the log
+FAR = 8.0  # a note names values farther from the median than this many widths of the middle half of the data
 
 
 @dataclass(frozen=True)
@@ -302,7 +302,7 @@ def _amounts(roles: Roles, values: Floats) -> BoxAction:
 
 
 def _are_codes(values: Floats) -> bool:
-    """Whether the different ``values`` of an action entry are few whole numbers, which may be codes of choices."""
+    """Whether ``values``, the different values of an action entry, are few whole numbers, which may number choices."""
     return bool(2 <= len(values) <= MOST_DISCRETE and (values == np.floor(values)).all())
 
 
@@ -400,7 +400,7 @@ def _remarks(values: Floats) -> list[str]:
 
 
 def ending(count: int) -> str:
-    """Return a number of steps with the verb in its right form: "1 step ends", "2 steps end"."""
+    """Return a number of steps with the verb "end" in its right form, such as "1 step ends" or "2 steps end"."""
     return f"{count} step ends" if count == 1 else f"{count} steps end"
 
 

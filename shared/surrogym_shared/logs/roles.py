@@ -35,16 +35,17 @@ from surrogym_shared.logs.table import Cells, Table
 from surrogym_shared.words import listed
 
 BY = "episodes by "  # prefix of the name of a column of episode numbers that was derived from another column
-STARTS = ("is_first", "episode_start", "episode_starts")  # columns that mark an episode's first step
+STARTS = ("is_first", "episode_start", "episode_starts")  # names of columns that mark the first step of each episode
 INDEX = {"index", "step", "steps", "timestep", "row", "line"}  # words in the names of columns that number rows
-# Whole names of columns that number rows.
+# Whole names (not only words in names) of columns that number rows.
 COUNTERS = {"sample", "frame", "tick", "counter", "count", "number", "no", "nr", "id", "i", "k", "n"}
 COUNTED = "it grows by one in each row, as the number of a row does"
 WITHIN = "it numbers the rows of each episode"
-LONGEST_HINT = 600  # most letters of a mapping that a message proposes
+LONGEST_HINT = 600  # a message proposes a mapping only if the mapping has at most this many characters
 
 Shown = Callable[[Cells], bool]
-# For each role: words in a column's name, or whole names, that make the role likely, and a test of the column's cells.
+# For each role: words in a column's name that make the role likely, whole names that do, and a test that the column's
+# cells have to pass.
 LIKELY: dict[str, tuple[set[str], set[str], Shown]] = {
     "reward": (
         {"reward", "rewards", "rew", "return", "returns"},

@@ -1,4 +1,4 @@
-"""Rows of a log as numbers, with the faults that a row shows by itself."""
+"""Rows of a log as numbers, with the faults that are visible in a row alone, without its neighbours."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from surrogym_shared.logs.headings import heading
 from surrogym_shared.logs.table import Bools, Floats, Ints, Table, flags, groups, numbers, times
 from surrogym_shared.spec import BoxAction, DiscreteAction, EnvironmentSpec
 
-SLACK = 1e-6  # share of a range's width by which a value may lie outside, because of rounding to single precision
+SLACK = 1e-6  # a value may lie outside its range by this share of the range's width, because of rounding to float32
 Ends = Mapping[str, tuple[float | None, float | None]]
 
 

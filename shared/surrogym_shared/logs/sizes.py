@@ -7,7 +7,7 @@ from surrogym_shared.logs.errors import UnusableLog
 MOST_ROWS = 2_000_000
 MOST_CELLS = 50_000_000
 MOST_COLUMNS = 1_000
-LONGEST_CELL = 10_000  # most letters of a cell
+LONGEST_CELL = 10_000  # largest number of characters of a cell
 
 
 def require_sizes(where: object, rows: int, cells: int) -> None:

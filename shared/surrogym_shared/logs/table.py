@@ -22,11 +22,11 @@ TRUE, FALSE = ("true", "t", "yes"), ("false", "f", "no")
 NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 NO_FINITE = ("nan", "+nan", "-nan", "inf", "+inf", "-inf", "infinity", "+infinity", "-infinity")
 BOOLEANS = {"True": 1.0, "False": 0.0, "true": 1.0, "false": 0.0, "TRUE": 1.0, "FALSE": 0.0}
-DATES, DURATIONS = "M", "m"  # kinds of NumPy's types datetime64 and timedelta64
+DATES, DURATIONS = "M", "m"  # letters for the kinds of NumPy's types datetime64 and timedelta64 (``dtype.kind``)
 NO_NUMBERS = {DATES: "dates", DURATIONS: "durations", "c": "complex numbers", "V": "records"}
-FEWEST_STAMPS = 3  # least number of numbers from which a column is recognised as time stamps
-MOST_STAMPS = 0.9  # a column has time stamps if more than this share of its numbers are dates
-MAX_MEASURED = 1e30  # largest size of a number in a log, the same as in requests to the server
+FEWEST_STAMPS = 3  # a column with fewer numbers is not recognised as time stamps such as 20240331001500
+MOST_STAMPS = 0.9  # a column has time stamps if more than this share of its numbers can be read as dates
+MAX_MEASURED = 1e30  # largest absolute value of a number in a log, as in requests to the server
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Table:
         repeated: number of columns of each name that several columns have. Such columns are not in ``columns``.
         ignored: reason for each array of the file that is not a column, by its name.
         discrete: whether the file declares the action as discrete; None if it does not say.
-        limits: limits of action entries that the file declares, by the entry's name.
+        limits: lowest and highest value of action entries that the file declares, by the entry's name.
         remarks: sentences about the form of the file, for the report on the log.
         evaluated: whether the steps come from an evaluation in the surrogate's own environment, so that their units and
             ends are not in doubt.
@@ -126,7 +126,8 @@ def stamps(values: Floats) -> Floats | None:
     other numbers.
     """
     finite = np.where(np.isfinite(values), values, 0)
-    for below in (1, 100, 10_000, 1_000_000):  # divisors of stamps that end with day, hour, minute or second
+    # Divisors that leave the date of stamps which end with day, hour, minute or second.
+    for below in (1, 100, 10_000, 1_000_000):
         day = np.floor(finite / below)
         if len(values) < FEWEST_STAMPS or not ((day >= 1900_01_01) & (day < 2200_00_00)).mean() > MOST_STAMPS:
             continue

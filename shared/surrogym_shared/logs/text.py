@@ -19,11 +19,14 @@ from surrogym_shared.words import counted
 
 DELIMITERS = ",;\t|"
 BLANKS = " "
-COMMENTS = ("#", "%", "//", "sep=")  # beginnings of lines that are no rows; Excel writes sep=; as the first line
-LONGEST_NAME = 200  # most letters of a column's name
+# First characters of lines that are no rows; Excel may write sep=; as the first line.
+COMMENTS = ("#", "%", "//", "sep=")
+LONGEST_NAME = 200  # largest number of characters of a column's name
 JSON = re.compile(r"[{\[]\s*[{\[\"]")
-UNIT_APART = re.compile(r"\s+(?=[\[(])")  # blanks before a unit: time [s] is one name, also if blanks separate columns
-UNNAMED = re.compile(r"^(?:unnamed column \d+|Unnamed: \d+|__index_level_\d+__)$")  # pandas writes the last two names
+# Blanks before a unit, which belong to the name (time [s]), also if blanks separate columns.
+UNIT_APART = re.compile(r"\s+(?=[\[(])")
+# Pandas gives columns without a name the last two names.
+UNNAMED = re.compile(r"^(?:unnamed column \d+|Unnamed: \d+|__index_level_\d+__)$")
 
 
 @dataclass(frozen=True)
@@ -33,15 +36,14 @@ class _Head:
     comments: tuple[str, ...]
     line: str
     row: str
-    before: int  # number of lines before ``line``
+    before: int  # number of lines of the file before ``line``
 
 
 def table_of_text(text: str, where: str, most_rows: int = MOST_ROWS, remarks: Sequence[str] = ()) -> Table:
     """Read a table from text with a heading.
 
-    Lines before the heading that begin with ``#``, ``%`` or ``//`` are comments. If the
-    first other line is a row, the last comment is the heading, as in files of ``numpy.savetxt``. A column without a
-    name is left out.
+    Lines before the heading that begin with ``#``, ``%`` or ``//`` are comments. If the first other line is a row of
+    numbers, the last comment is the heading, as in files of ``numpy.savetxt``. A column without a name is left out.
 
     Args:
         text: the log.
@@ -122,8 +124,8 @@ def _head(text: str) -> _Head:
 
 
 def _delimiter(head: _Head) -> str:
-    """Return the delimiter that gives the first two lines the same number of cells, otherwise the one that gives the
-    first line most cells."""
+    """Return the delimiter that gives the first two lines the same number of cells. If there is none, return the
+    delimiter that gives the first line the most cells."""
 
     def fit(delimiter: str) -> tuple[bool, int]:
         cells = len(_cells(head.line, delimiter))

@@ -1,4 +1,5 @@
-"""Convert rows to transitions: find which row follows which, and which rows contradict others."""
+"""Convert rows of a log to transitions (steps): find the row with each row's next state, and rows that contradict
+others."""
 
 from __future__ import annotations
 
@@ -13,7 +14,8 @@ from surrogym_shared.logs.clock import GAP, Ticks, episodes_of, repeated, ticks_
 from surrogym_shared.logs.rows import Rows
 from surrogym_shared.logs.table import Bools, Floats, Ints
 
-ONE_INTERVAL = 0.5  # largest difference between a step's duration and the sampling interval, as a share of the latter
+# Two rows are one step apart if the time between them differs from the usual interval by at most this share of it.
+ONE_INTERVAL = 0.5
 
 
 @dataclass(frozen=True)

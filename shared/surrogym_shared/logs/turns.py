@@ -19,14 +19,15 @@ FULL_TURN = 2 * math.pi
 KNOWN = {FULL_TURN: "radians", 360.0: "degrees", 400.0: "gon", 1.0: "turns", 24.0: "hours", 60.0: "minutes"} | {
     float(2**bits): "counts" for bits in range(8, 25)
 }
-FILLED = 0.8  # least width of a column's values, as a share of a full turn
-MOST_JUMPS = 1 / 3  # largest share of the steps that may jump
-CONTINUES = 4.0  # most standard deviations by which a jump plus a full turn may differ from the predicted change
-ROUGHLY = 0.1  # largest difference from the predicted change, as a share of a usual change, if the motion is not linear
-OUTLIERS = 0.05  # largest share of the jumps that may differ from the predicted change by more than is allowed
-BY_CHANCE = 1e-3  # largest probability that jumps of a column that does not wrap match a full turn by chance
-NEAR = 1e-3  # largest difference between the size of the jumps and a full turn, as a share of the full turn
-FINEST = 1e-6  # least standard deviation of the predicted change, as a share of the width of the values
+FILLED = 0.8  # a column wraps only if its values cover at least this share of a full turn
+# A column wraps only if at most this share of its steps are jumps (more than half the column's width).
+MOST_JUMPS = 1 / 3
+CONTINUES = 4.0  # a jump plus a full turn may differ from the predicted change by this many standard deviations
+ROUGHLY = 0.1  # if the motion is not linear, a jump plus a full turn may differ by this share of a usual change
+OUTLIERS = 0.05  # a column wraps only if at most this share of its jumps contradicts the predicted change
+BY_CHANCE = 1e-3  # a column certainly wraps if its jumps match a full turn by chance with a smaller probability
+NEAR = 1e-3  # the size of the jumps may differ from a known full turn by this share of the turn
+FINEST = 1e-6  # the predicted change has a standard deviation of at least this share of the values' width
 
 
 @dataclass(frozen=True)

@@ -9,17 +9,17 @@ from surrogym_shared.logs.rows import SLACK
 from surrogym_shared.logs.table import Floats
 from surrogym_shared.spec import EnvironmentSpec, limits
 
-BEYOND = 20.0  # distance outside a coordinate's range, in widths of the range, that no real plant reaches
-NARROW = 0.25  # a log that covers a smaller share of a coordinate's range gets a note
-MOST_OUTSIDE = 0.1  # a log with a larger share of its rows outside a coordinate's range gets a note
-FEWEST = 8  # least number of known rewards with which the rewards of a log are compared
+BEYOND = 20.0  # a log is refused if half of a column lies this many widths of the coordinate's range outside the range
+NARROW = 0.25  # if a log covers less than this share of a coordinate's range, the report notes it
+MOST_OUTSIDE = 0.1  # if more than this share of a log's rows lies outside a coordinate's range, the report notes it
+FEWEST = 8  # with fewer stored rewards, the rewards of a log are not compared with them
 
 
 def require_units(q: Floats, spec: EnvironmentSpec, which: str = "") -> None:
     """Check that states q (n, C) lie in the sampling ranges of their coordinates, and seem to be in their units.
 
-    A log outside the sampling ranges says nothing about the states that the surrogate is for. Angles are not checked,
-    because they wrap.
+    A log outside the sampling ranges says nothing about the states for which the surrogate is made. Angles are not
+    checked, because they wrap.
 
     Args:
         q: the states.

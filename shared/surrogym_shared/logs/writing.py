@@ -11,8 +11,10 @@ import numpy as np
 from surrogym_shared.logs.table import is_number
 from surrogym_shared.words import visible
 
-FORMULA = "=+-@\uff1d\uff0b\uff0d\uff20"  # first characters of a formula in a spreadsheet, also in full width
-EVALUATED = "evaluated"  # array that marks a file's steps as those of an evaluation in the surrogate's environment
+# Characters with which a formula begins in a spreadsheet; the last four are full-width forms.
+FORMULA = "=+-@\uff1d\uff0b\uff0d\uff20"
+# Name of the array that marks a file's steps as those of an evaluation in the surrogate's environment.
+EVALUATED = "evaluated"
 
 
 def spreadsheet_cell(value: Any) -> Any:

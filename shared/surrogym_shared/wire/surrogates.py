@@ -90,13 +90,16 @@ class OutputFidelity(Reply):
     name: str = Field(description="name of the output")
     structure: str = Field(description="inputs and kernel that the fit has chosen, in words")
     confidence_index: float = Field(
-        description="mean of Phi(tolerance / standard deviation) over random points of the sampling ranges (eq. 8, 9); "
-        "the tolerance of a noisy output is at least 1.5 standard deviations of its noise"
+        description="mean of Phi(``tolerance`` / standard deviation) over random points of the sampling ranges (eq. 8, "
+        "9)"
     )
     confidence_index_paper: float = Field(
         description="mean of Phi(1 / standard deviation), the paper's definition in raw units"
     )
-    tolerance: float = Field(description="error that is too small to matter, in the output's unit")
+    tolerance: float = Field(
+        description="error that is too small to matter, in the output's unit; with confirmed noise, the square root of "
+        "the sum of the squares of the output's tolerance and of ``noise``"
+    )
     coverage: float = Field(
         description="share of random points of the sampling ranges at which the standard deviation is below the "
         "tolerance"
@@ -119,7 +122,7 @@ class OutputFidelity(Reply):
     noise: float = Field(
         default=0.0,
         description="standard deviation of a single step's noise, if repeated or consecutive steps confirm it, in the "
-        "output's unit; it is part of ``tolerance``; 0 without confirmed noise",
+        "output's unit; ``tolerance`` includes it; 0 without confirmed noise",
     )
     sensor_noise: float = Field(
         default=0.0,
