@@ -171,7 +171,10 @@ def test_comparison_runs_on_ray_leave_the_same_files_as_local_ones(
 
 @pytest.mark.parametrize(
     ("address", "said"),
-    [("127.0.0.1:9", "expected a cluster at '127.0.0.1:9', got none"), ("there", "expected auto or host:port")],
+    [
+        ("127.0.0.1:9", "expected a Ray cluster at '127.0.0.1:9', got none"),
+        ("there", "expected the address of a Ray cluster, auto or host:port"),
+    ],
 )
 def test_a_ray_address_without_a_cluster_gives_a_one_sentence_error(address: str, said: str):
     with pytest.raises(NoCluster, match=said):

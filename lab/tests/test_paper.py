@@ -126,7 +126,7 @@ def test_the_paper_study_refuses_a_task_that_is_not_in_the_paper(lab):
     ("options", "told"),
     [
         (("--jobs", "2"), "--jobs: expected --on-ray ADDRESS with more than 1, got 2 without it"),
-        (("--on-ray", "127.0.0.1:9"), "expected a cluster at '127.0.0.1:9', got none"),
+        (("--on-ray", "127.0.0.1:9"), "expected a Ray cluster at '127.0.0.1:9', got none"),
     ],
 )
 def test_parallel_runs_of_the_paper_command_require_a_ray_cluster(lab, options, told):

@@ -67,7 +67,8 @@ class KeyedGenerator:
 
 @dataclass(frozen=True)
 class ActingPolicy:
-    """Policy network as plain arrays. Its outputs are means of continuous actions, or scores of discrete choices.
+    """Policy network as plain arrays. Its outputs are continuous actions before their tanh, or scores of discrete
+    choices.
 
     All arrays are float32 or all are float64, and the network computes in this precision.
 

@@ -6,17 +6,14 @@ CoordinateKind = Literal["linear", "angle", "constant"]
 LagKind = Literal["change", "value", "action", "steps"]
 Function = Literal["one", "linear", "sin", "cos"]  # function phi(q) of a summand in a term of the state q
 Relation = Literal["<", "<=", ">", ">="]  # relation of the two sides of an inequality
-RewardShape = Literal[
-    "one", "linear", "absolute", "square", "bump", "ball"
-]  # function of the quantities in one term of a declared reward
-RewardTiming = Literal[
-    "before", "after", "auto"
-]  # whether a reward depends on the state before or after the step; auto: the data decide
+# Function of the quantities in one term of a declared reward.
+RewardShape = Literal["one", "linear", "absolute", "square", "bump", "ball"]
+# Whether a reward depends on the state before or after the step. ``auto``: the data decide.
+RewardTiming = Literal["before", "after", "auto"]
 Side = Literal["lower", "upper"]  # lower or upper end of a range
 
 Variant = Literal["deterministic", "probabilistic", "pathwise"]
 AutoresetMode = Literal["next_step", "same_step", "disabled"]
-Propagation = Literal[
-    "mean", "sample"
-]  # whether a particle moves by the model's mean, or by a sample of its own from the posterior
+# Whether a particle moves by the model's mean, or by a sample of its own from the posterior.
+Propagation = Literal["mean", "sample"]
 Weighting = Literal["inverse_variance", "uniform"]  # how the rewards of a lane's particles are averaged

@@ -1,4 +1,4 @@
-"""Packages whose modules are imported when one of their names is first used."""
+"""Helper of packages that import a module only when one of its names is first used."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 try:
     from websockets.speedups import apply_mask
-except ImportError:  # websockets has no compiled extension on this platform
+except ImportError:  # without a compiled extension of websockets on this platform
     from websockets.utils import apply_mask
 
 __all__ = ["KEY_BYTES", "MASKED", "WHOLE_BINARY", "Extent", "FrameSplitter", "apply_mask", "extent_of", "header"]
@@ -34,7 +34,7 @@ class Extent:
 
 
 def extent_of(content: bytes | bytearray) -> Extent | None:
-    """Return the extent of the frame at the beginning of the content; None if its header is incomplete."""
+    """Return the positions in the WebSocket frame with which the content begins; None if its header is incomplete."""
     if len(content) < 2:
         return None
     size, key = content[1] & 0x7F, 2
@@ -51,8 +51,8 @@ def extent_of(content: bytes | bytearray) -> Extent | None:
 
 
 def header(size: int, masked: int = 0) -> bytes:
-    """Return the header of a whole binary message of ``size`` bytes. ``masked`` is 0, or ``MASKED`` if a key
-    follows."""
+    """Return the WebSocket header of a whole binary message of ``size`` bytes. ``masked`` is ``MASKED`` if a masking
+    key follows, else 0."""
     if size < _TWO_BYTES:
         return bytes((WHOLE_BINARY, masked | size))
     if size < 65_536:
@@ -64,24 +64,26 @@ class FrameSplitter:
     """Splits and joins incoming chunks of bytes into whole WebSocket frames.
 
     ``max_bytes`` is the longest payload to join. Chunks of a longer payload are returned unchanged, so that the library
-    refuses them. ``max_frames`` is the largest number of frames in one chunk; from a chunk with more, one frame more is
-    returned, which shows that there are too many, and the rest is dropped.
+    refuses them. ``max_frames`` is the largest number of frames in one chunk. From a chunk with more frames,
+    ``max_frames`` + 1 are returned, so that the caller sees that there are too many, and the rest is dropped.
     """
 
     def __init__(self, max_bytes: float = float("inf"), max_frames: float = float("inf")) -> None:
         self._max_bytes = max_bytes
         self._max_frames = max_frames
         self._rest = bytearray()
-        self._due = 0  # number of bytes needed before the next frame can be complete
+        self._due = 0  # ``_rest`` must have this number of bytes before its frame can be complete
 
     @property
     def rest_bytes(self) -> int:
-        """Number of bytes that were received of a frame that is not complete yet."""
+        """Number of received bytes of a frame that is not complete yet."""
         return len(self._rest)
 
     def split(self, chunk: bytes) -> list[tuple[bytes, Extent | None]]:
-        """Return the frames that this chunk completes, in order, each with its extent; None for a frame that is too
-        long."""
+        """Return the frames that this chunk completes, in order, each with the positions of its parts.
+
+        A frame that is too long has None instead of the positions.
+        """
         if self._rest:
             self._rest += chunk
             if len(self._rest) < self._due:
@@ -97,6 +99,6 @@ class FrameSplitter:
                 self._rest += chunk
                 self._due = 0 if extent is None else extent.end
                 break
-            frames.append((chunk[: extent.end], extent))  # slicing a whole chunk does not copy it
+            frames.append((chunk[: extent.end], extent))  # if the frame is the whole chunk, this slice is no copy
             chunk = chunk[extent.end :]
         return frames

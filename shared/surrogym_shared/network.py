@@ -1,6 +1,7 @@
 """A policy network as plain arrays, with layers of tanh or ReLU, for policy searches without a deep-learning library.
 
-Leading dimensions (...) stand for several policies at once. D observation entries, H hidden units, A outputs.
+Shapes: leading dimensions (...) stand for several policies at once; N observations, D observation entries, A outputs,
+F action entries.
 """
 
 from __future__ import annotations
@@ -27,21 +28,21 @@ Array = NDArray[np.float64]
 Activation = Literal["tanh", "relu"]
 HEAD = "surrogym-network.json"
 ARRAYS = "network.npz"
-MAX_BYTES = 16 * 1024 * 1024  # most bytes of a policy's file after decompression
+MAX_BYTES = 16 * 1024 * 1024  # largest size in bytes of a policy's file after decompression
 MAX_HEAD_BYTES = 64 * 1024
 MAX_LAYERS = 8
-OUTSIDE = ("mean", "deviation", "low", "high")  # arrays of a policy's file that belong to no layer
+OUTSIDE = ("mean", "deviation", "low", "high")  # names of the arrays in a policy's file that belong to no layer
 
 
 class Layer(NamedTuple):
-    """One layer of a network: x @ weights + bias."""
+    """One layer of a network, which computes x @ weights + bias."""
 
-    weights: NDArray[np.floating[Any]]  # (..., I, O) for I inputs and O outputs
-    bias: NDArray[np.floating[Any]]  # (..., O) for O outputs
+    weights: NDArray[np.floating[Any]]  # (..., I, O) factors from each of I inputs to each of O outputs
+    bias: NDArray[np.floating[Any]]  # (..., O) constant that is added to each of O outputs
 
 
 class _Head(BaseModel):
-    """JSON header in the file of a policy network. A file of version 1 has a single hidden layer, with tanh."""
+    """JSON header in the file of a policy network. In a file of version 1 there is one hidden layer, with tanh."""
 
     version: Literal[1, 2]
     counts: tuple[PositiveInt, ...]
@@ -50,7 +51,7 @@ class _Head(BaseModel):
 
     @property
     def names(self) -> list[tuple[str, str]]:
-        """Return the names of the weights and the bias of each layer."""
+        """Return the names of the weights and the bias of each layer in the file."""
         if self.version == 1:
             return [("hidden", "hidden_bias"), ("output", "output_bias")]
         return [(f"weights{i}", f"bias{i}") for i in range(self.layers)]
@@ -58,15 +59,16 @@ class _Head(BaseModel):
 
 @dataclass(frozen=True)
 class Network:
-    """Policy network: it standardises observations, and returns tanh outputs scaled to the bounds, or the most probable
-    choice.
+    """Policy network: it standardises observations and returns actions.
+
+    Continuous actions are tanh of the outputs, scaled to the bounds. Of discrete choices, the most probable is taken.
 
     ``counts`` are the numbers of choices of each entry of a discrete action. They are empty for a continuous action,
     whose bounds are ``low`` and ``high`` (F,).
     """
 
     mean: Array  # (D,) mean that is subtracted from an observation
-    deviation: Array  # (D,) standard deviation by which the difference is divided
+    deviation: Array  # (D,) number by which an observation minus ``mean`` is divided
     layers: tuple[Layer, ...]
     low: Array
     high: Array
@@ -77,8 +79,8 @@ class Network:
     def of(
         cls, spec: EnvironmentSpec, mean: Array, deviation: Array, units: int | Sequence[int], vector: Array
     ) -> Self:
-        """Make policies from parameter vectors (..., ``size``). Each weight of a layer is its entry in the vector,
-        divided by sqrt(number of the layer's inputs)."""
+        """Make policies from vectors of parameters (..., p), with p as ``size`` returns it. A layer's weight is its
+        entry in the vector, divided by sqrt(number of the layer's inputs)."""
         layers, begin = [], 0
         for inputs, outputs in pairwise(_sizes(spec, units)):
             middle, end = begin + inputs * outputs, begin + (inputs + 1) * outputs
@@ -89,7 +91,8 @@ class Network:
 
     @staticmethod
     def size(spec: EnvironmentSpec, units: int | Sequence[int]) -> int:
-        """Return the number of parameters of a policy. ``units``: size of its hidden layer, or of each hidden layer."""
+        """Return the number of parameters of a policy. ``units`` is the size of its hidden layer, or of each of
+        them."""
         return sum((inputs + 1) * outputs for inputs, outputs in pairwise(_sizes(spec, units)))
 
     @property
@@ -99,7 +102,7 @@ class Network:
         return np.concatenate([part.ravel() for layer in parts for part in layer])
 
     def __call__(self, observation: NDArray[Any]) -> NDArray[Any]:
-        """Return actions (..., N, F) for observations (..., N, D); int64 (..., N) for a single discrete choice."""
+        """Return the actions (..., N, F) for N observations (..., N, D); int64 (..., N) for one discrete entry."""
         return most_probable(self.outputs(observation), self.low, self.high, self.counts)
 
     def outputs(self, observation: NDArray[Any]) -> NDArray[np.floating[Any]]:
@@ -124,7 +127,7 @@ class Network:
         """Read a file that ``save`` wrote.
 
         Raises:
-            ValueError: the file has another form, or more than ``MAX_BYTES``.
+            ValueError: the file can't be read, was not written by ``save``, or has more than ``MAX_BYTES`` bytes.
         """
         # Imported here, because only reading a file needs it.
         from surrogym_shared.archives import read_arrays, read_entries, require_finite
@@ -163,7 +166,11 @@ def forward(layers: Sequence[Layer], activation: Activation, x: NDArray[np.float
 
 
 def most_probable(y: NDArray[np.floating[Any]], low: Array, high: Array, counts: tuple[int, ...]) -> NDArray[Any]:
-    """Return the most probable actions (..., N, F) for outputs y (..., N, A); int64 (..., N) for one discrete entry."""
+    """Return the most probable actions (..., N, F) for the network's outputs y (..., N, A).
+
+    For an action of one discrete entry, they are int64 (..., N). ``low`` and ``high`` (F,) are the bounds of a
+    continuous action; ``counts`` are the numbers of choices of a discrete one.
+    """
     if not counts:
         centre, reach = (low + high) / 2, (high - low) / 2
         return np.asarray(centre + reach * np.tanh(y), dtype=np.float32)
@@ -202,7 +209,7 @@ def _read_head(content: bytes) -> _Head:
     try:
         return _Head.model_validate_json(content)
     except ValidationError as error:
-        from surrogym_shared.faults import first_fault  # imported late, because only an error needs it
+        from surrogym_shared.faults import first_fault  # imported here, because only an error needs it
 
         raise ValueError(f"{HEAD}: {first_fault(error)}") from error
 
@@ -228,7 +235,7 @@ def _require_chain(head: _Head, headers: Mapping[str, Header]) -> None:
 
 
 def _chained(head: _Head, headers: Mapping[str, Header]) -> dict[str, tuple[int, ...]]:
-    """Return the shape that each array of a policy must have, given the sizes of the vectors in the headers."""
+    """Return the shape that each array of a policy must have, given the shapes of mean and biases in ``headers``."""
 
     def length(name: str) -> int:
         return (headers[name].shape or (0,))[0]
@@ -238,5 +245,6 @@ def _chained(head: _Head, headers: Mapping[str, Header]) -> dict[str, tuple[int,
     for weights, bias in head.names:
         shapes |= {weights: (size, length(bias)), bias: (length(bias),)}
         size = length(bias)
-    limits = (length("low") if head.counts else size,)  # a discrete action may have no bounds
+    # If the action is discrete, the arrays low and high may be empty.
+    limits = (length("low") if head.counts else size,)
     return shapes | {"low": limits, "high": limits}

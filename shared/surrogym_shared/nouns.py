@@ -29,17 +29,17 @@ class Query:
     """
 
     coordinates: Vector  # (C,) state to set; () for a query that begins at a snapshot or a reset
-    actions: tuple[Vector, ...]  # (T, F) actions to apply, one after the other
+    actions: tuple[Vector, ...]  # (T, F) actions to apply in T steps, one after the other
     snapshot: str | None = None  # name of the snapshot at which the steps begin; None: at coordinates or a reset
 
     @staticmethod
     def step(coordinates: Iterable[float], action: Iterable[float]) -> Query:
-        """Return the query of one step from coordinates (C,) under an action (F,)."""
+        """Return the query of one step from a state with coordinates (C,) under an action (F,)."""
         return Query(tuple(coordinates), (tuple(action),))
 
     @staticmethod
     def rollout(actions: Iterable[Iterable[float]], snapshot: str | None = None) -> Query:
-        """Return the query of an action sequence (T, F) from a snapshot, or from a reset."""
+        """Return the query of T actions (T, F), one after the other, from a snapshot, or from a reset if it is None."""
         return Query((), tuple(map(tuple, actions)), snapshot)
 
     @property
@@ -80,7 +80,7 @@ class RealSteps:
     next_coordinates: NDArray[np.float64]  # (n, C) state after each step
     reward: NDArray[np.float64]  # (n,) reward of each step
     terminated: NDArray[np.bool_]  # (n,) whether each step ended the episode
-    purpose: tuple[SamplePurpose, ...]  # (n,) why each step was taken
+    purpose: tuple[SamplePurpose, ...]  # purpose of each of n steps: why it was taken
 
     def __len__(self) -> int:
         return len(self.reward)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
-VISIBLE = r"^[^\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]*$"  # no control characters, because people see the text
+# A text without control characters, because people see it.
+VISIBLE = r"^[^\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]*$"
 ALIAS = r"^[a-z][a-z0-9_-]{0,31}$"
 POLICY = r"^[a-z0-9][a-z0-9_-]{0,31}$"
 DIGEST = r"^[0-9a-f]{64}$"

@@ -3,9 +3,9 @@
 A package adds a class by an entry point in the group of the registry. The entry point is loaded in the process that
 looks for a name that is not built in, or that lists the names.
 
-Any exception while a package is loaded, even ``sys.exit``, is kept as one sentence, and everything else continues to
-work. Only ``KeyboardInterrupt`` is raised, because one from a module can't be told from a real Ctrl-C, which must end
-the program.
+If loading a package raises any exception, even ``SystemExit``, the exception is kept as one sentence, and everything
+else continues to work. Only ``KeyboardInterrupt`` is raised again, because it may come from Ctrl-C, which must end the
+program.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import Generic, TypeVar
 from surrogym_shared.removed import instead_of, remark
 
 T = TypeVar("T")
-MOST_CHARACTERS = 500  # most characters of the message of a package's exception
+MOST_CHARACTERS = 500  # longest text of a package's exception that a message shows
 
 
 class UnknownMember(ValueError):
@@ -30,7 +30,7 @@ class UnknownMember(ValueError):
 
 
 class _Unfit(ValueError):
-    """An entry point of a package breaks a rule of the registry. The message explains the rule."""
+    """An entry point of a package can't be used, because it breaks a rule of the registry. The message has the rule."""
 
 
 def one_line(error: BaseException, *, typed: bool = True) -> str:
@@ -48,12 +48,12 @@ def one_line(error: BaseException, *, typed: bool = True) -> str:
 
 
 class Registry(Generic[T]):
-    """Classes by name, without regard to upper and lower case.
+    """Registry of classes by name. Upper and lower case of names make no difference.
 
     Args:
         kind: word for the classes in messages, such as "algorithm".
-        noun: word in front of a class's name in messages, if it differs from ``kind``, such as "model family".
-        group: group of the entry points of other packages.
+        noun: word before a class's name in messages, such as "model family", if it differs from ``kind``.
+        group: group of entry points by which other packages add classes.
         base: base class of all classes.
         built_in: classes by name, or ``module:class``, which is imported on first use; no other package may take these
             names.
@@ -122,7 +122,7 @@ class Registry(Generic[T]):
                     installed[entries[0].name] = self._load(entries)
                 except KeyboardInterrupt:
                     raise
-                except BaseException as error:  # another package's code may raise anything
+                except BaseException as error:  # code of another package may raise any exception
                     reason = str(error) if isinstance(error, _Unfit) else one_line(error)
                     broken[entries[0].name] = f"{self._described(entries)}: {reason}"
             self._installed, self._broken = installed, broken
@@ -134,7 +134,7 @@ class Registry(Generic[T]):
         return f"{'; '.join(parts)} of {self._group}"
 
     def _load(self, entries: list[EntryPoint]) -> type[T]:
-        """Load the class of the entry points with one name. Raises ``_Unfit``, or the error of the imported module.
+        """Load the class to which the entry point of one name refers. Raises ``_Unfit``, or what the module raises.
 
         If several packages add the same name, none is loaded, because the order of the search path must not decide.
         """
@@ -142,17 +142,21 @@ class Registry(Generic[T]):
             raise _Unfit("several plug-ins have this name, so none of them is used: uninstall all but one")
         (entry,) = entries
         if _same(entry.name, self._built_in):
-            raise _Unfit(f"expected a name that differs from the built-in {', '.join(self._built_in)}")
+            raise _Unfit(
+                f"expected a name that differs from the built-in ones ({', '.join(self._built_in)}), got {entry.name!r}"
+            )
         member = entry.load()
         if not (isinstance(member, type) and issubclass(member, self._base)):
             raise _Unfit(f"expected a subclass of {self._base.__module__}.{self._base.__name__}, got {member!r}")
         if missing := sorted(getattr(member, "__abstractmethods__", ())):
-            raise _Unfit(f"expected {', '.join(missing)} to be implemented in {member.__name__}")
+            raise _Unfit(
+                f"expected {member.__name__} to implement all abstract methods, but it lacks {', '.join(missing)}"
+            )
         return member
 
 
 def _same(name: str, members: Iterable[str]) -> str | None:
-    """Return the known name that equals ``name`` apart from upper and lower case."""
+    """Return the name among ``members`` that equals ``name`` apart from upper and lower case; None if there is none."""
     return next((member for member in members if member.casefold() == name.casefold()), None)
 
 

@@ -1,8 +1,9 @@
-"""SurrogatePort: what a trainer needs of a surrogate, however it is reached.
+"""``SurrogatePort``: the interface of a surrogate for trainers, which is the same over HTTP and in process.
 
-It is implemented by JSON and frames over HTTP, by the stream of frames, and by the surrogate in this process; one suite
-tests them all. Arrays are numpy: observation (N, D) float32, action (N, F) or (N,), reward (N,) float64, flags (N,)
-bool.
+There are implementations by JSON and binary frames over HTTP, by a WebSocket with frames, and in this process; one
+suite tests them all. N lanes step together. Arrays are of NumPy: observation (N, D) float32 with D entries, action (N,
+F) with F entries or (N,), reward (N,) float64, and bool (N,) such as terminated. K is a number of ended episodes, T of
+steps.
 """
 
 from __future__ import annotations
@@ -29,25 +30,25 @@ class ResetResult:
     """Result of a reset of N lanes."""
 
     observation: Floats  # (N, D) first observations of the episodes
-    model_version: Ints  # (N,) version of the model in each lane
+    model_version: Ints  # (N,) version of the model that each lane's episode runs under
 
 
 @dataclass(frozen=True)
 class StepResult:
     """Result of one step of N lanes."""
 
-    observation: Floats  # (N, D) observations after the step
+    observation: Floats  # (N, D) observation of each lane after the step
     reward: Floats  # (N,) rewards, less the penalty for uncertainty
     terminated: Bools  # (N,) whether the episode ended in a terminal state
     truncated: Bools  # (N,) whether the episode ended for another reason
-    final_lanes: Ints  # (K,) lanes whose episode ended and that were reset within this step
-    final_observation: Floats  # (K, D) last observations of the ended episodes
-    model_version: Ints  # (N,) version of the model in each lane
+    final_lanes: Ints  # (K,) numbers of the K lanes whose episode ended and that were reset within this step
+    final_observation: Floats  # (K, D) last observation of the ended episode in each lane of ``final_lanes``
+    model_version: Ints  # (N,) version of the model that each lane's episode runs under
     reward_mean: Floats  # (N,) rewards without the penalty for uncertainty
     deviation: Floats | None  # (N, O) predicted standard deviation of each output; None if it was not requested
-    untrusted: Bools | None = (
-        None  # (N,) lanes truncated because they left the trusted range; None in a session without one
-    )
+    # (N,) whether each lane was truncated because the model is too uncertain there; None in a session without
+    # ``trust``.
+    untrusted: Bools | None = None
 
 
 @dataclass(frozen=True)
@@ -56,23 +57,24 @@ class PolicyRollout:
 
     action: Floats  # (T, N, F) float64 actions before they are clipped to their bounds
     log_probability: Floats | None  # (T, N) float64 log probability of each action; None without noise
-    observation: Floats  # (T, N, D) observations after each step; action t was chosen at observation t - 1
+    observation: Floats  # (T, N, D) observation after each step; action t was chosen at the observation of step t - 1
     reward: Floats  # (T, N) rewards, less the penalty for uncertainty
     terminated: Bools  # (T, N) whether the episode ended in a terminal state
     truncated: Bools  # (T, N) whether the episode ended for another reason
-    final_steps: Ints  # (K,) steps in which a lane's episode ended and the lane was reset, in order
-    final_lanes: Ints  # (K,) lane of each episode in ``final_steps``
-    final_observation: Floats  # (K, D) last observation of each episode in ``final_steps``
-    model_version: Ints  # (T, N) version of the model in each step
+    final_steps: Ints  # (K,) for each of K ended episodes, the index of its last step, in ascending order
+    final_lanes: Ints  # (K,) lane of each of the K ended episodes
+    final_observation: Floats  # (K, D) last observation of each of the K ended episodes
+    model_version: Ints  # (T, N) version of the model that each lane's episode ran under in each step
     reward_mean: Floats  # (T, N) rewards without the penalty for uncertainty
-    untrusted: Bools | None = None  # (T, N) whether a lane left the trusted range; None without such a range
+    # (T, N) whether a lane was truncated because the model is too uncertain there; None in a session without ``trust``.
+    untrusted: Bools | None = None
 
     def __len__(self) -> int:
         return len(self.reward)
 
     @classmethod
     def of(cls, steps: Sequence[StepResult], action: Floats, log_probability: Floats | None) -> Self:
-        """Combine the results of at least one step, and the policy's actions in them."""
+        """Combine the results of one or more steps with the policy's actions (T, N, F) in these steps."""
         untrusted = [step.untrusted for step in steps if step.untrusted is not None]
         return cls(
             action=action,
@@ -90,7 +92,8 @@ class PolicyRollout:
         )
 
     def steps(self) -> list[StepResult]:
-        """Return the result of each step, as ``SurrogatePort.step`` would, as views of the rollout's arrays."""
+        """Return one result for each step, as ``SurrogatePort.step`` returns it. Its arrays are views of the
+        rollout's."""
         ends = np.searchsorted(self.final_steps, np.arange(len(self) + 1))
         return [
             StepResult(
@@ -110,8 +113,8 @@ class PolicyRollout:
 
 
 def quick(kind: type[T], **fields: Any) -> T:
-    """Make an instance of a frozen dataclass from all its fields, in half the time of its constructor: every virtual
-    step makes two instances."""
+    """Make an instance of a frozen dataclass from all its fields, in half the time of its constructor. Speed matters,
+    because every virtual step makes two instances."""
     instance = object.__new__(kind)
     instance.__dict__.update(fields)
     return instance
@@ -121,9 +124,9 @@ def quick(kind: type[T], **fields: Any) -> T:
 class SurrogatePort(Protocol):
     """One surrogate, as a trainer uses it.
 
-    Laws: a step happens once, however often the transport repeats it. A repeat gives the same reply, bit for bit.
-    Results of a session depend only on its seed and its requests. An error has the same class name in the error tree of
-    every implementation (``surrogym_client.errors``, ``surrogym_server.errors``).
+    Every implementation obeys these laws. A step is taken once, however often the transport repeats its request, and
+    each repeat gets the same reply, bit for bit. Results of a session depend only on its seed and its requests. An
+    error has a class of the same name in ``surrogym_client.errors`` and ``surrogym_server.errors``.
     """
 
     def spec(self) -> EnvironmentSpec:
@@ -131,32 +134,33 @@ class SurrogatePort(Protocol):
         ...
 
     def open(self, request: OpenSession) -> SessionView:
-        """Open a session of N lanes."""
+        """Open a session, a virtual environment of N lanes, and return its description."""
         ...
 
     def reset(self, session: str, *, seed: int | Sequence[int] | None = None, mask: Bools | None = None) -> ResetResult:
-        """Start new episodes in all lanes, or only in those of the mask (N,)."""
+        """Start new episodes in all lanes, or only in those where ``mask`` (N,) is True."""
         ...
 
     def step(
         self, session: str, action: Floats | Ints, *, mask: Bools | None = None, deviations: bool = False
     ) -> StepResult:
-        """Step all lanes, or only those of the mask (N,), with an action (N, F)."""
+        """Step all lanes, or only those where ``mask`` (N,) is True, with the actions (N, F) of the lanes."""
         ...
 
     def rollout(self, session: str, actions: Floats | Ints) -> list[StepResult]:
-        """Step all lanes T times with actions (T, N, F), in one request."""
+        """Step all lanes T times with actions (T, N, F), in one request, and return the result of each step."""
         ...
 
     def submit_occupancy(self, session: str, checkpoint: str) -> SubmittedOccupancy:
-        """Submit the states that a session visited as those of a policy's checkpoint, so that queries are chosen there.
+        """Store the states that a session visited under the name ``checkpoint``, so that queries can be chosen near
+        them.
 
         Returns how certain the model is at these states.
         """
         ...
 
     def close(self, session: str) -> None:
-        """Close the session. Closing it twice is harmless."""
+        """Close a session. Does nothing if the session is closed already."""
         ...
 
 
@@ -164,8 +168,8 @@ class SurrogatePort(Protocol):
 class PolicyPort(SurrogatePort, Protocol):
     """A surrogate that can also run a policy itself, so that a rollout of many steps is one request.
 
-    Law: the result equals stepping all lanes one by one with the actions of ``surrogym_shared.acting.Actor``, bit for
-    bit if both run the same NumPy on the same kind of processor.
+    Law: the result equals that of single steps of all lanes with the actions of ``surrogym_shared.acting.Actor``. The
+    two are equal bit for bit if client and server have the same version of NumPy and the same kind of processor.
     """
 
     def rollout_policy(
@@ -177,13 +181,13 @@ class PolicyPort(SurrogatePort, Protocol):
         noise: NoiseKey | None = None,
         until: Bools | None = None,
     ) -> PolicyRollout:
-        """Step all lanes with a policy, in one request. Either all steps are taken or none.
+        """Let a policy act in all lanes for several steps, in one request. If an error is raised, no step was taken.
 
         Args:
             session: id of a session whose lanes have been reset.
             policy: the policy.
             steps: largest number of steps, T.
-            noise: key of the actions' noise; None takes the most probable actions.
-            until: mask (N,) of lanes; the rollout stops after the step by which an episode has ended in each of them.
+            noise: key of the random noise of the actions; None takes the most probable actions.
+            until: mask (N,) of lanes; the rollout stops once an episode has ended in each of these lanes.
         """
         ...

@@ -1,4 +1,4 @@
-"""Presets: values for all settings that a specification and a training leave out.
+"""Presets: values for all settings that a specification or a training leaves open.
 
 ``default`` is this product's method. ``paper`` is the method as published, changed only where it can't work.
 """
@@ -23,14 +23,14 @@ class Preset:
 
     name: PresetName
 
-    # Settings of the model.
-    moves: Moves  # quantities whose change the model of the transition predicts
+    # Settings of the surrogate's model.
+    moves: Moves  # whether the model predicts changes of coordinates, or of observation entries
     takes_declared_rewards: bool
-    penalty: float  # k of eq. 14: standard deviations that are subtracted from a predicted reward
+    penalty: float  # k of eq. 14: this number of standard deviations is subtracted from a predicted reward
     limits_rewards: bool  # whether virtual rewards are limited to about the range of the samples' rewards
-    gaussian_process: Mapping[str, float | bool | str]  # settings of the Gaussian processes, by name
+    gaussian_process: Mapping[str, float | bool | str]  # settings of the models of Gaussian processes, by name
 
-    # Settings of the choice of queries.
+    # Settings that determine how the design chooses queries (real steps).
     takes_rollouts: bool  # whether a query may be a rollout, not only a single step
     hypercube_tries: int
     acquisition: str
@@ -40,28 +40,29 @@ class Preset:
     stopping: Stopping
 
     # Settings of the training and the audit of a policy.
-    algorithm: str  # name of the policy search
+    algorithm: str  # name of the training algorithm of a policy
     wide_networks: bool
-    adapts_training: bool  # whether a training adapts to noise, phase, long episodes, and a return that still rises
+    adapts_training: bool  # whether settings of a training depend on noise, episode length, and progress
     audits: bool
 
     def initial_steps(self, coordinates: int, observations: int, actions: int, by_steps: bool) -> int:
-        """Return the number of initial real steps.
+        """Return the default number of real steps before the first model.
 
         Args:
             coordinates: number of the state's coordinates.
             observations: number of the observation's entries.
             actions: number of the action's entries.
-            by_steps: whether a query is one step from a state to which the environment is set or returns.
+            by_steps: whether a query is one step from a state to which the environment is set, or from a saved state.
         """
         if self.name == "paper":
-            return 10 * (observations + actions)  # section 3.1 of the paper
+            return 10 * (observations + actions)  # as in section 3.1 of the paper
         return max(4, coordinates + actions) if by_steps else 4 * (coordinates + actions)
 
     def budget(self, initial: int, coordinates: int, actions: int, by_steps: bool) -> int:
         """Return the default number of real steps of a design, including the ``initial`` steps.
 
-        The paper needed 125 steps in all after 40 initial steps, and 120 after 50. Arguments as in ``initial_steps``.
+        The preset ``paper`` takes three times the initial steps: the paper needed 125 steps in all with 40 initial
+        steps, and 120 with 50. The other arguments are those of ``initial_steps``.
         """
         if self.name == "paper":
             return 3 * initial

@@ -13,8 +13,8 @@ AUTH_MODE, TOKEN, TOKEN_PATH = "RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKE
 def send_token() -> None:
     """Set the environment so that Ray sends this user's token, if there is one. Call this before Ray is imported.
 
-    A cluster from ``ray start`` requires the user's token if there is one. Ray 2.60 reads at import whether to send it,
-    before ``ray.init`` would set this. A cluster that requires no token ignores it.
+    A cluster that was started by ``ray start`` requires the user's token if there is one. Ray 2.60 decides when it is
+    imported whether it sends the token. A cluster that requires no token ignores it.
     """
     path = Path(os.environ.get(TOKEN_PATH) or Path.home() / ".ray" / "auth_token")
     if os.environ.get(TOKEN) or path.is_file():
@@ -31,7 +31,7 @@ def require_cluster(address: str) -> None:
         return
     host, _, port = address.rpartition(":")
     if not (host and port.isascii() and port.isdigit()) or "/" in host:
-        raise ValueError(f"expected auto or host:port, got {address!r}")
+        raise ValueError(f"expected the address of a Ray cluster, auto or host:port, got {address!r}")
     try:
         socket.create_connection((host, int(port)), KNOCKING_SECONDS).close()
     except (OSError, OverflowError) as error:
@@ -41,4 +41,6 @@ def require_cluster(address: str) -> None:
 def no_cluster(address: str, reason: str = "") -> str:
     """Return the error message for an address without a Ray cluster, with the command that starts one."""
     why = f" ({reason})" if reason else ""
-    return f"expected a cluster at {address!r}, got none{why}; begin one with RAY_worker_niceness=0 ray start --head"
+    return (
+        f"expected a Ray cluster at {address!r}, got none{why}; start one with RAY_worker_niceness=0 ray start --head"
+    )

@@ -1,6 +1,6 @@
 """Names of removed models, options and the like, each with its replacement.
 
-Old specifications, files and scripts may have such names. An error about an unknown name adds the replacement.
+Old specifications, files and scripts may have such names. The error about an unknown name then says what replaces it.
 """
 
 from __future__ import annotations
@@ -36,6 +36,6 @@ def instead_of(kind: str, name: str) -> str | None:
 
 
 def remark(kind: str, name: str) -> str:
-    """Return an addition to the error about an unknown name, "; NAME was removed: ...", or "" if it was not removed."""
+    """Return the end of an error about an unknown name: "; NAME was removed: ...", or "" if it was not removed."""
     instead = instead_of(kind, name)
     return "" if instead is None else f"; {name!r} was removed: {instead}"

@@ -20,7 +20,7 @@ def open_to_others(path: Path) -> str | None:
         return None
     mode = stat.S_IMODE(status)
     if stat.S_ISDIR(status):
-        return None  # reading the folder as a file raises an error later
+        return None  # a folder can't be read as a file, which raises an error later
     if os.name != "posix" or not mode & OTHERS:
         return None
     return f"{path} may be read by other users of this machine (mode {mode:o}): chmod 600 {path} prevents this"
@@ -35,7 +35,7 @@ def tokens_in(path: Path) -> dict[str, Role]:
     """
     lines = [line.strip() for line in path.read_text(encoding="utf-8").splitlines()]
     if not any(lines):
-        raise ValueError("expected lines like 'sample:token', got none: write one")
+        raise ValueError("expected lines of the form role:token, got an empty file: write a line such as sample:TOKEN")
     return dict(parse_token(line) for line in lines if line)
 
 

@@ -5,8 +5,9 @@ from typing import Literal
 Phase = Literal["collecting", "fitting", "sampling", "ready", "over_budget", "unsure", "from_log", "failed"]
 """Phase of a design of queries."""
 
-COMPLETED: tuple[Phase, ...] = ("ready", "over_budget", "unsure", "from_log")  # the design makes no further queries
-ENDED: tuple[Phase, ...] = (*COMPLETED, "failed")  # a sampler has nothing left to do
+# Phases in which the design makes no further queries.
+COMPLETED: tuple[Phase, ...] = ("ready", "over_budget", "unsure", "from_log")
+ENDED: tuple[Phase, ...] = (*COMPLETED, "failed")  # phases in which a sampler has nothing left to do
 
 Verdict = Literal["continue", "ready", "over_budget", "unsure", "from_log"]
 """Verdict of one round of a design. Unless it is ``continue``, the design ends, and the verdict is also its phase."""

@@ -31,9 +31,9 @@ MAX_FILE_BYTES = 256 * 1024 * 1024
 MAX_HEADER_BYTES = 16 * 1024 * 1024
 LENGTH_BYTES = 8
 METADATA = "__metadata__"
-OWN = "surrogate"  # key of the metadata about the surrogate, beside the model's metadata
+OWN = "surrogate"  # key of the surrogate's own metadata in the file's header
 SAMPLES = "samples."
-LOGGED = "logged"  # array that marks samples from a log; absent in a file without such samples
+LOGGED = "logged"  # name of the array that marks samples from a log; it is absent without such samples
 DTYPES: dict[str, np.dtype[Any]] = {"F64": np.dtype("<f8"), "BOOL": np.dtype("?")}
 UNREADABLE = (ValueError, LookupError, TypeError, AttributeError, RecursionError, OverflowError)
 
@@ -56,7 +56,8 @@ class RealSamples:
     reward: Floats  # (n,) reward of each step
     terminated: Bools  # (n,) whether the episode ended in a terminal state
     truncated: Bools  # (n,) whether the episode ended for another reason
-    logged: Bools | None = None  # (n,) whether a step is from a log, and so not from the budget; None: no step is
+    # (n,) whether a step comes from a log, so that the budget does not count it; None: no step does.
+    logged: Bools | None = None
 
     def __len__(self) -> int:
         return len(self.reward)
@@ -76,12 +77,12 @@ class SurrogateFile:
     spec: EnvironmentSpec
     model: bytes
     samples: RealSamples
-    tolerances: dict[str, float] = field(default_factory=dict)  # for each output, an error too small to matter
+    tolerances: dict[str, float] = field(default_factory=dict)  # largest error that does not matter, by output
     ledger: dict[str, int] = field(default_factory=dict)  # counts of real steps by purpose, on the exporting server
-    predictions: list[list[list[float]]] = field(
-        default_factory=list
-    )  # for each output, [error, standard deviation] of the prediction of each new sample
-    about: dict[str, Any] = field(default_factory=dict)  # what a prior was made from, as in ``wire.priors``
+    # For each output, and each sample that was new at a fit: [error, standard deviation] of its prediction before this
+    # fit.
+    predictions: list[list[list[float]]] = field(default_factory=list)
+    about: dict[str, Any] = field(default_factory=dict)  # what a prior was made from, as JSON of ``PriorAbout``
 
     def to_bytes(self) -> bytes:
         """Return the contents of the file.
@@ -124,9 +125,8 @@ class SurrogateFile:
             own = json.loads(header[METADATA].pop(OWN))
             if own["format"] != FORMAT:
                 raise NotASurrogateFile(
-                    f"expected a surrogate's file of format {FORMAT}, got format {own['format']!r}: export it "
-                    "again by the version "
-                    "of surrogym that reads it"
+                    f"expected a surrogate's file of format {FORMAT}, got format {own['format']!r}: export the "
+                    f"surrogate again with the version of surrogym that reads the file"
                 )
             spec = EnvironmentSpec.model_validate(own["spec"])
             names = [one for one in RealSamples.__dataclass_fields__ if one != LOGGED or SAMPLES + one in header]
@@ -143,19 +143,19 @@ class SurrogateFile:
             raise
         except ValidationError as error:
             raise NotASurrogateFile(
-                f"expected a specification without faults, got {first_fault(error)}; export the surrogate again"
+                f"expected a valid specification in the surrogate's file, got this fault: {first_fault(error)}; export "
+                f"the surrogate again"
             ) from error
         except UNREADABLE as error:
             raise NotASurrogateFile(
-                f"expected a surrogate's file, got one that is damaged or of another kind ({error!r}): export it "
-                "again by "
-                "surrogym export"
+                f"expected a surrogate's file, got one that is damaged or of another kind ({error!r}): export "
+                "the surrogate again by surrogym export"
             ) from error
         _require_shapes(spec, samples)
         return cls(name, spec, model, samples, tolerances, ledger, predictions, about)
 
     def about_as_json(self) -> str:
-        """Return as JSON what a prior was made from. If ``about`` is empty, its source is this surrogate."""
+        """Return as JSON what the prior in this file was made from. If ``about`` is empty, it is this surrogate."""
         return json.dumps(self.about or {"source": self.name})
 
     @classmethod
@@ -176,7 +176,7 @@ class SurrogateFile:
 def _split(data: bytes) -> tuple[Header, bytes]:
     """Split a safetensors file into header and arrays."""
     if len(data) > MAX_FILE_BYTES:
-        raise NotASurrogateFile(f"expected a file of at most {MAX_FILE_BYTES} bytes, got more")
+        raise NotASurrogateFile(f"expected a surrogate's file of at most {MAX_FILE_BYTES} bytes, got more")
     length = int.from_bytes(data[:LENGTH_BYTES], "little")
     end = LENGTH_BYTES + length
     if len(data) < LENGTH_BYTES or end > len(data) or length > MAX_HEADER_BYTES:
@@ -188,11 +188,11 @@ def _split(data: bytes) -> tuple[Header, bytes]:
         header = json.loads(data[LENGTH_BYTES:end])
     except UNREADABLE as error:
         raise NotASurrogateFile(
-            "expected a surrogate's file with a header in JSON, got other content: export it again"
+            "expected a surrogate's file with a header in JSON, got other content: export the surrogate again"
         ) from error
     if not isinstance(header, dict) or not isinstance(header.get(METADATA, {}), dict):
         raise NotASurrogateFile(
-            "expected a surrogate's file whose header names arrays, got other content: export it again"
+            "expected a surrogate's file whose header names arrays, got other content: export the surrogate again"
         )
     return header, data[end:]
 

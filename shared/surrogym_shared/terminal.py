@@ -16,11 +16,12 @@ import typer
 
 from surrogym_shared.words import visible
 
-PLAIN_SECONDS = 5.0  # time between lines of progress if no bar can be drawn
-FIRST_SECONDS = 2.0  # time before the first line of progress, so that short or refused work shows none
+PLAIN_SECONDS = 5.0  # time between two lines of progress, if the output is no terminal that can show a bar
+FIRST_SECONDS = 2.0  # time before the first line of progress, so that work that ends sooner shows none
 WATCH_SECONDS = 1.0  # time between two updates of a watched output
 
-Update = Callable[[float | None, str], None]  # arguments: share done in [0, 1], None if unchanged; a short description
+# Arguments: share of the work that is done, in [0, 1] (None: unchanged), and a short description.
+Update = Callable[[float | None, str], None]
 
 
 def say(text: str, *, quiet: bool = False) -> None:
@@ -38,8 +39,8 @@ def give(result: dict[str, Any], text: Callable[[], str], *, as_json: bool, quie
 
 
 def watch(look: Callable[[], str], seconds: float = WATCH_SECONDS) -> None:
-    """Show the output of ``look`` until Ctrl-C, and update it after each pause of ``seconds``: in place on a terminal,
-    elsewhere as new text if it has changed."""
+    """Show the text that ``look`` returns until Ctrl-C, and update it every ``seconds``: in place on a terminal,
+    elsewhere as further text if it has changed."""
     with suppress(KeyboardInterrupt), _screen() as show:
         while True:
             show(look())
@@ -72,7 +73,7 @@ def _screen() -> Iterator[Callable[[str], None]]:
 
 @contextmanager
 def _interrupt_afterwards() -> Iterator[None]:
-    """Context that delays Ctrl-C until its end, because a half-drawn output would be drawn again below itself."""
+    """Context that delays Ctrl-C until its end, so that the output in it is drawn completely."""
     came: list[int] = []
     before = signal.signal(signal.SIGINT, lambda number, _: came.append(number))
     try:
@@ -90,7 +91,7 @@ def on_interrupt(words: Callable[[], str]) -> Iterator[None]:
         yield
     except KeyboardInterrupt:
         if sys.stderr.isatty():
-            typer.echo(err=True)  # new line, because the terminal shows ^C in the last one
+            typer.echo(err=True)  # begin a new line, because the terminal has written ^C to the present one
         say(words())
         raise
 
@@ -132,8 +133,9 @@ def _bar(title: str) -> Iterator[Update]:
 
 
 class _Lines:
-    """Progress as lines of text, at most one every ``PLAIN_SECONDS``, and none before ``begin`` is called. The last
-    state is always shown."""
+    """Progress as lines of text, at most one every ``PLAIN_SECONDS``, and none before ``begin`` is called. The end of
+    the
+    work (share 1) is always shown."""
 
     def __init__(self, title: str) -> None:
         self._title = title

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-SHOWN = 10  # most names of a list that a message shows
+SHOWN = 10  # a message shows at most this many names of a list
 
 
-# Control characters; the last two ranges change the direction of text.
+# Codes of control characters; those of the last two ranges change the direction of text.
 _HIDDEN = (
     *range(32),
     *range(127, 160),

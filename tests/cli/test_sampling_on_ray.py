@@ -28,7 +28,7 @@ def line(server_process):
         (("--on-ray", "2", "--ray-resources", "robot"), "--ray-resources: expected NAME=AMOUNT"),
         (
             ("--on-ray", "2", "--ray-address", "127.0.0.1:9"),
-            "error: --on-ray: expected a cluster at '127.0.0.1:9', got none (Connection refused); begin one with "
+            "error: --on-ray: expected a Ray cluster at '127.0.0.1:9', got none (Connection refused); start one with "
             "RAY_worker_niceness=0 ray start --head",
         ),
         (("--on-ray", "2", "--runtime-env", "env.yaml"), "--runtime-env: expected names with values in env.yaml"),

@@ -113,10 +113,13 @@ GOOD = random_policy(SIZES)
 HUGE = tuple(Layer(np.full_like(one.weights, 3e38), np.full_like(one.bias, 3e38)) for one in GOOD.layers)
 BAD: dict[str, tuple[dict[str, Any], str]] = {
     "another observation": ({"policy": random_policy((4, 8, 1))}, "mean"),
-    "another action": ({"policy": random_policy((3, 8, 2))}, "expected 1 units in the last layer, got 2"),
+    "another action": (
+        {"policy": random_policy((3, 8, 2))},
+        "expected 1 units in the last layer, as the action space needs, got 2",
+    ),
     "no deviations for noise": (
         {"policy": replace(GOOD, log_deviations=None), "noise": NoiseKey(0)},
-        "expected log_deviations for the noise of continuous actions, got none",
+        "expected log_deviations with noise, got none",
     ),
     "deviations of another action": (
         {"policy": replace(GOOD, log_deviations=np.zeros(2, dtype=np.float32))},

@@ -271,24 +271,27 @@ def test_every_truncated_binary_frame_raises_an_error(read: Callable[[bytes], No
     [
         (frames.step_request(1, np.ones((3, 1)), None, False), r"action: expected 16 bytes, shape \(2, 1\) of float64"),
         (frames.step_request(1, np.ones((2, 1)), np.ones(3, bool), False), "mask: expected 2 bytes"),
-        (frames.StepRequest(action=np.ones(2).data, mask=memoryview(b"\x01\x02")), "mask: expected bytes 0 and 1"),
+        (
+            frames.StepRequest(action=np.ones(2).data, mask=memoryview(b"\x01\x02")),
+            "mask: expected booleans as bytes of 0 or 1",
+        ),
         (frames.rollout_request(1, np.ones((0, 2, 1))), "actions: expected 1 to 100000 steps of 2 x 1 float64"),
         (frames.rollout_request(1, np.ones(3)), "actions: expected 1 to 100000 steps of 2 x 1 float64, got 24 bytes"),
         (frames.reset_request(1, [1], None), "seed: expected 16 bytes"),
-        (frames.reset_request(0, 1, None), "expected a frame"),
-        (frames.reset_request(1, -1, None), "expected a frame"),
-        (of_policy(steps=0), "expected a frame"),
-        (of_policy(units=[1_025, 1]), "expected a frame"),
-        (of_policy(units=[1] * 9), "expected a frame"),
-        (of_policy(precision="float16"), "expected a frame"),
+        (frames.reset_request(0, 1, None), "expected a binary frame"),
+        (frames.reset_request(1, -1, None), "expected a binary frame"),
+        (of_policy(steps=0), "expected a binary frame"),
+        (of_policy(units=[1_025, 1]), "expected a binary frame"),
+        (of_policy(units=[1] * 9), "expected a binary frame"),
+        (of_policy(precision="float16"), "expected a binary frame"),
         (of_policy(units=[1_024] * 2), "policy: expected at most 262144 weights and biases, got 1053696"),
         (of_policy(units=[5, 1]), "parameters: expected 104 bytes"),
         (of_policy(mean=np.ones(4).data), "mean: expected 12 bytes"),
-        (of_policy(deviation=np.zeros(3, dtype=np.float32).data), "expected a positive standard deviation, got 0"),
+        (of_policy(deviation=np.zeros(3, dtype=np.float32).data), "expected numbers above 0 in deviation, got 0"),
         (of_policy(parameters=np.full(21, np.nan, dtype=np.float32).data), "finite numbers in layers"),
         (of_policy(until=np.ones(3, dtype=bool).data), "until: expected 2 bytes"),
-        (of_policy(noise=frames.Noise(-1, 0)), "expected a frame"),
-        (of_policy(noise=frames.Noise(0, 0, 0)), "expected a frame"),
+        (of_policy(noise=frames.Noise(-1, 0)), "expected a binary frame"),
+        (of_policy(noise=frames.Noise(0, 0, 0)), "expected a binary frame"),
     ],
 )
 def test_a_binary_request_that_does_not_fit_the_session_is_refused_with_the_reason(
@@ -322,5 +325,5 @@ def test_a_step_reply_with_invalid_final_environment_numbers_is_refused():
 
 @pytest.mark.parametrize("seeds", [2**63, [2**63], [1.5, "a"], [None]])
 def test_a_binary_reset_with_non_integer_seeds_is_refused(seeds: Any):
-    with pytest.raises(FrameError, match="seed: expected 0 to"):
+    with pytest.raises(FrameError, match="seed: expected whole numbers from 0 to"):
         frames.reset_request(1, seeds, None)

@@ -117,7 +117,7 @@ def test_a_network_file_with_invalid_numbers_is_refused(tmp_path: Path, name, va
     """Such a policy was loaded, and its actions were NaN."""
     made = network(pendulum())
     replace(made, **{name: np.full_like(getattr(made, name), value)}).save(tmp_path / "policy.zip")
-    with pytest.raises(ValueError, match=f"expected {name} as finite numbers"):
+    with pytest.raises(ValueError, match=f"array {name}: expected finite numbers"):
         Network.load(tmp_path / "policy.zip")
 
 
@@ -125,5 +125,5 @@ def test_a_network_file_with_a_non_finite_weight_is_refused(tmp_path: Path):
     made = network(pendulum())
     made.layers[-1].weights[0] = np.inf
     made.save(tmp_path / "policy.zip")
-    with pytest.raises(ValueError, match="expected weights1 as finite numbers"):
+    with pytest.raises(ValueError, match="array weights1: expected finite numbers"):
         Network.load(tmp_path / "policy.zip")

@@ -98,4 +98,4 @@ def test_a_plugin_cannot_take_a_built_in_name(sites: Sites):
     sites.add("thief", "PLAIN", GOOD)
     things = registry()
     assert things.get("plain") is Plain
-    assert "expected a name that differs from the built-in plain" in things.broken["PLAIN"]
+    assert "expected a name that differs from the built-in ones (plain), got 'PLAIN'" in things.broken["PLAIN"]

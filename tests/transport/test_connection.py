@@ -146,7 +146,7 @@ def test_the_token_can_be_read_from_a_file(monkeypatch: pytest.MonkeyPatch, tmp_
     ("content", "message"),
     [
         (None, "can't be read: No such file or directory"),
-        ("", "expected lines like 'sample:token', got none"),
+        ("", "expected lines of the form role:token, got an empty file"),
         ("read:one-secret\ntrain:two-secret", "expected one token, got 2"),
         ("king:a-secret", "a token's role: expected one of read, train, sample, admin before the colon, got another"),
     ],

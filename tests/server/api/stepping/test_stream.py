@@ -130,8 +130,8 @@ def test_the_stream_continues_after_an_error_reply(stream: ClientConnection):
 
 
 BAD: list[tuple[bytes, str]] = [
-    (b"no frame", "expected a frame, got 8 bytes that can't be read as one"),
-    (b"", "expected a frame, got 0 bytes"),
+    (b"no frame", "expected a binary frame (msgpack), got 8 bytes that can't be read as one"),
+    (b"", "expected a binary frame (msgpack), got 0 bytes"),
     (frames.encode(frames.step_request(2, np.ones((3, 1)), None, False)), "action: expected 16 bytes"),
     (frames.encode(frames.step_request(2, ACTION, np.ones(3, bool), False)), "mask: expected 2 bytes"),
     (frames.encode(frames.step_request(2, ACTION * np.nan, None, False)), "expected finite numbers"),

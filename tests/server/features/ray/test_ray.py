@@ -360,8 +360,8 @@ def walked(port: HttpSurrogate, disturbances: dict[int, Callable[[str], None]]) 
     ("options", "said"),
     [
         ({"database": "surrogym.db"}, "expected a PostgreSQL database, which all machines reach, got a SQLite file"),
-        ({"ray_address": "127.0.0.1:9"}, "expected a cluster at '127.0.0.1:9', got none"),
-        ({"ray_address": "ray://there:10001"}, "expected auto or host:port"),
+        ({"ray_address": "127.0.0.1:9"}, "expected a Ray cluster at '127.0.0.1:9', got none"),
+        ({"ray_address": "ray://there:10001"}, "expected the address of a Ray cluster, auto or host:port"),
         ({"ray_hosts": HOSTS + 1}, "which have hosts 2, got 3"),
         ({"max_lanes": 5}, "which have max_lanes"),
     ],
