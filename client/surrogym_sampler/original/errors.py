@@ -51,7 +51,7 @@ class NotParallel(OriginalError):
 
 
 class PolicyMisfit(OriginalError, ValueError):
-    """A policy was trained for another environment, or gave actions that this one does not have."""
+    """A policy was trained for another environment, or gave actions that this environment does not take."""
 
 
 class QueryRefused(OriginalError):

@@ -1,4 +1,4 @@
-"""Conversion of what an environment reads to coordinates with their lags.
+"""Conversion of the values that an environment reports to coordinates, some of which repeat earlier values (lags).
 
 Shapes: C coordinates, of which R are read and the others are lags; F action entries.
 """

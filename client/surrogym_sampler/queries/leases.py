@@ -24,7 +24,7 @@ class LeaseEnded(Exception):
 
 
 def seconds_awake_or_asleep() -> float:
-    """Return the seconds of a monotonic clock. If the system has such a clock, it also counts the time in which the
+    """Return the seconds of a monotonic clock. On systems that offer it, the clock also counts the time in which the
     machine was suspended."""
     if not hasattr(time, "clock_gettime"):
         return time.monotonic()

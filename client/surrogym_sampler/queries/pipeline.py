@@ -35,9 +35,10 @@ def beside(call: Callable[[], T]) -> Future[T]:
 
 
 class ClaimAhead:
-    """A claim of queries shortly before the running step ends, so that the next step need not wait for it.
+    """A claim of queries shortly before the running step ends, so that the next step need not wait for the server.
 
-    Other samplers may wait for these queries. If the step takes longer than expected, they are returned to the queue.
+    If the step takes longer than expected, the claimed queries are returned to the queue: other samplers may wait for
+    them.
 
     Args:
         claim: claims queries, without waiting for any.

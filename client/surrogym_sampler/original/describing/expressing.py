@@ -17,7 +17,7 @@ from surrogym_shared.terms import evaluate
 TOLERANCE = 1e-7  # a term expresses an observation entry with an error of at most this share of its largest value
 DIGITS = 6  # weights rounded to this number of decimals are preferred, if they still give the observation exactly
 FEW_TURNS = 4  # with at most this number of angles, the cosine and sine of sums of three angles are tried as well
-CLIPPED = 0.02  # an observation entry counts as clipped if this share of its values equals one of its two ends
+CLIPPED = 0.02  # an observation entry is clipped at an end of its range if this share of the states has that value
 
 
 def express(
