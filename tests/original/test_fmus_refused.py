@@ -26,7 +26,7 @@ def tanks(tmp_path_factory: pytest.TempPathFactory) -> Path:
     [
         ({"<CoSimulation": "<ModelExchange"}, "for model exchange only, .*: export it for co-simulation"),
         ({'fmiVersion="2.0"': 'fmiVersion="1.0"'}, r"can't be read|of FMI 2.0 or 3.0"),
-        ({'causality="input"': 'causality="parameter" variability="fixed"'}, "got no scalar input: declare one"),
+        ({'causality="input"': 'causality="parameter" variability="fixed"'}, "got no scalar input: declare an input"),
         ({' stepSize="10.0"': ""}, r'expected the seconds of one action, as \{"fmu": "copy.fmu", "step": 0.1\}'),
         ({"</fmiModelDescription>": ""}, "modelDescription.xml of .* can't be read"),
     ],
@@ -83,7 +83,7 @@ def test_fmu_options_that_do_not_fit_the_file_are_refused(tanks: Path, tmp_path:
 
 def test_files_that_are_no_fmu_are_refused_without_python_terms(tmp_path: Path) -> None:
     (tmp_path / "list.json").write_text("[1]")
-    with pytest.raises(UnknownEnvironment, match=r"list.json: not a JSON object; expected fmu"):
+    with pytest.raises(UnknownEnvironment, match=r"list.json: not a JSON object; expected the key fmu"):
         open_simulator(f"fmu:{tmp_path / 'list.json'}")
     with zipfile.ZipFile(tmp_path / "bare.fmu", "w") as bare:
         bare.writestr("modelDescription.xml", "<fmiModelDescription/>")
