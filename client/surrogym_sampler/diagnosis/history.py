@@ -30,8 +30,7 @@ HELD = 4  # largest number of steps for which a random action is held
 RIDGE = 1e-6  # ridge term of the linear regression, relative to the variance of its inputs
 ENOUGH = 0.05  # a history is good enough if its error is below this share of the standard deviation of the changes
 SLACK = 1.2  # a history is also good enough if its error is below this multiple of the smallest error of all histories
-# If the error exceeds this share of the standard deviation of the changes, the regression shows nothing about
-# histories.
+# If the error exceeds this share of the changes' standard deviation, the regression says nothing about histories.
 EXPLAINED = 0.5
 WIDER = 1.5  # the declared largest change of a coordinate is this multiple of its largest observed change
 

@@ -242,8 +242,7 @@ def _keep(path: Path, table: Table, steps: Transitions, where: str | Path | None
     if foreign:
         raise UnusableLog(
             f"{counted(len(steps.rejected), 'row')} of the log can't be used and would be written to {file}, but that "
-            "file "
-            "exists and does not contain rejected rows: give another file with --rejected"
+            "file exists and does not contain rejected rows: give another file with --rejected"
         )
     write_rejected(file, table, steps)
     return file

@@ -142,8 +142,7 @@ def read_hdf5(path: Path) -> Table:
             if not found:
                 raise UnusableLog(
                     f"expected data sets with one row per step at the top of {path}, got only the groups "
-                    f"{listed(groups)}: "
-                    "move the data sets to the top, or save them as CSV or NPZ"
+                    f"{listed(groups)}: move the data sets to the top, or save them as CSV or NPZ"
                 )
             table = table_of_arrays(path, {name: _cells(one[()]) for name, one in found.items()})
     except (OSError, KeyError, ValueError, RuntimeError) as error:
@@ -230,8 +229,7 @@ def _of_column(path: Path, name: str, column: Any) -> Cells:
         if types.is_string(chunk.dictionary.type) and longest > LONGEST_CELL:
             raise UnusableLog(
                 f"expected cells of at most {LONGEST_CELL:,} letters in the column {name!r} of {path}, got "
-                f"{longest:,}: "
-                "shorten or drop the column"
+                f"{longest:,}: shorten or drop the column"
             )
         words = np.array([*map(str, chunk.dictionary.to_pylist()), ""], dtype=object)
         parts.append(words[chunk.indices.fill_null(len(words) - 1).to_numpy()])
@@ -247,8 +245,7 @@ def _of_objects(path: Path, name: str, cells: Cells) -> Cells:
     if len(shapes) > 1:
         raise UnusableLog(
             f"expected lists of the same length in the column {name} of {path}, got different lengths: write each "
-            "entry "
-            "to a column of its own"
+            "entry to a column of its own"
         )
     return np.stack(list(cells))
 

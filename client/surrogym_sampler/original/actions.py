@@ -77,8 +77,7 @@ def require_same_action(name: str, declared: Action, own: Action) -> None:
     if not fits:
         raise UnknownEnvironment(
             f"the specification declares {_words_of(declared)}, but {name} takes {_words_of(own)}: declare the latter "
-            "as "
-            "the action"
+            "as the action"
         )
 
 

@@ -138,8 +138,7 @@ class OwnEpisode(Episode):
         del rng, sigma
         raise NotPerturbable(
             "expected an environment with a built-in adapter for a perturbation, got one of your own: write a class "
-            "with "
-            "changed physics, and give it with --env"
+            "with changed physics, and give it with --env"
         )
 
     def _started(self, coordinates: Array) -> Moment:

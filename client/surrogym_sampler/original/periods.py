@@ -35,6 +35,5 @@ def require_period(name: str, spec: EnvironmentSpec, own: float | None) -> None:
     if is_other(own, spec.sampling_period):
         raise UnknownEnvironment(
             f"expected {name} to take a step every {spec.sampling_period:g} s, the sampling_period of its "
-            "specification, "
-            f"got {own:g} s: correct one of them"
+            f"specification, got {own:g} s: correct one of them"
         )

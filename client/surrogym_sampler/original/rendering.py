@@ -73,8 +73,7 @@ class _Own:
         if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3:
             raise NotRenderable(
                 f"expected picture() to return an array (height, width, 3) of uint8, got {picture.shape} of "
-                f"{picture.dtype}: "
-                "convert the picture"
+                f"{picture.dtype}: convert the picture"
             )
         return picture
 

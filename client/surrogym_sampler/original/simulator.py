@@ -247,8 +247,7 @@ class Simulated:
         if not self.simulator.saves:
             raise StepFailed(
                 "expected a simulator that can return to a saved state, got one that can only be reset: register it "
-                "with "
-                "--access reset"
+                "with --access reset"
             )
         return packed(self.simulator.save())
 

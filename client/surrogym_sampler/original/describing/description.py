@@ -231,8 +231,7 @@ class _Draft:
         if ended:
             lines.append(
                 f"termination: {ended} of {len(self._seen.rewards)} steps ended an episode. It is learned from these; "
-                "an "
-                "inequality that you declare saves real steps"
+                "an inequality that you declare saves real steps"
             )
         else:
             paid = ", and what an end pays" if isinstance(spec.reward, DeclaredReward) else ""

@@ -136,8 +136,7 @@ class _Boundary:
     """
 
     def __init__(self, steps: Paid, explored: int, rare: NDArray[np.bool_], step: Steps) -> None:
-        # ``points``: the steps next to the boundary; ``passed``: the first, coarse steps of the bisections that led
-        # there
+        # ``points``: the steps next to the boundary; ``passed``: the first steps of the bisections to find them
         self.points = self.passed = steps.at(slice(0))
         self._steps, self._step = steps, step
         self._ends: list[tuple[Paid, Paid]] = []  # the two ends of the bisection that found each point

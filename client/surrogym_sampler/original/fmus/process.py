@@ -124,8 +124,7 @@ class Process:
         if digest != self._digest:
             raise StepFailed(
                 f"expected a snapshot of {self._archive.path.name} as it is now, got one that was made with another "
-                "file, "
-                "step or start: delete the snapshot, or restore the former file and settings"
+                "file, step or start: delete the snapshot, or restore the former file and settings"
             )
         self._revive()
         file = self._directory / "snapshot"
