@@ -4,7 +4,7 @@ SurrogymClientError
 ├── ServerUnreachable       no answer within the retry budget; the last request may have been carried out
 │   └── RequestTimeout      the server took the request and did not answer in time
 ├── UnusableToken           the file that should hold the token can't be used; nothing was sent
-├── ProtocolMismatch        what answered does not speak this version of the protocol
+├── ProtocolMismatch        the answer does not follow this version of the protocol
 └── ProblemError            the server refused; ``problem`` is its body, and nothing was changed
     ├── InvalidInput        the request can't be used: wrong route, field, shape, type or range
     │   ├── InvalidSpec
@@ -30,7 +30,7 @@ SurrogymClientError
     │   ├── Unauthenticated
     │   ├── Forbidden
     │   └── BeyondBudget    an admin raises the budget, or fewer real steps are asked for
-    ├── Unavailable         was tried again until the retry budget ran out
+    ├── Unavailable         the server can't answer now; retries did not help within the retry budget
     │   └── Overloaded
     ├── NotInstalled        the surrogate needs a plug-in that the server lacks; reading works without it
     └── ServerFailure       a defect of the server, or of what it has stored

@@ -1,23 +1,23 @@
 """Errors of the original environment.
 
 OriginalError
-├── UnknownEnvironment      nothing can be made of this name, or no specification can express it
-├── NotPerturbable          its masses, lengths and limits are unknown here
-├── NotSettable             it can only be reset and acted on
-├── NotParallel             one instance is open, and the environment does not say that another may be
-├── PolicyMisfit            the policy was trained for another environment, or gives actions that this one does not have
-├── QueryRefused            a query asks for what the environment does not allow; nothing was sent to it
+├── UnknownEnvironment      no environment can be made from this name, or no specification can express it
+├── NotPerturbable          the environment's physical attributes can't be changed, because they are unknown
+├── NotSettable             the environment can't be set to a state, only reset
+├── NotParallel             one instance is open, and the environment does not declare that several may be
+├── PolicyMisfit            the policy was trained for another environment, or gives unknown actions
+├── QueryRefused            the environment's specification does not allow a query; nothing was sent to it
 ├── SnapshotGone            a query begins at a snapshot that can't be used; the design chooses another query
 ├── SnapshotNotKept         a state can't be saved or written; no query will begin there
 ├── UnusableFolder          snapshots can't be kept in this folder; nothing was begun
-├── MachineFails            the environment failed at several different queries in a row; the worker stops
-├── LimitsLeft              more rollouts left a limit than is allowed; the worker stops
+├── MachineFails            the environment failed at several different queries in a row; the sampler stops
+├── LimitsLeft              more rollouts left a limit than is allowed; the sampler stops
 ├── EvaluationFailed        the environment or the policy failed after real steps had been taken
-└── StepFailed              the environment did not give a step; the query fails, the worker continues
-    ├── StepTimedOut        it took longer than its limit and was killed; the next step starts a fresh one
-    ├── EnvironmentDied     its process ended; the next step starts a fresh one
-    ├── StepRefused         it refused the step before anything moved; the design asks elsewhere
-    └── RequestRefused      its program answered with an error, and keeps running
+└── StepFailed              the environment did not give a step; the query fails, the sampler continues
+    ├── StepTimedOut        the step took too long, and the environment was killed; the next step starts it anew
+    ├── EnvironmentDied     the environment's process ended; the next step starts it anew
+    ├── StepRefused         the environment refused the step before it moved; the design chooses another query
+    └── RequestRefused      the environment's program answered with an error, and keeps running
 """
 
 from __future__ import annotations

@@ -117,8 +117,8 @@ class Simulator(ABC):
         """Set the state (V,), and clear all other memory of earlier steps."""
 
     def save(self) -> Array:
-        """Return as numbers (K,) everything that the next step depends on: more than ``read`` returns if a solver
-        remembers something."""
+        """Return everything that the next step depends on, as K numbers (K,): more than ``read`` returns, if a solver
+        has a memory."""
         return self.read()
 
     def restore(self, saved: Array) -> None:

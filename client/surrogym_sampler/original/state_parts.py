@@ -34,7 +34,7 @@ class StatePart(Protocol):
         ...
 
     def save(self) -> Array:
-        """Return as numbers (k,) everything in this part that the next step depends on."""
+        """Return everything in this part that the next step depends on, as k numbers (k,)."""
         return self.read()
 
     def restore(self, saved: Array) -> None:

@@ -1,4 +1,4 @@
-"""Expression of observation entries as sums of terms, by least squares on 1, q, and sin and cos of turning coordinates.
+"""Expression of observation entries as weighted sums of 1, coordinates, and sines and cosines of (sums of) angles.
 
 Shapes: n states, C coordinates, D observation entries.
 """
