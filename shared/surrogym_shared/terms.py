@@ -1,4 +1,4 @@
-"""Terms of a specification, evaluated on coordinates."""
+"""Evaluate terms of a specification (functions of the state) at n states of C coordinates."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Bools = NDArray[np.bool_]
 
 
 def evaluate(spec: EnvironmentSpec, term: Term, coordinates: Array) -> Array:
-    """Return the value (n,) of a term at coordinates (n, C)."""
+    """Return the value (n,) of a term at each of n states with coordinates (n, C)."""
     total = np.sum([_part(spec, part, coordinates) for part in term.parts], axis=0)
     if term.low is None and term.high is None:
         return np.asarray(total)
@@ -20,18 +20,18 @@ def evaluate(spec: EnvironmentSpec, term: Term, coordinates: Array) -> Array:
 
 
 def observe(spec: EnvironmentSpec, coordinates: Array) -> Array:
-    """Return the observation (n, D) that a specification declares, at coordinates (n, C)."""
+    """Return the observation (n, D) of D entries that a specification declares, at n states with coordinates (n, C)."""
     return np.stack([evaluate(spec, entry.term, coordinates) for entry in spec.observation], axis=1)
 
 
 def holds(spec: EnvironmentSpec, inequality: Inequality, coordinates: Array) -> Bools:
-    """Return whether an inequality holds at each of the coordinates (n, C), as booleans (n,)."""
+    """Return whether an inequality holds at each of n states with coordinates (n, C), as booleans (n,)."""
     compare = {"<": np.less, "<=": np.less_equal, ">": np.greater, ">=": np.greater_equal}[inequality.relation]
     return np.asarray(compare(evaluate(spec, inequality.term, coordinates), inequality.value))
 
 
 def terminates(spec: EnvironmentSpec, coordinates: Array) -> Bools:
-    """Return whether any declared termination holds at each of the coordinates (n, C), as booleans (n,)."""
+    """Return whether any declared termination holds at each of n states with coordinates (n, C), as booleans (n,)."""
     ended = np.zeros(len(coordinates), dtype=np.bool_)
     for group in spec.termination_groups:
         ended |= np.all([holds(spec, inequality, coordinates) for inequality in group], axis=0)

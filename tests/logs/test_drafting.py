@@ -189,7 +189,7 @@ def test_drafting_from_a_log_with_too_large_or_small_numbers_is_refused(
 def test_a_draft_that_would_be_an_invalid_specification_is_refused(tmp_path: Path):
     name = "a" * 62  # cos(name) is longer than a name may be
     angle = np.remainder(np.arange(50) * 0.3, 2 * math.pi)
-    with pytest.raises(UnusableLog, match="the drafted specification is not valid: name: "):
+    with pytest.raises(UnusableLog, match="no valid specification can be drafted from the log: name: "):
         drafted(tmp_path, **{name: angle, "action": rows()["action"]})
 
 

@@ -266,7 +266,7 @@ def test_if_some_columns_are_marked_as_states_other_columns_are_ignored():
     [
         (["a", "b"], "expected a column of the action, such as action_valve, got \\['a', 'b'\\]"),
         (["action"], "expected a column of the state"),
-        (["a", "b", "action", "next_a"], "expected a column of the next state for all of \\['a', 'b'\\] or for none"),
+        (["a", "b", "action", "next_a"], "columns of the next state for all states"),
     ],
 )
 def test_a_log_whose_column_names_are_not_sufficient_is_refused(heading: list[str], says: str):

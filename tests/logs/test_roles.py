@@ -85,7 +85,7 @@ def test_the_mapping_of_recognised_columns_gives_the_same_roles_again():
 @pytest.mark.parametrize(
     ("name", "content", "says"),
     [
-        ("map.toml", b"\xff\xfe\x00state", "expected JSON or TOML in .*, got bytes that are no text in UTF-8"),
+        ("map.toml", b"\xff\xfe\x00state", "expected JSON or TOML in .*, got other bytes than UTF-8"),
         ("map.json", b"[" * 100_000, "expected a table of columns in .*nested too deeply"),
         ("map.json", b"[" * 4_000 + b"]" * 4_000, "expected a table"),
         ("map.toml", b"a=" + b"[" * 100_000, "nested too deeply|expected JSON or TOML"),

@@ -21,7 +21,7 @@ def test_one_long_cell_of_a_text_log_does_not_enlarge_its_column_in_memory() -> 
     [
         ("x\n1\n2\n3\n", "at most 2 rows in the log, got more"),
         (",".join(f"x{i}" for i in range(MOST_COLUMNS + 1)), f"at most {MOST_COLUMNS} columns in the log, got 1001"),
-        ("x" * (LONGEST_NAME + 1), "names of at most 200 letters"),
+        ("x" * (LONGEST_NAME + 1), "names of at most 200 characters"),
         (f"x\n{'1' * 200_000}\n", "expected CSV in the log, got other text in line 2"),
     ],
 )

@@ -115,7 +115,10 @@ def draft_log(table: Table, roles: Roles, name: str, budget: int = 0) -> ReadLog
     try:
         drafted: Draft = draft(roles, steps, name, budget)
     except ValidationError as error:
-        raise UnusableLog(f"the drafted specification is not valid: {first_fault(error)}") from error
+        raise UnusableLog(
+            f"no valid specification can be drafted from the log: {first_fault(error)}; change the log or the mapping "
+            "file"
+        ) from error
     notes = (*table.remarks, *steps.notes, *drafted.notes)
     return ReadLog(table, roles, _shaped(drafted.spec, roles, steps), drafted.spec, notes)
 
@@ -139,11 +142,11 @@ def is_of_rejected(path: Path) -> bool:
 
 
 def _of_spec(roles: Roles, spec: EnvironmentSpec) -> Roles:
-    """Restrict the roles to the coordinates of a specification, in its order. Other states are ignored."""
+    """Return the roles with only those states that are coordinates of a specification, in its order."""
     if missing := [name for name in spec.coordinate_names if name not in roles.state]:
         raise UnusableLog(
             f"expected the coordinates {list(spec.coordinate_names)} of the specification, got {list(roles.state)}: "
-            f"{missing[0]!r} is missing; name the columns in a mapping file (--map)"
+            f"{missing[0]!r} is missing; name the columns of the states in a mapping file (--map)"
         )
     if len(roles.action) != spec.action.size:
         raise UnusableLog(
@@ -176,7 +179,8 @@ def _require_choices(spec: EnvironmentSpec, roles: Roles, values: Floats) -> Non
         if (declared := roles.choices.get(name)) is not None:
             if len(declared) != count:
                 raise UnusableLog(
-                    f"action {name}: expected {count} choices in discrete, as specified, got {list(declared)}"
+                    f"action {name}: expected {count} choices in discrete, as in the specification, got "
+                    f"{list(declared)}"
                 )
             continue
         present = set(np.unique(column[np.isfinite(column)]).tolist())
@@ -192,7 +196,8 @@ def _require_choices(spec: EnvironmentSpec, roles: Roles, values: Floats) -> Non
 
 
 def _shaped(spec: EnvironmentSpec, roles: Roles, steps: Transitions) -> Transitions:
-    """Keep only the states that are coordinates of a specification, in its order, and wrap angles to [-pi, pi)."""
+    """Return the steps with only those states that are coordinates of a specification, in its order. Angles are wrapped
+    to [-pi, pi)."""
     names = list(roles.state)
     columns = [names.index(name) for name in spec.coordinate_names]
     q, q_next = steps.q[:, columns].copy(), steps.q_next[:, columns].copy()
@@ -203,7 +208,7 @@ def _shaped(spec: EnvironmentSpec, roles: Roles, steps: Transitions) -> Transiti
 
 
 def _consistent(spec: EnvironmentSpec, steps: Transitions) -> Transitions:
-    """Reject the steps that contradict the specification.
+    """Return the steps without those that contradict the specification, which are rejected with a reason.
 
     These are steps with a discrete action that is not a whole number, steps that are marked as terminated although no
     declared termination holds, and steps that are not marked although one holds.

@@ -101,8 +101,8 @@ def _names(rows: Rows, names: Ints, notes: list[str]) -> Ints:
 
 
 def _restarts(time: Floats) -> Bools:
-    """Return a mask (n,) of the rows where the time goes back and continues from there. A single row that is out of
-    order does not count."""
+    """Return a mask (n,) of the rows at which the time goes back and then continues from the earlier time. A single row
+    that is out of order does not count."""
     restarts = np.zeros(len(time), dtype=np.bool_)
     if len(time) > 2:
         restarts[1:-1] = (time[1:-1] < time[:-2]) & (time[2:] > time[1:-1]) & (time[2:] <= time[:-2])

@@ -227,13 +227,13 @@ def _content(path: Path) -> Mapping[str, Any]:
         text = path.read_text(encoding="utf-8")
         content: Mapping[str, Any] = json.loads(text) if path.suffix.lower() == ".json" else tomllib.loads(text)
     except UnicodeDecodeError as error:
-        raise UnusableLog(f"expected JSON or TOML in {path}, got bytes that are no text in UTF-8") from error
+        raise UnusableLog(f"expected JSON or TOML in {path}, got other bytes than UTF-8: write it in UTF-8") from error
     except RecursionError as error:
         raise UnusableLog(
-            f"expected a table of columns in {path}, got lists or tables nested too deeply: write one level"
+            f"expected a table of columns in {path}, got lists or tables nested too deeply: write them without nesting"
         ) from error
     except ValueError as error:
-        raise UnusableLog(f"expected JSON or TOML in {path}: {error}") from error
+        raise UnusableLog(f"expected JSON or TOML in {path}, got text with an error: {error}") from error
     return content
 
 
@@ -293,7 +293,8 @@ def _choices(mapped: LogMapping, action: Mapping[str, str], where: str) -> dict[
         return {}
     if set(mapped.discrete) != set(action):
         raise UnusableLog(
-            f"{where}: expected discrete to list the choices of each action ({listed(list(action))}), got those of "
+            f"{where}: expected discrete to list the choices of each action entry ({listed(list(action))}), got "
+            "choices of "
             f"{listed(list(mapped.discrete))}"
         )
     for name, values in mapped.discrete.items():
@@ -396,15 +397,15 @@ def _checked(roles: Roles) -> Roles:
             )
     if long := [name for name in roles.state if not 1 <= len(name) <= LONGEST]:
         raise UnusableLog(
-            f"expected names of states with 1 to {LONGEST} letters, got {long[0]!r}: rename it in a mapping file "
+            f"expected names of states with 1 to {LONGEST} characters, got {long[0]!r}: rename it in a mapping file "
             "(--map)"
         )
     if roles.following and set(roles.following) != set(roles.state):
         odd = sorted(set(roles.following) ^ set(roles.state))[0]
         raise UnusableLog(
-            f"expected a column of the next state for all of {listed(roles.state)} or for none, got "
-            f"{listed(roles.following)} "
-            f"({odd!r} differs): name the columns in a mapping file (--map)"
+            f"expected columns of the next state for all states ({listed(roles.state)}) or for none, got columns for "
+            f"{listed(roles.following)} ({odd!r} is only in one of the lists): name the columns in a mapping file "
+            "(--map)"
         )
     for name, column in roles.following.items():
         unit, other = roles.units.get(roles.state[name], ""), roles.units.get(column, "")

@@ -64,8 +64,8 @@ def decoded(content: bytes, where: str) -> tuple[str, tuple[str, ...]]:
         if encoding == "utf-8":
             return _windows(content, where)
         raise UnusableLog(
-            f"expected text in {name} in {where}, as its first bytes show, got byte {error.start} that is none: the "
-            "file may be cut off; write it again in UTF-8"
+            f"expected text in {name} in {where}, as its first bytes show, got an invalid byte at position "
+            f"{error.start}: the file may be cut off; write it again in UTF-8"
         ) from error
     if "\0" in text:
         raise UnusableLog(

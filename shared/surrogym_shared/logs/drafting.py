@@ -55,7 +55,7 @@ def draft(roles: Roles, steps: Transitions, name: str, budget: int = 0) -> Draft
 
     Args:
         roles: roles of the columns, and declarations about them.
-        steps: usable transitions of the log, at least two.
+        steps: usable steps of the log, at least two.
         name: name of the environment.
         budget: real steps that a design may take in addition to the log.
 
@@ -129,7 +129,7 @@ def _require_size(name: str, low: float, high: float) -> None:
         came = f"{low:g}" if low == high else f"{low:g} to {high:g}"
         raise UnusableLog(
             f"{name}: expected values of at most {LARGEST:g} in size, got {came}: convert the column to "
-            "another unit, or leave out the rows that are faults"
+            "another unit, or remove rows with wrong values"
         )
 
 
@@ -185,8 +185,8 @@ def _stays_at(after: Floats, end: float, ends: tuple[float, float]) -> bool:
 
 
 def _start(coordinate: Coordinate, steps: Transitions, index: int) -> Uniform | Fixed:
-    """Return the range of a coordinate at the starts of the log's episodes. If the log has only one episode, return the
-    range over all states."""
+    """Return the distribution of a coordinate at the start: its range over the first states of the log's episodes. If
+    the log has only one episode, this is the range over all states."""
     begins = steps.q[steps.first, index]
     values = begins if len(begins) >= FEW_EPISODES else steps.q[:, index]
     if coordinate.kind == "angle":
@@ -316,7 +316,7 @@ def _discrete(counts: list[int]) -> DiscreteAction | MultiDiscreteAction:
 
 
 def _questions(names: list[str], codes: list[Floats], whole: list[bool]) -> Iterator[str]:
-    """Yield notes that ask whether actions are choices, because their values are few whole numbers.
+    """Yield notes that ask whether an action is discrete, because its values are few whole numbers.
 
     Args:
         names: names of the action entries.

@@ -1,4 +1,4 @@
-"""Split the headings of columns into the name, its words, and the unit."""
+"""Split the heading of a column into its name, the words of the name, and its unit."""
 
 from __future__ import annotations
 
@@ -62,8 +62,8 @@ def heading(column: str) -> Heading:
 
 
 def timed(one: Heading) -> Heading:
-    """Return the heading with the last word of its name as the unit, if that is a unit of time as in ``time_s`` and
-    ``timestampMs``."""
+    """Return a heading whose name ends with a unit of time, as ``time_s`` and ``timestampMs`` do, with this word as its
+    unit. Return other headings unchanged."""
     if one.unit or len(one.words) < 2 or one.words[-1].lower() not in TIMES:
         return one
     return Heading(one.column, one.name, one.words[-1], one.words[:-1])

@@ -10,17 +10,20 @@ from surrogym_shared.terms import evaluate, holds
 
 
 def declared_reward(spec: EnvironmentSpec, q: Floats, u: Floats, q_next: Floats, terminated: Bools) -> Floats:
-    """Compute the declared rewards of n steps, (n,). Raises ``TypeError`` if the reward is learned."""
+    """Compute the declared rewards (n,) of n steps from states q (n, C) to ``q_next`` (n, C) under actions u (n, F).
+
+    ``terminated`` (n,) says which steps end the episode. Raises ``TypeError`` if the reward is learned.
+    """
     reward = spec.reward
     if not isinstance(reward, DeclaredReward):
-        raise TypeError(f"expected a declared reward, got a {reward.kind} one")
+        raise TypeError(f"expected a specification with a declared reward, got one with a {reward.kind} reward")
     read = q_next if reward.timing == "after" else q
     reward_sum = np.sum([_reward_of(spec, term, read, u) for term in reward.terms], axis=0)
     return np.asarray(reward_sum + reward.terminal * terminated, dtype=np.float64)
 
 
 def _reward_of(spec: EnvironmentSpec, term: RewardTerm, q: Floats, u: Floats) -> Floats:
-    """Compute one term of the reward (n,): weight * shape(of) if every inequality of ``when`` holds, else 0."""
+    """Compute one term of the reward for n steps, (n,): weight * shape(of) if all its inequalities hold, else 0."""
     of = [
         (0.0 if one.term is None else evaluate(spec, one.term, q)) + (u @ np.array(one.action) if one.action else 0.0)
         for one in term.of

@@ -1,4 +1,4 @@
-"""Steps of RLDS (Reinforcement Learning Datasets) as rows with their next observation."""
+"""Convert steps of the format RLDS (Reinforcement Learning Datasets) to rows that also have the next observation."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ FIRST, LAST, TERMINAL = "is_first", "is_last", "is_terminal"
 def from_rlds(table: Table) -> Table:
     """Convert a log in the format RLDS to rows with their next state and end; return any other log unchanged.
 
-    A step of RLDS has an observation, the action taken there, and the reward paid for it. The last step of an episode
-    (``is_last``) has only the observation: its action and reward mean nothing, so it is no row here. The step before it
-    is the end of the episode, as a terminal state if the last step has ``is_terminal``, otherwise as cut off.
+    A step of RLDS has an observation, the action taken there, and the reward for it. The last step of an episode
+    (``is_last``) has only the observation. Its action and reward mean nothing, so it becomes no row. The row of the
+    step before is terminated if the last step has ``is_terminal``, and truncated otherwise.
 
     Raises:
         UnusableLog: the columns ``is_first``, ``is_last`` and ``is_terminal`` contradict each other.

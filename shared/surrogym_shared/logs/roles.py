@@ -94,7 +94,7 @@ def read_roles(table: Table, mapping: Path | Mapping[str, Any] | LogMapping | No
     if twice := [name for name in roles.used if name in table.repeated]:
         count = table.repeated[twice[0]]
         raise UnusableLog(
-            f"expected different names of used columns, got {twice[0]!r} {count} times: rename the columns"
+            f"expected different names of the columns that are used, got {twice[0]!r} {count} times: rename the columns"
         )
     return table, roles
 
@@ -133,14 +133,15 @@ def _with_episodes(table: Table, name: str) -> Table:
 
 
 def _plain(table: Table, roles: Roles) -> list[str]:
-    """Return the columns that are states only because their names suggest no other role."""
+    """Return the names of columns that are states only because their names suggest no other role."""
     free = [column for name, column in roles.state.items() if name not in roles.following and column in table.columns]
     return [column for column in free if not STATE.match(heading(column).name)]
 
 
 def _numbering(name: str, table: Table) -> Numbering | None:
-    """Return what a column counts; None if it counts nothing. A column that restarts or has gaps counts rows only if
-    its name is that of a counter.
+    """Return what a column counts: rows of the log or of episodes; None if it counts nothing.
+
+    A column that restarts or has gaps counts rows only if its name is one of a counter, such as ``step``.
 
     Raises:
         UnusableLog: the column numbers the rows, and the rows are not in the order of these numbers.

@@ -95,8 +95,8 @@ def rows_of(table: Table, roles: Roles, spec: EnvironmentSpec | None = None) -> 
 def _matrix(
     table: Table, columns: Mapping[str, str], ends: Ends, choices: Mapping[str, tuple[float, ...]] | None = None
 ) -> tuple[Floats, dict[int, str]]:
-    """Convert columns to numbers (n, k), and values of declared ``choices`` to their numbers from 0. Also returns the
-    first fault of each row, by the row's index."""
+    """Convert k columns of n rows to numbers (n, k), and values of declared ``choices`` to the numbers of the choices
+    from 0. Also returns the first fault of each row, by the row's index."""
     values, faults = [], dict[int, str]()
     for name, column in columns.items():
         cells, faulty = numbers(column, table.columns[column])

@@ -31,7 +31,7 @@ UNNAMED = re.compile(r"^(?:unnamed column \d+|Unnamed: \d+|__index_level_\d+__)$
 
 @dataclass(frozen=True)
 class _Head:
-    """Beginning of a log: comment lines, the line after them, a row below it, and the line that names the columns."""
+    """Beginning of a text log: its comments, the first other line, and the line below that one."""
 
     comments: tuple[str, ...]
     line: str
@@ -107,7 +107,7 @@ def _with_places(names: Sequence[str]) -> list[str]:
 
 
 def _head(text: str) -> _Head:
-    """Return the comments and the first two other lines of a log. Missing lines are empty."""
+    """Return the comments and the first two other lines of a text log. Missing lines are empty."""
     comments, lines, before = [], list[str](), 0
     for number, line in enumerate(io.StringIO(text, newline=None)):
         if not line.strip():
@@ -198,4 +198,4 @@ def _require_names(where: str, names: Sequence[str]) -> None:
     if len(names) > MOST_COLUMNS:
         raise UnusableLog(f"expected at most {MOST_COLUMNS} columns in {where}, got {len(names)}: import some of them")
     if long := [name for name in names if len(name) > LONGEST_NAME]:
-        raise UnusableLog(f"expected names of at most {LONGEST_NAME} letters in {where}, got {long[0][:40]!r}...")
+        raise UnusableLog(f"expected names of at most {LONGEST_NAME} characters in {where}, got {long[0][:40]!r}...")

@@ -1,4 +1,4 @@
-"""Error for a log with too few usable steps. It names the most frequent reason."""
+"""Error for a log with too few usable steps, with the most frequent reason why steps can't be used."""
 
 from __future__ import annotations
 
@@ -54,5 +54,5 @@ def require_steps(table: Table, steps: Transitions, least: int) -> None:
 
 
 def _kind(reason: str) -> str:
-    """Return the reason of a rejected row without value and line number, so that equal kinds of faults are equal."""
+    """Return the reason of a rejected row without value and line number, so that faults of the same kind are equal."""
     return re.sub(r"line \d+", "line", reason.partition(", got")[0])

@@ -30,12 +30,12 @@ class Transitions:
         first: whether an episode of the log begins with the step, (m,).
         episodes: number of rows of each episode.
         rejected: reason for each row that was set aside, by the row's index.
-        ends: number of rows without a next state, because an episode ends there or a gap in time follows.
+        ends: number of rows that give no step, because an episode ends there or a gap in time follows.
         interval: median time between two rows, in the unit of the time column; None without such a column.
         lost_ends: number of rows that end their episode in a terminal state, and give no step, because their next state
             is not known.
         began: time of the first step; None without a column of times.
-        notes: conclusions about the order of the rows, from the clock and the names of episodes.
+        notes: sentences on the order of the rows, concluded from the times and the names of episodes.
     """
 
     row: Ints
@@ -146,8 +146,8 @@ def _backwards(
 
 
 def _going_on(rows: Rows, follower: dict[int, int], rejected: dict[int, str]) -> dict[int, str]:
-    """Return a reason for each row that is marked as the end of its episode although a row of the same episode follows,
-    by the row's index."""
+    """Return a reason, by the row's index, for each row that is marked as terminated although a row of the same episode
+    follows. ``follower`` has the index of the row that follows each row."""
     return {
         row: f"{rows.roles.terminated}: expected 0, as line {rows.lines[after]} continues the episode, got 1"
         for row, after in follower.items()

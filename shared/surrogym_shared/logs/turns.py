@@ -46,7 +46,7 @@ class Turn:
 
 
 def turn_of(steps: Transitions, index: int) -> Turn | None:
-    """Return the full turn after which the values of column ``index`` of the states wrap; None if they don't wrap."""
+    """Return the full turn after which the values of state column ``index`` wrap; None if they don't wrap."""
     before, after = steps.q[:, index], steps.q_next[:, index]
     change, low, high = after - before, min(before.min(), after.min()), max(before.max(), after.max())
     width = float(high - low)

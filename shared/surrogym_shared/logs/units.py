@@ -73,8 +73,8 @@ def unit_notes(q: Floats, spec: EnvironmentSpec) -> list[str]:
 def require_reward_unit(paid: Floats, known: Floats, name: str) -> None:
     """Check that the rewards of a log seem to be in the same unit as those of a surrogate's samples.
 
-    Nothing is checked if the samples are few, because their rewards may be small by chance, or if all rewards of the
-    samples are 0.
+    Nothing is checked if there are few samples, because their rewards may be small by chance, or if all their rewards
+    are 0.
 
     Args:
         paid: rewards of the log, (m,).
@@ -82,7 +82,7 @@ def require_reward_unit(paid: Floats, known: Floats, name: str) -> None:
         name: name of the surrogate.
 
     Raises:
-        UnusableLog: the middle half of ``paid`` lies beyond ``BEYOND`` times the largest size of a known reward, or is
+        UnusableLog: the middle half of ``paid`` lies beyond 20 times the largest absolute value of ``known``, or is
             wider than that.
     """
     largest = float(np.abs(known).max(initial=0.0))

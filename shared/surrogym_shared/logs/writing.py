@@ -1,4 +1,4 @@
-"""Write steps to files that a log may be read from."""
+"""Write steps to CSV cells and NPZ files that can be read again as a log."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ def npz_of_steps(coordinate_names: Sequence[str], arrays: Mapping[str, Any]) -> 
 
     Args:
         coordinate_names: names of the coordinates.
-        arrays: ``coordinates`` (n, C), ``action`` (n, F), ``next_coordinates`` (n, C), and ``reward``, ``terminated``
-            and the like, (n,) each.
+        arrays: ``coordinates`` (n, C), ``action`` (n, F), ``next_coordinates`` (n, C), and further arrays (n,) such as
+            ``reward`` and ``terminated``.
     """
     buffer = io.BytesIO()
     np.savez(buffer, coordinate_names=np.array(coordinate_names), **arrays)

@@ -11,7 +11,7 @@ from surrogym_shared.spec.base import MAX_DIMENSIONS, MAX_DISCRETE_ACTIONS, Froz
 
 
 class BoxAction(Frozen):
-    """Continuous action in [low, high].
+    """Continuous action, with each entry in [low, high].
 
     ``bins`` is the number of equally spaced values in each dimension from which a policy chooses (the paper's
     discretised control); None for a continuous policy. The model and the sampler always get the continuous value.
@@ -62,7 +62,7 @@ class DiscreteAction(Frozen):
 
 
 class MultiDiscreteAction(Frozen):
-    """Several discrete actions at once; entry i is between 0 and nvec[i] - 1."""
+    """Action of several discrete entries; entry i is a whole number from 0 to nvec[i] - 1."""
 
     kind: Literal["multi_discrete"] = "multi_discrete"
     nvec: tuple[Annotated[int, Field(ge=2, le=MAX_DISCRETE_ACTIONS, strict=True)], ...] = Field(

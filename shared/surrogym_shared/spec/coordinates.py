@@ -1,4 +1,4 @@
-"""Coordinates of the state q, with their distributions and bounds."""
+"""Coordinates of the state q: their kinds, sampling distributions, bounds and lags (repeated past values)."""
 
 from __future__ import annotations
 
@@ -27,7 +27,8 @@ class Uniform(Frozen):
 
 
 class Normal(Frozen):
-    """Normal distribution, truncated to [low, high], or at three standard deviations if there are no limits."""
+    """Normal distribution, truncated to [low, high]. An end that is None lies three standard deviations from the
+    mean."""
 
     kind: Literal["normal"] = "normal"
     mean: Number
@@ -51,7 +52,7 @@ class Normal(Frozen):
 
 
 class Fixed(Frozen):
-    """A single value, for the start distribution only."""
+    """A single value, which is allowed as the distribution of starts only."""
 
     kind: Literal["fixed"] = "fixed"
     value: Number
@@ -75,8 +76,8 @@ def limits(distribution: Uniform | Normal | Fixed) -> tuple[float, float]:
 class Bounds(Frozen):
     """Saturation: the environment clips the coordinate to [low, high].
 
-    ``stops`` names a coordinate that becomes zero when this one reaches the bound, as at a wall (MountainCar's left
-    end).
+    ``stops`` names another coordinate, such as the speed, that becomes 0 when this coordinate reaches a bound, as at a
+    wall (MountainCar's left end).
     """
 
     low: Number | None = None
@@ -94,10 +95,10 @@ class Bounds(Frozen):
 class Lag(Frozen):
     """Past value that a coordinate repeats. Its next value is known, so no model learns it.
 
-    ``change``: how far coordinate ``of`` moved in the step, an angle by at most half a turn. ``value``: the value of
-    coordinate ``of`` before the step. ``action``: entry ``entry`` of the step's action. ``steps``: the number of steps
-    since the reset, up to the coordinate's upper bound; below it the other lags are not known yet, and the model does
-    not learn from the step.
+    What the coordinate has after a step depends on ``kind``. ``change``: how far coordinate ``of`` moved in the step,
+    an angle by at most half a turn. ``value``: the value of coordinate ``of`` before the step. ``action``: entry
+    ``entry`` of the step's action. ``steps``: the number of steps since the reset, up to the coordinate's upper bound.
+    While it is below this bound, other lags are not known yet, and the model does not learn from the steps.
     """
 
     kind: LagKind
@@ -116,11 +117,11 @@ class Lag(Frozen):
 
 
 class Coordinate(Frozen):
-    """One entry of q: a part of the state that the original environment is set to.
+    """One coordinate, that is one entry of the state q.
 
-    The dynamics move ``linear`` and ``angle`` coordinates; an angle is wrapped to [-pi, pi). A ``constant`` is drawn at
-    the start of an episode and does not change (Reacher's target). A coordinate with a ``lag`` repeats the past.
-    ``sampling`` is the distribution of design queries.
+    Coordinates of kind ``linear`` and ``angle`` move; an angle is wrapped to [-pi, pi). A ``constant`` is drawn at the
+    start of an episode and does not change in it (Reacher's target). A coordinate with a ``lag`` repeats the past.
+    ``sampling`` is the distribution of the states of the design's queries.
     """
 
     name: Name

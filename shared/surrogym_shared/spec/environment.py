@@ -1,4 +1,4 @@
-"""Specification of a whole environment, and the check for contradictions."""
+"""Specification of an original environment, and checks that its parts don't contradict each other."""
 
 from __future__ import annotations
 
@@ -22,7 +22,8 @@ Access = Literal["any", "snapshot", "reset"]
 
 
 def _require_setting(value: object) -> object:
-    """Raise ``ValueError`` if a setting has none of the allowed types. Pydantic's error would name only one of them."""
+    """Return a setting. Raise ``ValueError`` if it has none of the allowed types, of which pydantic's error would name
+    only one."""
     allowed = isinstance(value, bool | int | str) or (isinstance(value, float) and math.isfinite(value))
     require(allowed, f"expected a finite number, true, false or a text, got {str(value)[:SHOWN]}")
     return value
@@ -54,23 +55,25 @@ class Design(Frozen):
     ``budget``: number of real steps of the design, with the initial ones. With 0 the design takes no real steps, and
     the model is learned from a log.
 
-    ``initial``: number of these steps that form a Latin hypercube, before the first model.
+    ``initial``: number of real steps before the first model. Their queries form a Latin hypercube.
 
-    ``acquisition``: criterion that chooses the other queries, by name or with settings. ``integrated_variance``, the
-    default, takes the query that lowers the variance most, averaged over the sampling range and over states that
-    policies visited. ``variance`` takes the query with the largest standard deviation. ``uncertainty_index`` is the
-    criterion of the paper (eq. 12). ``latin_hypercube`` takes the whole budget as one hypercube, whatever ``initial``
-    is; steps beyond the budget go to the largest gaps. A package on the server may add others.
+    ``acquisition``: criterion that chooses the queries after the initial ones, by name or with settings.
+    ``integrated_variance``, the default, takes the query that lowers the variance most, averaged over the sampling
+    range and over states that policies visited. ``variance`` takes the query with the largest standard deviation.
+    ``uncertainty_index`` is the criterion of the paper (eq. 12). ``latin_hypercube`` takes the whole budget as one
+    Latin hypercube, whatever ``initial`` is; if the budget is raised later, further steps go to the largest gaps. A
+    package on the server may add others.
 
     ``model``: family of models. ``gaussian_process`` is the default. ``sparse_gaussian_process``, the same with the
-    setting ``inducing`` of 300, is for thousands of steps. ``ensemble`` is of neural networks. A package on the server
-    may add others.
+    setting ``inducing`` of 300, is for thousands of steps. ``ensemble`` is an ensemble of neural networks. A package on
+    the server may add others.
 
-    ``tolerance``: numerator of eq. 9 for outputs without a declared tolerance. ``relative`` is 5 % of the output's
+    ``tolerance``: error of an output that does not matter (numerator of eq. 9), for outputs without a declared
+    tolerance. ``relative`` is 5 % of the output's
     standard deviation over the initial design, ``raw`` is 1 in the output's own unit, as published.
 
-    ``symmetry``: ``auto`` tests whether the environment is its own mirror image, with the signs of all coordinates and
-    the action changed; ``none`` does not. Preset ``paper`` never does.
+    ``symmetry``: ``auto`` tests whether the environment is its own mirror image: whether all changes have the opposite
+    sign if all coordinates and the action have. ``none``, and the preset ``paper``, don't test this.
 
     ``monte_carlo``: number of points that estimate the confidence index (eq. 8).
     """
@@ -92,7 +95,10 @@ class EnvironmentSpec(Frozen):
     queries."""
 
     environment: str = Field(
-        default="", max_length=256, pattern=VISIBLE, description="Gymnasium id, or free text for one's own"
+        default="",
+        max_length=256,
+        pattern=VISIBLE,
+        description="name of the environment, such as a Gymnasium id or ``module:Class``, or a text that describes it",
     )
     coordinates: tuple[Coordinate, ...] = Field(min_length=1, max_length=MAX_DIMENSIONS)
     observation: tuple[ObservationEntry, ...] = Field(min_length=1, max_length=MAX_DIMENSIONS)
@@ -101,36 +107,41 @@ class EnvironmentSpec(Frozen):
     starts: tuple[tuple[Number, ...], ...] = Field(
         default=(),
         max_length=MAX_STARTS,
-        description="states that episodes start at, each as likely, in the place of ``start``; a log's, as a rule",
+        description="states (C,) at which episodes start, all equally likely, instead of ``start``; used for logs as a "
+        "rule",
     )
     termination: Termination = ()
     time_limit: Annotated[int, Field(ge=1, le=10_000_000, strict=True)] | None = None
     sampling_period: Positive | None = Field(
-        default=None, description="seconds from one step to the next; None: nobody declared it"
+        default=None, description="seconds from one step to the next; None: unknown"
     )
     outside_reward: Number | None = Field(
         default=None,
-        description="ends a virtual episode that leaves the sampling ranges, or what a session trusts, and pays this "
-        "for each step up to the time limit that it lacks then; None: it goes on",
+        description="if given, a virtual episode ends where it leaves the sampling ranges, or where the session's "
+        "model is too uncertain (``trust``), and this reward is paid for each step that is then missing up to the time "
+        "limit; None: the episode continues",
     )
     limits: Limits | None = Field(
-        default=None, description="what the machine must keep at every step, and how it falls back"
+        default=None,
+        description="ranges that the state must not leave, and the action that a fallback takes near their ends",
     )
     query: Literal["step", "rollout"] = Field(
         default="step",
-        description="``step``: it can be set to any state; ``rollout``: it can only be reset, and acted on from there",
+        description="``step``: the environment can be set to any state, and a query is one step from a state; "
+        "``rollout``: it can't, and a query is an action sequence from a reset or a saved state",
     )
     snapshots: StrictBool = Field(
         default=False,
-        description="with query ``rollout``: it can also return to any state that it was in and that was saved",
+        description="with query ``rollout``: whether the environment can save a state that it is in, and return to it",
     )
     max_rollout: Annotated[int, Field(ge=1, le=MAX_ROLLOUT_QUERY, strict=True)] | None = Field(
-        default=None, description="longest action sequence of one query; None: the time limit, 200 at most"
+        default=None, description="largest number of actions of one query; None: the time limit, but at most 200"
     )
     reward: AnyReward = Reward()
     tolerances: dict[Name, Positive] = Field(
         default_factory=dict,
-        description="by moving coordinate (preset paper: by observation entry), or 'reward', in the output's own unit",
+        description="error that does not matter, in the output's unit, by moving coordinate (preset paper: by "
+        "observation entry) or 'reward'",
     )
     success: Success | None = None
     design: Design = Design()
@@ -141,7 +152,7 @@ class EnvironmentSpec(Frozen):
 
     @property
     def termination_groups(self) -> tuple[AllOf, ...]:
-        """Groups of inequalities that declare terminations; empty if termination is learned."""
+        """Groups of inequalities: an episode terminates when all of a group hold. Empty if termination is learned."""
         return () if self.termination == "learned" else self.termination
 
     @property
@@ -157,7 +168,8 @@ class EnvironmentSpec(Frozen):
 
     @property
     def unknown_steps(self) -> int:
-        """Number of an episode's first steps that a model does not learn from, as lags (past values) are unknown."""
+        """Number of first steps of an episode from which a model does not learn, because lags (past values) are
+        unknown."""
         return max(c.counted for c in self.coordinates)
 
     @property
@@ -239,7 +251,8 @@ class EnvironmentSpec(Frozen):
         return self
 
     def _require_lags(self) -> None:
-        """Check that each lag repeats a known value, is shorter than an episode, and that queries are rollouts."""
+        """Check that each lag (past value) repeats a known value, that it looks back less far than an episode, and that
+        queries are rollouts if there are lags."""
         earlier: dict[str, Coordinate] = {}
         age = dict.fromkeys(self.coordinate_names, 0)
         longest = min((limit for limit in (self.time_limit, self.max_rollout) if limit is not None), default=math.inf)

@@ -27,9 +27,9 @@ def with_history(
 
     Args:
         spec: specification whose coordinates can all be measured in the environment, with queries of kind ``rollout``.
-        changes: number of earlier changes of each moving coordinate, such as 1 for a hidden speed.
-        actions: number of earlier actions. An action that takes effect after a dead time of three steps needs three,
-            and one more if the plant is sampled with a zero-order hold and has a lag of its own.
+        changes: number of earlier changes of each moving coordinate to add, such as 1 for a hidden speed.
+        actions: number of earlier actions to add. An action that takes effect after a dead time of three steps needs
+            three, and one more if the plant is sampled with a zero-order hold and has a lag of its own.
         largest: largest change of each moving coordinate in one step, in its unit; needed for ``changes``.
         at_start: largest change of a coordinate in the step before a reset, if the environment may move at a reset.
             This change is unknown, so a model does not learn from the first steps of each episode.
@@ -109,7 +109,7 @@ def _counter(steps: int) -> Coordinate:
 
 
 def _at_rest(lag: Coordinate) -> float:
-    """Return the value of a lag before the first step: no change, and the action closest to 0."""
+    """Return the value of a lag at the start of an episode: 0 for a change, the action closest to 0 for an action."""
     if lag.name == COUNTER:
         return lag.settable[1]
     low, high = lag.settable

@@ -1,4 +1,4 @@
-"""Reward, learned or declared, and the criterion for a successful episode."""
+"""Reward of a specification, learned or declared, and the criteria for a successful episode."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ class Reward(Frozen):
     ``timing``: the state that the reward depends on. ``before`` is (q, u), as in Gymnasium's Pendulum; ``after`` is
     (q', u), as in the paper; ``auto`` chooses at each fit the timing that the data favour.
 
-    ``penalty``: k of eq. 14, reward = mean - k * deviation. None takes the value of the preset (default 0, paper 3).
+    ``penalty``: k of eq. 14, where a virtual reward is mean - k * standard deviation. None takes the value of the
+    preset (0 for ``default``, 3 for ``paper``).
     """
 
     kind: Literal["learned"] = "learned"
@@ -27,7 +28,8 @@ class Reward(Frozen):
 
 
 class Quantity(Frozen):
-    """Quantity of a declared reward: x = term(q) + action . u, where ``action`` has a weight for each entry of u."""
+    """Quantity x of a declared reward, as a function of state q and action u: x = term(q) + action . u, where
+    ``action`` has a weight for each entry of u."""
 
     term: Term | None = None
     action: tuple[Number, ...] = Field(default=(), max_length=MAX_DIMENSIONS)
@@ -44,8 +46,8 @@ class Quantity(Frozen):
 class RewardTerm(Frozen):
     """Term of a declared reward: weight * shape(of) if every inequality in ``when`` holds, else 0.
 
-    ``one``: 1. ``linear``: sum of x. ``absolute``: sum of |x|. ``square``: sum of x^2. ``bump``: exp(-1/2 sum of x^2).
-    ``ball``: 1 where the sum of x^2 is at most 1, else 0.
+    With x the quantities in ``of``, the shapes are ``one``: 1; ``linear``: sum of x; ``absolute``: sum of |x|;
+    ``square``: sum of x^2; ``bump``: exp(-1/2 sum of x^2); ``ball``: 1 where the sum of x^2 is at most 1, else 0.
     """
 
     weight: Number = 1.0
@@ -65,8 +67,8 @@ class RewardTerm(Frozen):
 class DeclaredReward(Frozen):
     """A known reward, the sum of its terms, so that it is not learned. It is data, never evaluated as code.
 
-    ``timing`` chooses the state that the terms depend on. ``terminal`` is added to the reward of a step that ends the
-    episode.
+    ``timing`` says whether the terms depend on the state before or after the step. ``terminal`` is added to the reward
+    of a step that ends the episode in a terminal state.
     """
 
     kind: Literal["declared"]
@@ -87,8 +89,9 @@ AnyReward = Annotated[
 class Success(Frozen):
     """Criteria of a successful evaluation episode. All criteria that are given must hold.
 
-    ``hold``: inequalities that all hold in each of the last ``hold_steps`` steps. ``min_steps``: smallest length of the
-    episode. ``terminated``: whether the episode has to end by termination. ``min_return``: smallest return.
+    ``hold``: inequalities that must all hold in each of the last ``hold_steps`` steps. ``min_steps``: the episode must
+    have at least this many steps. ``terminated``: whether the episode must end in a terminal state. ``min_return``: the
+    return must be at least this.
     """
 
     hold: tuple[Inequality, ...] = Field(default=(), max_length=MAX_INEQUALITIES)

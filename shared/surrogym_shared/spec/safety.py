@@ -16,7 +16,7 @@ class Limit(Frozen):
     """Range of a term of the state that must never be left, such as the angle of an arm between its stops.
 
     ``margin``: distance from ``low`` and ``high``, in the term's unit, within which the fallback acts. It has to be
-    larger than the most by which the term's change in one step can exceed its change in the step before.
+    larger than the largest amount by which the term's change in a step can exceed its change in the previous step.
 
     ``unit``: unit of ``low``, ``high`` and ``margin``. If the term is a single coordinate, it is the coordinate's unit.
     """
@@ -42,12 +42,12 @@ class Limit(Frozen):
 
 
 class Limits(Frozen):
-    """Limits that the sampler, audits and evaluations keep.
+    """Limits that sampler, audits and evaluations keep, and the fallback near them.
 
-    ``fallback``: a term of the state for each entry of the action, such as a constant or a linear feedback. Its value
-    is clipped to the action's range.
+    ``fallback``: for each entry of the action, a term of the state that gives its value near a limit, such as a
+    constant or a linear feedback. The value is clipped to the action's range.
 
-    ``probability``: share of episodes that may leave a limit.
+    ``probability``: largest share of episodes that may leave a limit.
     """
 
     keep: tuple[Limit, ...] = Field(min_length=1, max_length=MAX_INEQUALITIES)

@@ -1,4 +1,4 @@
-"""Terms of the state, and their uses: observations, inequalities and terminations."""
+"""Terms (functions of the state q), and observation entries, inequalities and terminations made of them."""
 
 from __future__ import annotations
 
@@ -12,12 +12,14 @@ from surrogym_shared.spec.base import MAX_INEQUALITIES, MAX_TERM_PARTS, Frozen, 
 
 
 class Part(Frozen):
-    """Summand of a term: coefficient * phi(q), where phi is ``one`` = 1, ``linear`` = a.q, ``sin`` = sin(a.q) or
-    ``cos`` = cos(a.q)."""
+    """Summand of a term of the state q: coefficient * phi(q). phi is 1 for the function ``one``, a.q for ``linear``,
+    sin(a.q) for ``sin``, and cos(a.q) for ``cos``, where a are the ``weights``."""
 
     function: Function
     coefficient: Number = 1.0
-    weights: dict[Name, Number] = Field(default_factory=dict, description="a, by coordinate name")
+    weights: dict[Name, Number] = Field(
+        default_factory=dict, description="weight of each coordinate in a.q, by the coordinate's name"
+    )
 
     @model_validator(mode="after")
     def _weighted(self) -> Self:
@@ -29,7 +31,8 @@ class Part(Frozen):
 
 
 class Term(Frozen):
-    """Sum of parts, optionally clipped to [low, high]. Terms can be added with ``+`` and scaled with ``*``."""
+    """Function of the state: a sum of parts, clipped to [low, high] if these are given. Terms can be added with ``+``
+    and scaled with ``*``."""
 
     parts: tuple[Part, ...] = Field(min_length=1, max_length=MAX_TERM_PARTS)
     low: Number | None = None
@@ -47,7 +50,7 @@ class Term(Frozen):
 
     @classmethod
     def linear(cls, /, **weights: float) -> Term:
-        """Make a linear term of coordinates: ``Term.linear(x=1)`` is the coordinate x."""
+        """Make a weighted sum of coordinates: ``Term.linear(x=1)`` is the coordinate x."""
         return cls(parts=(Part(function="linear", weights=weights),))
 
     @classmethod
@@ -77,7 +80,8 @@ class Term(Frozen):
 
 
 class ObservationEntry(Frozen):
-    """One entry of the observation: its name, the term that computes it, and its limits in the observation space."""
+    """One entry of the observation: its name, the term of the state that computes it, and its ends in the
+    observation space."""
 
     name: Name
     term: Term
@@ -104,5 +108,8 @@ Termination = Annotated[
     Annotated[tuple[AllOf, ...], Field(max_length=MAX_INEQUALITIES), Tag("declared")]
     | Annotated[Literal["learned"], Tag("learned")],
     Discriminator(_termination_kind),
-    Field(description="ends when any of these all-of groups holds at q'; or 'learned' from samples that ended"),
+    Field(
+        description="groups of inequalities: an episode terminates if, after a step, all of any group hold; or "
+        "'learned': the model learns from samples when an episode terminates"
+    ),
 ]

@@ -1,8 +1,9 @@
-"""Request and reply models of every route (JSON form). Unknown fields are refused; numbers must be finite.
+"""Pydantic models of the requests and replies of every HTTP route, in JSON. Unknown fields are refused; numbers must be
+finite.
 
 Shapes: N lanes, D observation entries, C coordinates, F action entries, O model outputs (moving coordinates, reward).
 
-A module is imported when one of its names is first used, so that a client which only steps loads only what steps need.
+Each module here is imported when one of its names is first used, so that a client which only steps loads little.
 """
 
 from __future__ import annotations

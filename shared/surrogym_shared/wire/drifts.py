@@ -1,4 +1,4 @@
-"""Wire model of drift. The thin client does not load this module."""
+"""Wire model of a report of drift: the original environment has changed since its model was learned."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from surrogym_shared.wire.policies import Count, Text
 
 
 class AddDrift(Request):
-    """Report that real steps no longer agree with the model, so that the policy's promised return is not trusted."""
+    """Report that real steps no longer agree with the model, so that the return that a policy's promise predicts is not
+    trusted."""
 
     output: Text = Field(description="name of the output that differs most")
     error: Measured = Field(

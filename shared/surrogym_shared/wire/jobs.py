@@ -116,7 +116,7 @@ class AddJob(Request):
 
 
 class ClaimJob(Request):
-    """Request of a trainer worker for a job, which it holds under a lease."""
+    """Request of a trainer worker to lease the next job that it accepts."""
 
     worker: Key = Field(description="name of the worker, shown to people")
     most_episodes: Annotated[int, Field(ge=0, le=MAX_JOB_EPISODES)] = Field(

@@ -16,7 +16,7 @@ MAX_REJECTED = 1_000  # largest number of rejected rows that a reply lists
 
 
 class SentLog(Request):
-    """Base class of requests with a log."""
+    """Base class of requests that send a log as CSV text."""
 
     text: Annotated[str, Field(min_length=1, max_length=MAX_LOG, description="the log as CSV with a heading")]
     mapping: LogMapping | None = Field(

@@ -1,4 +1,4 @@
-"""Messages about the fitted models of a surrogate: predictions and history."""
+"""Wire models of the fitted models of a surrogate: predictions, virtual episodes and versions."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ class Imagined(Reply):
 
 
 class ModelView(Reply):
-    """A version of a surrogate's model."""
+    """One version of a surrogate's model: its samples, its fidelity and its structure."""
 
     version: int = Field(description="version number; a later model has a higher one")
     created_at: float = Field(description="when the model was stored, in seconds since 1970, by the server's clock")

@@ -42,7 +42,7 @@ class PolicyPromise(BaseModel):
 
 
 class PolicyRangeLeft(BaseModel):
-    """The end of a coordinate's sampling range that a policy's states exceed most often."""
+    """The end of a coordinate's sampling range that the states of a policy exceed most often."""
 
     model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
 
@@ -140,7 +140,8 @@ class AddPolicy(Request):
     @field_validator("card")
     @classmethod
     def _sane(cls, card: PushedCard) -> PushedCard:
-        """Refuse numbers that are not finite or are too large, also in the settings, which may have any structure."""
+        """Return the card. Refuse numbers in it that are not finite or too large, also in the settings, and a promise
+        whose quantiles are not in order."""
         _require_sane("card", card.model_dump(exclude={"spec"}), CARD_DEPTH)
         promises = [card.promise, *((card.audit.before, card.audit.after) if card.audit else ())]
         for promise in [one for one in promises if one is not None]:
@@ -157,8 +158,9 @@ class AddPolicy(Request):
 
 
 def _require_sane(place: str, value: Any, depth: int) -> None:
-    """Raise ``ValueError`` unless a nested value has finite numbers of at most ``MAX_MEASURED``, text without NUL, and
-    at most ``depth`` levels. ``place`` is its name in the message."""
+    """Raise ``ValueError`` unless a value of lists and objects has only finite numbers of at most ``MAX_MEASURED``,
+    text
+    without NUL, and at most ``depth`` nested levels. ``place`` is the value's name in the message."""
     if depth < 0:
         raise ValueError(f"{place}: expected at most {CARD_DEPTH} levels of lists and objects, got more")
     if isinstance(value, dict):

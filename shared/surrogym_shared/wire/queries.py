@@ -29,7 +29,7 @@ ActionSequence = Annotated[list[Vector], Field(min_length=1, max_length=MAX_ROLL
 
 
 class ClaimQueries(Request):
-    """Request of a sampler for queries, which it holds under leases."""
+    """Request of a sampler to lease pending queries."""
 
     sampler: Key = Field(description="name of the sampler, which people see with its queries and samples")
     max_queries: Annotated[int, Field(ge=1, le=MAX_CLAIM)] = Field(
@@ -122,7 +122,7 @@ class FailQuery(Request):
 
 
 class QueryView(Reply):
-    """A query as people see it."""
+    """A query with its status and its leases, for people and for the dashboard."""
 
     id: int = Field(description="id of the query")
     purpose: Purpose = Field(description="why the server requests the real steps")

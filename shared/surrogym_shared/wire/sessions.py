@@ -53,7 +53,7 @@ class Residual(Request):
 class OpenSession(Request):
     """Request to open a session, the virtual environment of one trainer, with its options.
 
-    For ``time_limit`` and ``penalty``, None takes the surrogate's value.
+    If ``time_limit`` or ``penalty`` is null, the value of the surrogate's specification is used.
     """
 
     num_envs: Annotated[int, Field(ge=1, le=MAX_LANES)] = Field(default=1, description="number of lanes, N")
@@ -163,7 +163,7 @@ class OpenSession(Request):
 
 
 class SessionCoordinates(Reply):
-    """Present states of a session's lanes."""
+    """The present state of each lane of a session."""
 
     coordinates: list[list[float]] = Field(
         description="(N, C) state of each lane; the mean of its particles in the variant probabilistic"
@@ -171,7 +171,7 @@ class SessionCoordinates(Reply):
 
 
 class BoxSpace(Reply):
-    """Space of vectors of numbers within limits."""
+    """Space of vectors of real numbers, each within its limits."""
 
     kind: Literal["box"] = "box"
     low: list[float | None] = Field(description="lowest value of each entry; null: no limit")

@@ -64,8 +64,7 @@ class PrequentialScores(Reply):
     Each sample that the design, an audit or a person chose after the first fit is predicted by the latest model that
     has not learned from it. The standard deviation is that for the optimum of the hyperparameters, and includes the
     learned noise. An error within the tolerance counts as inside every interval. The design chooses samples where the
-    model is uncertain, so their errors are not representative. These scores are reported, and no verdict depends on
-    them.
+    model is uncertain, so their errors are not representative. No verdict on the design depends on these scores.
     """
 
     predictions: int = Field(description="number of samples that were predicted")
@@ -171,7 +170,7 @@ class Fidelity(Reply):
 
 
 class Ledger(Reply):
-    """Counts of real steps by purpose.
+    """Counts of a surrogate's real steps by purpose.
 
     ``total`` is the cost of the design: initial + adaptive + manual. It excludes audits, evaluations, and ``logged``
     steps, which were recorded before and don't count towards the budget. ``unresolved`` counts steps that may have been
