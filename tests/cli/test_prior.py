@@ -46,7 +46,7 @@ def test_with_a_calibrated_simulator_prior_the_design_needs_few_real_steps(on_se
     assert not [name for name in others if ".simulator-" in name]
 
 
-def test_a_simulator_that_prints_and_fails_in_some_states_works_as_prior(on_server, server_process, hinge):
+def test_a_simulator_that_prints_and_fails_in_some_states_can_be_used_as_prior(on_server, server_process, hinge):
     with Api(server_process.url) as api:
         PriorCalls(api.connection).wait(hinge)
         sampler = Sampler(api, hinge, Real(), SamplerSettings(until_done=True, wait_seconds=1.0))

@@ -144,7 +144,7 @@ def test_checking_a_controller_uses_the_compiler_in_the_variable_cc(surrogym, tm
 
 
 @NEEDS_C
-def test_deploying_again_into_the_folder_of_the_same_controller_works(surrogym, tmp_path):
+def test_deploying_again_into_the_folder_of_the_same_controller_is_accepted(surrogym, tmp_path):
     path = policy_for(tmp_path, pendulum(), None)
     deploy = ["deploy", str(path), "--target", "c", "--out", "c"]
     check = ["--check", "--episodes", "1", "--env", "Pendulum-v1"]

@@ -102,7 +102,7 @@ def test_observations_terminations_and_rewards_of_a_surrogate_fmu_equal_a_sessio
 
 
 @pytest.mark.parametrize("share", [0.25, 1 / 3, 3.0])
-def test_a_surrogate_fmu_gives_equal_samples_with_other_communication_steps(twin, share):
+def test_a_surrogate_fmu_gives_the_same_states_with_another_communication_step_of_the_importer(twin, share):
     """An input holds from one sampling instant to the next; a change in between waits."""
     with opened(twin) as one, opened(twin) as other:
         one.begin()

@@ -80,7 +80,7 @@ def test_draws_of_a_systematic_error_have_its_mean_and_uncertainty():
     assert not found.expected()[[0, 2]].any()
 
 
-def test_every_draw_gives_a_systematic_error_to_an_output_known_to_be_wrong():
+def test_every_random_draw_of_model_errors_is_nonzero_for_an_output_known_to_be_wrong():
     found, rng = jointly(0, 8, scale=3.0), np.random.default_rng(0)
     wrong = np.array([False, True, False])
     drawn = found.draws(400, rng, wrong)
@@ -95,7 +95,7 @@ def consequence(seed: int, shift: float, cost: float, steps: int = 40) -> Conseq
     return Consequence(found, changes, PROMISE, slack=10.0)
 
 
-def test_a_systematic_error_that_lowers_the_return_is_proven():
+def test_a_systematic_model_error_that_lowers_the_return_counts_as_proven():
     assert consequence(0, shift=1.5, cost=-60.0).proven
 
 

@@ -77,7 +77,7 @@ def test_log_rows_repeated_at_the_same_time_are_set_aside():
         assert plant.wrong(steps, rows, rows[-1:]) == 0
 
 
-def test_a_log_concatenated_with_itself_counts_once():
+def test_a_log_concatenated_with_itself_gives_each_step_once():
     for rng, plant in drawn():
         copies = int(rng.integers(2, 4))
         rows = np.tile(np.arange(len(plant)), copies)
@@ -86,7 +86,7 @@ def test_a_log_concatenated_with_itself_counts_once():
         assert plant.wrong(steps, rows, rows[-1:]) == 0
 
 
-def test_equal_episodes_within_a_log_all_count():
+def test_equal_episodes_within_a_log_all_give_samples():
     """A machine that is reset and does the same writes equal rows, which are not repeats."""
     for rng, plant in drawn():
         length = len(plant)

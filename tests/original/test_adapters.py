@@ -60,7 +60,7 @@ def test_two_simulator_resets_with_one_seed_are_equal(name: str) -> None:
 
 @installed("dm_control")
 @pytest.mark.filterwarnings("ignore")
-def test_a_dm_control_task_steps_like_its_own_environment() -> None:
+def test_a_dm_control_task_gives_the_same_steps_as_dm_control_itself() -> None:
     from dm_control import suite
 
     ours = open_simulator("dm_control:cartpole-swingup")

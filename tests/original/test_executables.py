@@ -192,7 +192,7 @@ def test_a_late_program_reply_is_never_taken_for_the_reply_to_another_request(tm
         plant.close()
 
 
-def test_an_environment_program_ends_if_its_client_is_killed(tmp_path):
+def test_an_environment_program_ends_if_the_process_that_started_it_is_killed(tmp_path):
     name = f"exec:{program(tmp_path, NOTES_ITSELF)}"
     client = f"import time; from surrogym_sampler import original; plant = original.make({name!r}); time.sleep(3600)"
     process = subprocess.Popen([sys.executable, "-c", client])
@@ -217,7 +217,7 @@ def test_the_fallback_of_a_program_with_limits_acts_longer_than_a_step_after_its
     assert (tmp_path / "rests").exists()
 
 
-def test_a_hanging_environment_program_ends_if_its_client_is_killed(tmp_path):
+def test_an_environment_program_that_hangs_ends_if_the_process_that_started_it_is_killed(tmp_path):
     """It reads nothing, so the end of its input says nothing to it, and SIGTERM does not end it."""
     hangs = (HANGS[0], "    open(os.path.dirname(__file__) + '/hangs', 'x')\n" + HANGS[1])
     command = program(tmp_path, NOTES_ITSELF, UNTERMINABLE, hangs)

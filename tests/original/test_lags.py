@@ -162,7 +162,7 @@ def test_a_policy_does_not_observe_the_steps_since_reset():
     assert Moving().spec().observation_names == ("x", "x.change1", "x.change2")
 
 
-def test_the_declared_start_of_an_environment_with_lags_has_known_lags():
+def test_the_declared_start_of_an_environment_with_lags_is_a_state_whose_lags_are_known():
     start = Moving().spec().start
     assert (start["steps since reset"].value, start["x.change2"].high) == (2, 0.05)
 
@@ -194,7 +194,7 @@ def test_a_too_short_snapshot_with_lags_is_refused():
         environment.save()
 
 
-def test_a_machine_gets_the_nearest_action_that_keeps_the_rate_and_the_step_has_it():
+def test_a_machine_gets_and_the_sample_has_the_nearest_action_that_the_rate_of_change_allows():
     rail = RatedRail()
     environment = answering(rail)
     environment.begin(0)
@@ -205,7 +205,7 @@ def test_a_machine_gets_the_nearest_action_that_keeps_the_rate_and_the_step_has_
     assert environment.act(np.array([-1.0])).action == pytest.approx([-0.5]), "a reset forgets the last action"
 
 
-def test_an_environment_that_takes_its_steps_itself_can_not_have_a_rate():
+def test_a_rate_of_action_change_is_refused_for_a_class_that_implements_begin_and_act():
     class Stepping:
         def spec(self):
             return RATED

@@ -84,7 +84,7 @@ def test_a_validation_error_for_a_setting_lists_all_allowed_types(given: object)
     assert said == f"settings.beta: expected a finite number, true, false or a text, got {given}"
 
 
-def test_settings_keep_their_types_when_validated():
+def test_validated_settings_of_a_model_keep_their_types():
     settings = {"a": True, "b": 1, "c": 0.5, "d": "text"}
     assert ModelChoice(name="own", settings=settings).settings == settings
     assert [type(value) for value in ModelChoice(name="own", settings=settings).settings.values()] == [

@@ -118,7 +118,9 @@ def test_a_one_sided_limit_has_infinite_distance_on_the_other_side() -> None:
 
 
 @pytest.mark.parametrize(("episodes", "share"), [(1, 0.02), (7, 0.02), (40, 0.3), (2_000, 0.01), (50, 1.0)])
-def test_limits_are_left_too_often_by_the_exact_binomial_test(episodes: int, share: float) -> None:
+def test_whether_limits_were_left_too_often_is_decided_as_by_the_exact_binomial_test(
+    episodes: int, share: float
+) -> None:
     for left in range(min(episodes, 60) + 1):
         probability = binomtest(left, episodes, share, alternative="greater").pvalue
         for level in (0.01, 0.05):

@@ -22,11 +22,11 @@ def state(last: float) -> np.ndarray:
 @pytest.mark.parametrize(
     ("last", "asked", "kept"), [(0.0, 2.0, 1.0), (0.0, -0.4, -0.4), (1.5, -2.0, 0.5), (-2.0, 2.0, -1.0)]
 )
-def test_an_entry_with_a_rate_changes_by_at_most_rate_times_period_and_others_at_once(last, asked, kept):
+def test_an_action_entry_with_a_rate_changes_by_at_most_rate_times_period_and_others_freely(last, asked, kept):
     np.testing.assert_allclose(within_rates(RATED, state(last), np.array([asked, 9.0])), [kept, 9.0])
 
 
-def test_a_specification_without_rates_leaves_actions_unchanged():
+def test_a_specification_without_rates_of_action_change_leaves_actions_unchanged():
     assert rates(plant(actions=1)) == ()
     np.testing.assert_array_equal(within_rates(plant(), np.zeros(3), np.array([2.0, 9.0])), [2.0, 9.0])
 
@@ -45,11 +45,11 @@ def changed(**fields) -> dict:
     ],
     ids=["no period", "another length", "a rate of 0", "no last action"],
 )
-def test_a_rate_that_can_not_be_kept_is_refused_with_what_it_needs(fields, said):
+def test_a_specification_whose_rate_of_action_change_cannot_be_kept_is_refused_with_the_reason(fields, said):
     with pytest.raises(ValidationError, match=said):
         EnvironmentSpec.model_validate(changed(**fields))
 
 
-def test_a_discrete_action_can_have_no_rate():
+def test_declaring_a_largest_rate_of_change_for_a_discrete_action_is_refused():
     with pytest.raises(ValueError, match="continuous action"):
         plant(DiscreteAction(n=3), actions=1, rate=(1.0,))

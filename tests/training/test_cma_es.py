@@ -98,7 +98,7 @@ def test_unknown_cma_es_hyperparameters_are_refused(surrogate, tmp_path: Path):
         train(surrogate, tmp_path / "policy.zip", small(hyperparameters={"gamma": 0.9}))
 
 
-def test_a_cma_es_training_is_not_prolonged(surrogate, tmp_path: Path):
+def test_a_cma_es_training_is_not_extended_while_the_policy_improves(surrogate, tmp_path: Path):
     with pytest.raises(ValueError, match="can't be prolonged"):
         train(surrogate, tmp_path / "policy.zip", small(prolong=True))
     assert not list(tmp_path.iterdir())

@@ -274,7 +274,7 @@ def test_ctrl_c_before_the_first_rollout_leaves_an_untrained_policy(surrogate, t
     assert load_policy(tmp_path / "policy.zip")(np.zeros((1, 3), np.float32)).shape == (1, 1)
 
 
-def test_a_training_without_given_steps_is_prolonged_except_with_preset_paper():
+def test_a_training_without_given_steps_may_be_extended_except_with_preset_paper():
     default, paper = pendulum(), make("Pendulum-v1", preset="paper").spec()
     assert prolongs(TrainSettings(), default)
     assert not prolongs(TrainSettings(total_steps=1_000), default)
@@ -297,7 +297,7 @@ def test_with_option_anew_the_saved_policy_is_kept_if_a_new_network_earns_less(
     assert (distance(one, two) == 0) is (earned < 100)
 
 
-def test_stable_baselines3_ppo_refuses_to_be_prolonged(surrogate):
+def test_stable_baselines3_ppo_refuses_the_setting_prolong(surrogate):
     with pytest.raises(ValueError, match="PPO trains for a fixed number of steps"):
         search_for(small(prolong=True))
 

@@ -35,7 +35,7 @@ def test_a_refusal_exception_contains_its_detail_and_can_be_pickled(code: Code):
 
 
 @pytest.mark.parametrize("cls", [errors.ServerUnreachable, errors.RequestTimeout, errors.ProtocolMismatch])
-def test_the_other_client_exceptions_can_be_pickled(cls: type[Exception]):
+def test_client_exceptions_that_are_no_server_refusals_can_be_pickled(cls: type[Exception]):
     again = pickle.loads(pickle.dumps(cls("why")))
     assert type(again) is cls
     assert str(again) == "why"

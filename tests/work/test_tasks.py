@@ -18,7 +18,7 @@ def test_a_training_job_without_options_trains_like_the_train_command():
     assert (settings.seed, settings.tracker, settings.hyperparameters) == (7, None, {})
 
 
-def test_a_quick_training_job_takes_fewer_steps_and_is_never_prolonged():
+def test_a_quick_training_job_takes_fewer_steps_and_is_never_extended():
     settings = settings_of(wire.TrainTask(kind="train", algorithm="cmaes", preset="quick"), pendulum())
     assert settings.total_steps == SEARCHES.get("CMAES").suggested_steps // QUICK
     assert settings.prolong is False

@@ -88,7 +88,9 @@ def test_a_body_over_the_size_limit_of_its_route_is_refused(client: httpx.Client
     ],
     ids=["duplicate key", "nested", "zipped", "fields"],
 )
-def test_unusual_json_is_refused_with_an_explanation(client: httpx.Client, content: bytes, said: str):
+def test_json_with_repeated_keys_deep_nesting_or_too_many_fields_is_refused_with_the_reason(
+    client: httpx.Client, content: bytes, said: str
+):
     for path in ("/v1/surrogates/none/queries:claim", "/v1/sessions/none/step"):
         reply = client.post(path, content=content, headers={"content-type": JSON})
         assert (reply.status_code, problem(reply).code) == (422, Code.INVALID_REQUEST)

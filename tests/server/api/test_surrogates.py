@@ -111,7 +111,7 @@ def test_raising_the_budget_restarts_a_finished_design(client: httpx.Client, nam
     assert pendulum.finish(client, name)["samples"] == 7
 
 
-def test_a_changed_tolerance_has_a_finished_design_judged_again(client: httpx.Client, name: str):
+def test_after_a_change_of_tolerance_the_server_judges_a_finished_design_again(client: httpx.Client, name: str):
     pendulum.teach(client, name, budget=5)
     changed = client.patch(f"/v1/surrogates/{name}", json={"tolerances": {"theta_dot": 0.25}, "budget": 6})
     assert changed.raise_for_status().json()["tolerances"] == {"theta_dot": 0.25}

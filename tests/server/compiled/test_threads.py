@@ -19,7 +19,7 @@ def test_threads_compute_each_row_once_in_whole_blocks(rows, threads):
     assert len(done) <= min(threads, -(-rows // 32))
 
 
-def test_the_calling_thread_computes_rows_too():
+def test_the_calling_thread_computes_rows_of_a_batch_too():
     names: list[str] = []
     side_by_side(lambda _: names.append(threading.current_thread().name), 128, 32, 4)
     assert len(names) == 4

@@ -28,7 +28,7 @@ def test_one_dimensional_actions_may_be_given_as_a_flat_array():
     np.testing.assert_array_equal(policy_actions(DISCRETE, np.array([2, 0]), 2), [[2.0], [0.0]])
 
 
-def test_discrete_actions_pass_unchanged():
+def test_valid_discrete_actions_of_policies_and_samples_are_not_changed():
     np.testing.assert_array_equal(policy_actions(SEVERAL, np.array([[2, 1], [0, 0]]), 2), [[2, 1], [0, 0]])
     np.testing.assert_array_equal(model_actions(SEVERAL, np.array([[2.0, 1.0]])), [[2, 1]])
 

@@ -120,7 +120,7 @@ def test_odd_processes_are_pooled_only_if_matched_inputs_mirror_alike():
     assert pools([known, replace(other, signs=None, **unread)], most=4) == []
 
 
-def test_pooled_odd_processes_are_centred_at_zero():
+def test_pooled_processes_of_odd_functions_have_mean_zero():
     """A part that was standardised around its average sees the pool around 0, where an odd function is 0."""
     turned = -torch.ones(5, dtype=torch.float64)
     known, plain = odd((0, 3), 0, turned), odd((4, 1), 1, turned)

@@ -97,7 +97,7 @@ def test_choosing_a_batch_of_queries_equals_choosing_them_one_by_one(model, cand
     assert len(set(batch)) == 3
 
 
-def test_queries_already_asked_are_not_chosen_again(model, candidates):
+def test_the_design_chooses_no_query_that_was_already_asked(model, candidates):
     points = candidates.points
     all_but_two = points[: len(points) - 2]
     assert set(choose(model, candidates, all_but_two, points[:0], [0, 1, 2, 0, 1], TOLERANCES)) == {58, 59}

@@ -113,7 +113,7 @@ def test_a_fit_can_be_committed_although_the_clock_was_set_back_meanwhile(
     assert storage.designs.commit(lease, design()) == 1
 
 
-def test_a_sample_is_kept_as_late_if_the_clock_was_set_forward(
+def test_a_sample_is_stored_as_late_if_the_clock_was_set_forward(
     storage: Storage, make: Callable[..., str], answer: Callable[..., NewSample], set_clock_back: SetBack
 ) -> None:
     name = make(queries=1)

@@ -61,7 +61,7 @@ def test_visited_states_are_stored_with_their_design_round(
     assert (found.round, found.states.shape) == (1, (0, 2))
 
 
-def test_saved_sessions_are_deleted_from_storage_when_they_are_taken(storage: Storage) -> None:
+def test_saved_sessions_are_deleted_from_storage_when_a_server_restores_them(storage: Storage) -> None:
     storage.sessions.save([])
     storage.sessions.save([SavedSession("s", "p", b"old"), SavedSession("t", "p", b"\0\xff")])
     storage.sessions.save([SavedSession("s", "p", b"new")])

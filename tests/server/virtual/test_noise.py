@@ -89,6 +89,6 @@ def test_changing_high_bits_of_the_seed_changes_the_noise(lanes):
     assert not torch.isclose(one, other).any()
 
 
-def test_noise_for_different_purposes_shares_no_number(lanes):
+def test_random_numbers_for_different_purposes_are_never_the_same(lanes):
     draws = [uniform_noise(lanes, purpose, 4) for purpose in Purpose]
     assert len(torch.stack(draws).unique()) == 4 * 8 * len(Purpose)

@@ -130,7 +130,7 @@ def test_the_pathwise_reward_follows_a_drawn_function(model, started):
     np.testing.assert_array_equal(transition.reward, transition.reward_mean)
 
 
-def test_without_drawn_functions_pathwise_errors_stay_constant_within_an_episode(started):
+def test_if_a_model_has_no_drawn_functions_pathwise_episodes_have_one_constant_error_each(started):
     """Each lane lies the same number of deviations from the mean at every step, another in each episode."""
     exact = exact_pendulum()
     model = ExactModel(exact.definition, lambda q, _: q.clone(), exact.pay, std=0.01)

@@ -38,7 +38,7 @@ def kept(asked: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("form", [lambda settings, _: settings, in_fastest_form], ids=["torch", "fastest"])
 @pytest.mark.parametrize("variant", ["deterministic", "pathwise", "probabilistic"])
-def test_virtual_steps_under_any_action_equal_those_under_the_nearest_that_keeps_the_rate(model, form, variant):
+def test_virtual_steps_replace_an_action_that_changes_too_fast_by_the_nearest_allowed_one(model, form, variant):
     settings = form(VirtualSettings(LANES, variant=variant), model)
     lanes, _ = reset(model.definition, settings, create(model.definition, settings, 0))
     free = rated = lanes
@@ -51,7 +51,7 @@ def test_virtual_steps_under_any_action_equal_those_under_the_nearest_that_keeps
     assert (kept(ASKED) != ASKED).any(), "the rate changes some of the actions"
 
 
-def test_a_planned_rollout_predicts_the_actions_that_the_machine_will_take(model):
+def test_a_planned_rollout_has_the_actions_that_the_rate_of_change_allows(model):
     starts = torch.zeros(LANES, len(model.definition.coordinates), dtype=torch.float64)
     asked = torch.from_numpy(ASKED.transpose(1, 0, 2).copy())
     planned = predict_paths(model, starts, asked).u.numpy().transpose(1, 0, 2)

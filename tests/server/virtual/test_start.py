@@ -34,7 +34,7 @@ def test_one_seed_gives_each_environment_its_own_noise_key(definition):
     assert len(np.unique(five[0][:, 0])) == 5
 
 
-def test_an_environment_with_its_own_seed_starts_as_if_alone(definition):
+def test_an_environment_with_its_own_seed_starts_as_in_a_session_of_its_own(definition):
     listed = starts(definition, 3, seed=[7, 8, 7])[0]
     for lane, seed in enumerate([7, 8, 7]):
         np.testing.assert_array_equal(listed[lane], starts(definition, 1, seed=seed)[0][0])

@@ -81,7 +81,7 @@ def test_each_shape_of_a_declared_reward_term_has_its_value():
 
 
 @pytest.mark.parametrize("actions", [1, 2])
-def test_a_state_threshold_reward_works_with_any_number_of_actions(actions: int):
+def test_a_declared_reward_of_a_state_threshold_does_not_depend_on_the_number_of_actions(actions: int):
     """A reward of two values that was found has conditions, and no quantity whose weights name the actions."""
     fast = Inequality(term=Term.linear(speed=1), relation=">=", value=1.0)
     spec = paying(RewardTerm(shape="one", when=(fast,)))

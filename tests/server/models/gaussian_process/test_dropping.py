@@ -102,7 +102,7 @@ def test_preset_paper_drops_no_inputs():
     assert not any(output.feature_map.dropped for output in learned.outputs)
 
 
-def test_predictions_with_dropped_inputs_equal_those_of_the_processes(model, points):
+def test_a_model_with_dropped_inputs_predicts_the_posteriors_of_its_gaussian_processes(model, points):
     check_processes(model, points)
 
 
@@ -121,7 +121,7 @@ def test_drawn_functions_with_uncertain_hyperparameters_ignore_dropped_inputs(mo
     torch.testing.assert_close(functions.transition_along(paths, q, u).q_next[:, 3], before)
 
 
-def test_dropped_inputs_survive_storage(model, points):
+def test_a_stored_model_keeps_which_inputs_each_output_drops(model, points):
     loaded = from_bytes(ROW, to_bytes(model))
     assert isinstance(loaded, GaussianProcessModel)
     assert [o.feature_map for o in loaded.outputs] == [o.feature_map for o in model.outputs]

@@ -55,7 +55,7 @@ def test_an_angle_that_depends_only_on_the_next_speed_is_recognised_after_six_st
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_an_even_reward_is_recognised_as_even(pendulum_definition, seed):
+def test_a_reward_that_is_an_even_function_of_the_state_is_recognised_as_even(pendulum_definition, seed):
     assert learn(pendulum_definition, random_steps(pendulum(), 12, seed=seed)).model.reward.feature_map.parity == "even"
 
 

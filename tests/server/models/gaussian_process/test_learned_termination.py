@@ -70,7 +70,7 @@ def test_states_outside_the_range_of_the_samples_count_as_unexplored(model):
     assert unexplored(model.definition, seen[:0], at).tolist() == [1, 1, 1]
 
 
-def test_predicted_points_use_the_learned_termination(model):
+def test_the_predictions_for_requested_points_use_the_learned_termination(model):
     q = torch.tensor([[0, 0, 0.2, 3.0], [0, 0, 0, 0]], dtype=torch.float64)
     assert predict_points(model, q.numpy(), torch.ones(2, 1).double().numpy()).terminated.tolist() == [True, False]
 

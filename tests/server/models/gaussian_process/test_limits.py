@@ -108,7 +108,7 @@ def test_without_samples_at_a_limit_the_model_treats_all_samples_alike():
     assert not any(output.past_limits for output in gaussian_processes(RELIEVED, below).transitions)
 
 
-def test_samples_at_an_outputs_own_limit_or_a_wall_are_left_out():
+def test_samples_at_an_outputs_own_limit_or_a_wall_are_not_used_to_learn_that_output():
     at_valve = torch.tensor([[0.0, VALVE], [0.0, 0.0]], dtype=torch.float64)
     assert stopped(RELIEVED, 1, at_valve).tolist() == [True, False]
     assert stopped(RELIEVED, 0, at_valve).tolist() == [False, False]

@@ -129,7 +129,7 @@ def test_the_reward_is_predicted_from_the_state_before_or_after_the_step_by_its_
     assert model.transition(q, u).reward_std is None
 
 
-def test_predicted_points_contain_next_state_observation_reward_and_termination(pendulum_model, cartpole_model):
+def test_the_predictions_for_requested_points_contain_next_state_reward_and_termination(pendulum_model, cartpole_model):
     points = predict_points(
         cartpole_model, torch.tensor([[2.39, 3.0, 0, 0]]).double().numpy(), torch.ones(1, 1).numpy()
     )

@@ -87,7 +87,7 @@ def test_small_changes_are_predicted_better_by_a_nonstationary_process(model):
     assert amount_error(model, steps(400, 9)) < 0.5 * amount_error(without, steps(400, 9))
 
 
-def test_predictions_of_a_model_with_nonstationary_processes_equal_those_of_the_processes(model, points):
+def test_a_model_with_nonstationary_processes_predicts_their_posteriors(model, points):
     check_processes(model, points)
 
 

@@ -116,7 +116,7 @@ def test_the_number_of_samples_an_output_takes_from_others_is_limited(monkeypatc
     assert max(len(output.posterior.y) for output in model.transitions) == 40
 
 
-def test_predictions_with_shared_samples_equal_those_of_the_processes(model, points):
+def test_a_model_with_shared_samples_predicts_the_posteriors_of_its_gaussian_processes(model, points):
     check_processes(model, points)
 
 
@@ -125,7 +125,7 @@ def test_compiled_steps_with_shared_samples_equal_the_model(model, points, how):
     check_compiled(model, points, how)
 
 
-def test_sample_sharing_survives_storage(model, points):
+def test_a_stored_model_keeps_which_outputs_share_samples(model, points):
     loaded = from_bytes(ROW, to_bytes(model))
     assert isinstance(loaded, GaussianProcessModel)
     assert [o.shared for o in loaded.outputs] == [o.shared for o in model.outputs]
