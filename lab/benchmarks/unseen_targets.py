@@ -14,7 +14,7 @@ from cmaes import SepCMA
 from surrogym_lab.tasks import UNSEEN
 from surrogym_lab.unseen.machine import Machine
 from surrogym_lab.unseen.tasks import ResetOnly
-from surrogym_sampler.original.loading import load_factory
+from surrogym_sampler.original.factories import load_factory
 from surrogym_shared.network import Network
 from surrogym_shared.terms import observe
 

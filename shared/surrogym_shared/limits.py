@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from surrogym_shared.checks import require, require_known, require_unique
 from surrogym_shared.spec import BoxAction, DiscreteAction, EnvironmentSpec, limits
-from surrogym_shared.spec.safety import Limit, Limits
+from surrogym_shared.spec.safety import Limit, Limits, NamedFallback
 from surrogym_shared.terms import evaluate
 
 Array = NDArray[np.float64]
@@ -73,9 +73,15 @@ def is_near(margin: Array, now: Array, before: Array) -> Bools:
 
 def fallback_action(spec: EnvironmentSpec, coordinates: Array) -> Array:
     """Return the action (F,) that the fallback takes at coordinates (C,)."""
-    values = [float(evaluate(spec, term, coordinates[None])[0]) for term in limits_of(spec).fallback]
+    terms = limits_of(spec).fallback
+    assert not isinstance(terms, NamedFallback)  # a program at the machine, which is not called here
+    return clipped_action(spec, [float(evaluate(spec, term, coordinates[None])[0]) for term in terms])
+
+
+def clipped_action(spec: EnvironmentSpec, action: ArrayLike) -> Array:
+    """Return an action (F,), clipped to its range."""
     low, high = np.array(_action_ranges(spec)).T
-    return np.asarray(np.clip(values, low, high))
+    return np.asarray(np.clip(action, low, high), dtype=np.float64)
 
 
 def nearest(spec: EnvironmentSpec, coordinates: Array) -> tuple[Limit, float]:
@@ -188,6 +194,8 @@ def _check_pairs(declared: Limits) -> None:
 
 
 def _check_fallback(spec: EnvironmentSpec, declared: Limits) -> None:
+    if isinstance(declared.fallback, NamedFallback):
+        return
     size = spec.action.size
     require(
         len(declared.fallback) == size,

@@ -11,7 +11,8 @@ from typing import Any
 import pytest
 import typer
 
-from support.limited import SPEC
+from support.controllers import network
+from support.limited import SPEC, NamedCart
 from support.programs import FALLS_BACK, KEEPS_LIMITS, program
 from surrogym.cli import sample
 from surrogym_shared.wire import Query
@@ -125,6 +126,25 @@ def test_a_sampler_whose_rollouts_leave_a_limit_more_often_than_allowed_ends_bef
     assert (view["ledger"]["unresolved"], view["queries"]["leased"]) == (0, 0)
     assert view["queries"]["answered"] == int(stopped[2])
     assert view["queries"]["pending"] > 0
+
+
+def test_sampling_and_evaluating_with_a_named_fallback_need_its_program(
+    on_server: Any, name: str, tmp_path: Path
+) -> None:
+    named, program_of = ("--env", "support.limited:NamedCart"), ("--fallback", "brake=support.limited:brake")
+    assert on_server("register", name, *named).code == 0
+    (tmp_path / "policy").mkdir()
+    policy = str(network(tmp_path / "policy", NamedCart().spec(), (4,)))
+    for command in (("sample", name, *named, "--max-queries", "1"), ("evaluate", policy, *named, "--episodes", "2")):
+        refused = on_server(*command)
+        assert refused.code != 0
+        assert "the limits name the fallback 'brake': expected --fallback brake=package.module:function" in refused.err
+    assert json.loads(on_server("status", name, "--json").out)["ledger"]["total"] == 0
+    assert on_server("sample", name, *named, *program_of, "--max-queries", "1").code == 0
+    assert "the fallback acted" in on_server("evaluate", policy, *named, *program_of, "--episodes", "2").out
+    deployed = on_server("deploy", policy, "--target", "c", "--out", str(tmp_path / "c"))
+    assert deployed.code != 0
+    assert "expected a fallback of terms, got the program 'brake'" in deployed.err
 
 
 def test_the_status_command_shows_how_many_real_steps_were_beyond_each_limit(on_server: Any, cart: str) -> None:

@@ -14,11 +14,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from support.limited import DIARY, RAIL, SPEC, Cart, PatientCart, SlowCart, with_limits
+from support.limited import DIARY, RAIL, SPEC, Cart, FreeCart, NamedCart, PatientCart, SlowCart, with_limits
 from support.noting import until
 from surrogym_sampler.original.episodes import open_episode
-from surrogym_sampler.original.errors import StepFailed, StepRefused
+from surrogym_sampler.original.errors import StepFailed, StepRefused, UnknownEnvironment
 from surrogym_sampler.original.isolated import IsolatedEnvironment
+from surrogym_sampler.original.limits.guard import Guard
 from surrogym_sampler.original.limits.queries import GuardedRollouts, GuardedSteps
 from surrogym_sampler.original.protocol import RealStep
 from surrogym_sampler.original.rollouts import answering, keeping_limits
@@ -291,6 +292,51 @@ def test_an_isolated_environment_keeps_its_declared_limits() -> None:
     assert not past(SPEC, np.array(reached)).any()
 
 
+def test_a_fallback_by_the_name_of_a_program_acts_as_the_same_fallback_of_terms() -> None:
+    reached = {}
+    for made, fallback in ((PatientCart, None), (NamedCart, "brake=support.limited:brake")):
+        with IsolatedEnvironment(made, fallback=fallback) as environment:
+            environment.begin(0)
+            reached[made] = [environment.act(RIGHT).next_coordinates for _ in range(30)]
+    np.testing.assert_allclose(reached[NamedCart], reached[PatientCart])
+    episode = open_episode("cart:Cart", None, NamedCart, "brake=support.limited:brake")
+    episode.reset(0)
+    assert any(episode.step(RIGHT).fell_back for _ in range(30))
+
+
+@pytest.mark.parametrize(
+    ("made", "fallback", "said"),
+    [
+        (NamedCart, None, "expected --fallback brake=package.module:function, got none"),
+        (NamedCart, "stop=support.limited:brake", "expected --fallback brake=package.module:function, got stop="),
+        (NamedCart, "brake=support.limited:DIARY", "to be callable, got a str"),
+        (NamedCart, "brake=support.limited:parking", "has no attribute 'parking'"),
+        (NamedCart, "brake", "expected package.module:factory, got ''"),
+        (PatientCart, "brake=support.limited:brake", "expected limits that name a fallback"),
+        (FreeCart, "brake=support.limited:brake", "expected limits that name a fallback"),
+    ],
+)
+def test_a_named_fallback_without_its_program_is_refused_before_the_first_step(
+    diary: Path, made: type[Cart], fallback: str | None, said: str
+) -> None:
+    with pytest.raises(UnknownEnvironment, match=said), IsolatedEnvironment(made, fallback=fallback) as environment:
+        environment.begin(0)
+    with pytest.raises(UnknownEnvironment, match=said):
+        keeping_limits(answering(made()), fallback)
+    with pytest.raises(UnknownEnvironment, match=said):
+        open_episode("cart:Cart", None, made, fallback)
+    assert set(diary.read_text().splitlines()) == {"close"}
+
+
+def test_the_action_of_a_fallback_program_is_clipped_and_has_to_have_the_actions_size() -> None:
+    guard = Guard(NamedCart().spec(), lambda coordinates: 1e3 * coordinates[:1])
+    guard.begin(np.array([-2.0, 0.0]))
+    assert guard.choose(RIGHT)[0] == -1.0
+    for wrong in ([0.0, 0.0], [np.nan]):
+        with pytest.raises(StepFailed, match="expected 1 finite numbers from the fallback's program"):
+            Guard(NamedCart().spec(), lambda _, wrong=wrong: wrong).fallback()
+
+
 def test_setting_a_state_within_the_margin_of_a_limit_is_refused() -> None:
     class Settable:
         def spec(self):
@@ -315,5 +361,5 @@ def test_an_episode_step_reports_if_the_safety_fallback_replaced_its_action() ->
     moments = [episode.step(RIGHT) for _ in range(30)]
     episode.close()
     assert not past(SPEC, np.array([moment.coordinates for moment in moments])).any()
-    assert any(moment.fallback is not None for moment in moments)
-    assert moments[0].fallback is None
+    assert any(moment.fell_back for moment in moments)
+    assert not moments[0].fell_back

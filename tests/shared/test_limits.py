@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
 import numpy as np
@@ -125,3 +126,16 @@ def test_whether_limits_were_left_too_often_is_decided_as_by_the_exact_binomial_
         probability = binomtest(left, episodes, share, alternative="greater").pvalue
         for level in (0.01, 0.05):
             assert left_too_often(left, episodes, share, level) == (probability < level)
+
+
+def test_a_fallback_may_be_the_name_of_a_program_and_nothing_else() -> None:
+    named = {
+        **SPEC.model_dump(mode="json"),
+        "limits": {**LIMITS.model_dump(mode="json"), "fallback": {"name": "brake"}},
+    }
+    spec = EnvironmentSpec.model_validate_json(json.dumps(named))
+    assert spec.limits is not None
+    assert spec.limits.model_dump(mode="json")["fallback"] == {"name": "brake"}
+    for wrong in ({"name": "a b; c"}, {"name": "brake", "program": "os:abort"}, {}, []):
+        with pytest.raises(ValidationError):
+            EnvironmentSpec.model_validate({**named, "limits": {**named["limits"], "fallback": wrong}})

@@ -19,6 +19,7 @@ from surrogym_shared.spec import (
     Term,
     Uniform,
 )
+from surrogym_shared.spec.safety import NamedFallback
 
 DIARY = "CART_DIARY"  # environment variable: the file that each action is noted in
 BRAKING = 0.3  # seconds of the present speed within which the fallback stops the cart
@@ -106,6 +107,19 @@ class LeavingCart(PatientCart):
 
     def step(self, action):
         return super().step(4 * np.asarray(action))
+
+
+def brake(coordinates):
+    """What the fallback of the other carts does, as a program."""
+    x, v = coordinates
+    return [-0.5 * x - 1.6 * v]
+
+
+class NamedCart(PatientCart):
+    """A cart whose limits name their fallback."""
+
+    def __init__(self) -> None:
+        super().__init__(with_limits(Limits(keep=(RAIL,), fallback=NamedFallback(name="brake"))))
 
 
 class FreeCart(Cart):

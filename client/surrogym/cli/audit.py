@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from surrogym.cli.groups import Output, PolicyReading, Service, add
-from surrogym.cli.options import SpecFile, read_spec
+from surrogym.cli.options import FallbackProgram, SpecFile, read_spec
 from surrogym.cli.pushing import push_or_say
 
 if TYPE_CHECKING:
@@ -51,6 +51,7 @@ def command(
         ),
     ] = None,
     spec: SpecFile = None,
+    fallback: FallbackProgram = None,
     episodes: Annotated[int, typer.Option(min=1, max=100, help="Number of whole episodes, with --env.")] = 3,
     seed: Annotated[
         int, typer.Option(min=0, help="Seed of starts, of sampled functions, and of the places to audit.")
@@ -102,7 +103,7 @@ def command(
         if env is None:
             found = hand_over(subject, asked, lambda view: update(None, words_of_audit(view)))
         else:
-            opener = opener_for_policy(env, read_spec(spec), card, quiet=output.quiet)
+            opener = opener_for_policy(env, read_spec(spec), card, fallback, quiet=output.quiet)
             found = _by_episodes(subject, env, opener, EvaluationSettings(episodes, seed), quiet=output.quiet)
     if found.audit is None:
         raise CommandError(_not_made(view, found.reason))

@@ -15,7 +15,7 @@ from surrogym.cli.filming import film
 from surrogym.cli.groups import Output, PolicyReading, Service, add
 from surrogym.cli.learning import kept
 from surrogym.cli.opening import opener_for_policy
-from surrogym.cli.options import NAMES, SpecFile, read_spec
+from surrogym.cli.options import NAMES, FallbackProgram, SpecFile, read_spec
 from surrogym.cli.pushing import push_or_say
 
 if TYPE_CHECKING:
@@ -124,6 +124,7 @@ def command(
     policy: Annotated[Path, typer.Argument(help="Policy file from surrogym train or Stable-Baselines3.")],
     env: Environment = None,
     spec: SpecFile = None,
+    fallback: FallbackProgram = None,
     *,
     episodes: Episodes,
     reading: PolicyReading,
@@ -152,7 +153,7 @@ def command(
     card, settings, token = card_of_policy(policy), episodes.settings(), service.token_for(context)
     differences.check(settings)
     beside.check(settings)
-    opener = opener_for_policy(env, read_spec(spec), card, quiet=output.quiet)
+    opener = opener_for_policy(env, read_spec(spec), card, fallback, quiet=output.quiet)
     ledger = ledger_of(surrogate, service.server, card, policy, quiet=output.quiet)
     if learning := differences.learning(ledger, service.server, token):
         opener = learning.checked(opener)

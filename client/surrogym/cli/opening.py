@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def opener_for_policy(
-    env: str | None, given: EnvironmentSpec | None, card: PolicyCard, *, quiet: bool
+    env: str | None, given: EnvironmentSpec | None, card: PolicyCard, fallback: str | None = None, *, quiet: bool
 ) -> Callable[[], Episode]:
     """Return a function that opens an episode for a policy, after a check of the specification.
 
@@ -21,6 +21,7 @@ def opener_for_policy(
         env: name of the original environment; None takes the one that the policy was trained for.
         given: specification of the environment from --spec; None takes the environment's own specification.
         card: card of the policy.
+        fallback: program of the limits' fallback, as NAME=package.module:function.
         quiet: whether remarks are hidden.
 
     Raises:
@@ -34,7 +35,7 @@ def opener_for_policy(
     if given is not None and noted is not None:
         check_policy(noted, given)
     try:
-        return opener_of(env, given, card, quiet=quiet)
+        return opener_of(env, given, card, fallback, quiet=quiet)
     except UnknownEnvironment as error:
         if noted is None or env is None or env == noted.environment:
             raise
@@ -42,7 +43,7 @@ def opener_for_policy(
 
 
 def opener_of(
-    env: str | None, given: EnvironmentSpec | None, card: PolicyCard, *, quiet: bool
+    env: str | None, given: EnvironmentSpec | None, card: PolicyCard, fallback: str | None = None, *, quiet: bool
 ) -> Callable[[], Episode]:
     """Return a function that opens an episode. An environment that only a policy's card names is opened only if it is
     Gymnasium's own, because the name of a module would run unknown code.
@@ -57,11 +58,11 @@ def opener_of(
         raise CommandError(f"expected --env with the original environment, got none (noted beside the policy: {name})")
     if is_own(name):
         bins = _bins(noted) if given is None else None
-        return lambda: open_episode(name, given, lambda: make(name, spec=given, bins=bins))
+        return lambda: open_episode(name, given, lambda: make(name, spec=given, bins=bins), fallback)
     if given is None and noted is not None and fits(noted.environment, name):
         given = _limited(noted, name, quiet=quiet)
     spec = given or make(name).spec()
-    return lambda: open_episode(name, spec, lambda: make(name, spec=spec))
+    return lambda: open_episode(name, spec, lambda: make(name, spec=spec), fallback)
 
 
 def _limited(noted: EnvironmentSpec, name: str, *, quiet: bool) -> EnvironmentSpec:

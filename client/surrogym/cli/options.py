@@ -87,6 +87,15 @@ Tolerances = Annotated[
         "--tolerance", help="Tolerance of an output, in its own unit, such as theta=0.01. May be given several times."
     ),
 ]
+FallbackProgram = Annotated[
+    str | None,
+    typer.Option(
+        "--fallback",
+        metavar="NAME=MODULE:FUNCTION",
+        help="Program of the fallback that the limits of the specification name: a function from the coordinates to an "
+        "action.",
+    ),
+]
 StepLimit = Annotated[float, typer.Option(min=0.001, help="Seconds that one real step, or one reset, may take.")]
 # the entries at the top level of a file that surrogym describe writes
 DESCRIBED = ("real_steps", "resets", "found", "asked", "specification")

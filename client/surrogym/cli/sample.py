@@ -17,6 +17,7 @@ from surrogym.cli.groups import Output, Service, add
 from surrogym.cli.options import (
     NAMES,
     ExitWithParent,
+    FallbackProgram,
     SpecFile,
     StepLimit,
     Surrogate,
@@ -115,6 +116,7 @@ def command(
     env: Environment = None,
     program: Command = None,
     spec: SpecFile = None,
+    fallback: FallbackProgram = None,
     once: Annotated[bool, typer.Option("--once", help="Stop after the first claim that returns queries.")] = False,
     until_done: UntilDone = False,
     max_queries: MaxQueries = None,
@@ -168,7 +170,9 @@ def command(
         if _without_queries(view, output, until_done=until_done):
             return
         name, replaced = _environment(_named(env, program), read_spec(spec), view.spec)
-        plan = SamplerPlan(api.url, service.token_for(context), surrogate, name, replaced, step_limit, settings)
+        plan = SamplerPlan(
+            api.url, service.token_for(context), surrogate, name, replaced, step_limit, settings, fallback
+        )
         if cluster.on_ray is None:
             _sample_here(api, plan, output, approved if caution.approve else None)
         else:
@@ -214,7 +218,7 @@ def _sample_here(
     from surrogym_shared.terminal import on_interrupt, say
 
     with (
-        closing(for_queries(plan.environment, plan.step_limit, plan.spec)) as environment,
+        closing(for_queries(plan.environment, plan.step_limit, plan.spec, plan.fallback)) as environment,
         _telling(api, plan.surrogate, quiet=output.quiet, plain=ask is not None) as tell,
     ):
         approve = None if ask is None else partial(ask, environment.spec())

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from surrogym_sampler.original.episode import Episode, Moment
-from surrogym_sampler.original.errors import NotPerturbable, NotSettable, StepFailed
+from surrogym_sampler.original.errors import NotPerturbable, NotSettable, StepFailed, UnknownEnvironment
 from surrogym_sampler.original.gymnasium import native_action, opens_task, shows_the_same, task_for, wrapped
 from surrogym_sampler.original.protocol import (
     Array,
@@ -208,20 +208,28 @@ class SteppedEpisode(OwnEpisode):
         self._environment.close()
 
 
-def open_episode(name: str, spec: EnvironmentSpec | None, factory: Factory) -> Episode:
+def open_episode(name: str, spec: EnvironmentSpec | None, factory: Factory, fallback: str | None = None) -> Episode:
     """Open an episode of an environment, in which the limits of its specification are kept.
 
     Args:
         name: the environment's name.
         spec: a specification that replaces the environment's own; None keeps the own one.
         factory: makes the environment, unless the name is that of a built-in Gymnasium task.
+        fallback: program of the limits' fallback, as NAME=package.module:function.
+
+    Raises:
+        UnknownEnvironment: the limits name a fallback, and ``fallback`` does not give its program; or the reverse.
     """
     episode = _open(name, spec, factory)
-    if episode.spec.limits is None:
+    if episode.spec.limits is None and fallback is None:
         return episode
     from surrogym_sampler.original.limits import GuardedEpisode
 
-    return GuardedEpisode(episode)
+    try:
+        return GuardedEpisode(episode, fallback)
+    except UnknownEnvironment:
+        episode.close()
+        raise
 
 
 def _open(name: str, spec: EnvironmentSpec | None, factory: Factory) -> Episode:

@@ -42,14 +42,16 @@ class IsolatedEnvironment:
     Args:
         factory: makes the environment in the child process; it must be picklable (a module's function, a ``partial``).
         step_limit: seconds that one step may take.
+        fallback: program of the limits' fallback, as NAME=package.module:function. The child process imports it.
 
     Raises (from any method):
         UnknownEnvironment: the factory failed.
         StepFailed: the environment raised an error, hung or died; the message says which.
     """
 
-    def __init__(self, factory: Factory, step_limit: float = 30.0) -> None:
+    def __init__(self, factory: Factory, step_limit: float = 30.0, fallback: str | None = None) -> None:
         self._factory = factory
+        self._fallback = fallback
         self._step_limit = step_limit
         self._number = 0  # number of the last request
         # Additional seconds for closing, in which the fallback controller brings the machine to rest.
@@ -140,7 +142,8 @@ class IsolatedEnvironment:
         self._kill()
         context = multiprocessing.get_context("spawn")
         self._pipe, theirs = context.Pipe()
-        self._process = context.Process(target=_serve, args=(theirs, self._factory, self._step_limit), daemon=True)
+        arguments = (theirs, self._factory, self._step_limit, self._fallback)
+        self._process = context.Process(target=_serve, args=arguments, daemon=True)
         self._process.start()
         theirs.close()
         try:
@@ -217,7 +220,7 @@ class _Ending:
             sys.exit()
 
 
-def _serve(pipe: Connection, factory: Factory, step_limit: float) -> None:
+def _serve(pipe: Connection, factory: Factory, step_limit: float, fallback: str | None) -> None:
     """Run the child process: make the environment, and answer requests until the parent closes.
 
     The first answer (ok, value) says whether the environment was made. Then one answer to each request follows. What
@@ -230,7 +233,7 @@ def _serve(pipe: Connection, factory: Factory, step_limit: float) -> None:
     threading.Thread(target=_exit_after_parent, args=(working,), daemon=True).start()
     with working:
         try:
-            environment = keeping_limits(answering(factory()))
+            environment = keeping_limits(answering(factory()), fallback)
         except RAISED as error:
             pipe.send((False, sentence(error)))
             return

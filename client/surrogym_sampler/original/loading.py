@@ -3,10 +3,7 @@
 
 from __future__ import annotations
 
-import importlib
-import os
 import shlex
-import sys
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
@@ -16,6 +13,7 @@ from surrogym_sampler.original.adapters import adapter_of, is_trusted, open_simu
 from surrogym_sampler.original.classic import TASKS
 from surrogym_sampler.original.errors import UnknownEnvironment, sentence
 from surrogym_sampler.original.executables import Executable, is_executable, open_executable
+from surrogym_sampler.original.factories import load_factory
 from surrogym_sampler.original.gymnasium import GymnasiumEnvironment, opens_task, task_for
 from surrogym_sampler.original.isolated import IsolatedEnvironment
 from surrogym_sampler.original.mujoco_tasks import SPECIFICATIONS
@@ -88,23 +86,28 @@ def make(
 
 
 def isolated(
-    name: str, step_limit: float, spec: EnvironmentSpec | None = None
+    name: str, step_limit: float, spec: EnvironmentSpec | None = None, fallback: str | None = None
 ) -> IsolatedEnvironment | Executable | Simulated:
-    """Make an original environment in a process of its own, in which a step may take ``step_limit`` seconds."""
+    """Make an original environment in a process of its own, in which a step may take ``step_limit`` seconds.
+
+    ``fallback`` gives the program of the limits' fallback, as NAME=package.module:function.
+    """
     if is_executable(name):
         return open_executable(name, spec, step_limit=step_limit)
     if (adapter := adapter_of(name)) is not None and adapter.separate:
         made = make(name, spec=spec, step_limit=step_limit)
         assert isinstance(made, Simulated)
         return made
-    return IsolatedEnvironment(partial(make, name, spec=spec), step_limit)
+    return IsolatedEnvironment(partial(make, name, spec=spec), step_limit, fallback)
 
 
-def for_queries(name: str, step_limit: float, spec: EnvironmentSpec | None = None) -> Environment:
+def for_queries(
+    name: str, step_limit: float, spec: EnvironmentSpec | None = None, fallback: str | None = None
+) -> Environment:
     """Make an original environment as ``isolated`` does, but one that keeps the limits of its specification."""
-    made = isolated(name, step_limit, spec)
+    made = isolated(name, step_limit, spec, fallback)
     # an IsolatedEnvironment keeps the limits by itself
-    return made if isinstance(made, IsolatedEnvironment) else keeping_limits(made)
+    return made if isinstance(made, IsolatedEnvironment) else keeping_limits(made, fallback)
 
 
 def is_own(name: str) -> bool:
@@ -215,30 +218,6 @@ def with_choices(
     if max_rollout is not None:
         fields["max_rollout"] = max_rollout
     return EnvironmentSpec.model_validate(fields)
-
-
-def load_factory(name: str) -> Any:
-    """Import the factory ``package.module:attribute``. The working directory is searched too.
-
-    Raises:
-        UnknownEnvironment: the module can't be imported, or has no such callable.
-    """
-    module_name, _, attribute = name.partition(":")
-    if os.getcwd() not in sys.path:
-        sys.path.insert(0, os.getcwd())
-    try:
-        factory = getattr(importlib.import_module(module_name), attribute)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise UnknownEnvironment(f"expected package.module:factory, got {name!r}: {error}") from error
-    except SystemExit as error:
-        raise UnknownEnvironment(
-            f"{module_name} called sys.exit while it was imported: {sentence(error)}; remove the call"
-        ) from error
-    if not callable(factory):
-        raise UnknownEnvironment(
-            f"expected {name!r} to be callable, got a {type(factory).__name__}: name a class or function"
-        )
-    return factory
 
 
 def _known(name: str, spec: EnvironmentSpec | None, choose: Choose, preset: str, step_limit: float) -> Environment:

@@ -14,8 +14,9 @@ from surrogym_client.environments.render_modes import drawn_with, is_drawn_by_gy
 from surrogym_sampler.original.adapters.gymnasium_ids import settable
 from surrogym_sampler.original.classic import TASKS
 from surrogym_sampler.original.executables import is_executable
+from surrogym_sampler.original.factories import load_factory
 from surrogym_sampler.original.gymnasium import opens_task
-from surrogym_sampler.original.loading import is_own, load_factory
+from surrogym_sampler.original.loading import is_own
 from surrogym_sampler.original.protocol import Array, Native
 from surrogym_shared.spec import EnvironmentSpec
 

@@ -191,14 +191,26 @@ def answering(environment: object) -> Environment:
     return environment
 
 
-def keeping_limits(environment: Environment) -> Environment:
+def keeping_limits(environment: Environment, fallback: str | None = None) -> Environment:
     """Return an environment that keeps the limits of its specification. An environment without limits is returned
-    unchanged."""
-    if environment.spec().limits is None:
+    unchanged.
+
+    Args:
+        environment: the environment. It is closed if this raises an error.
+        fallback: program of the limits' fallback, as NAME=package.module:function.
+
+    Raises:
+        UnknownEnvironment: the limits name a fallback, and ``fallback`` does not give its program; or the reverse.
+    """
+    if environment.spec().limits is None and fallback is None:
         return environment
     from surrogym_sampler.original.limits import guarded
 
-    return guarded(environment)
+    try:
+        return guarded(environment, fallback)
+    except UnknownEnvironment:
+        environment.close()
+        raise
 
 
 def _missing(environment: object) -> str:

@@ -43,6 +43,7 @@ class SamplerPlan:
         spec: a specification that replaces the environment's own; None keeps the own one.
         step_limit: seconds that one real step may take.
         settings: settings of the sampler.
+        fallback: program of the limits' fallback, as NAME=package.module:function.
         version: version of surrogym, which must be the same on all machines.
     """
 
@@ -53,6 +54,7 @@ class SamplerPlan:
     spec: EnvironmentSpec | None
     step_limit: float
     settings: SamplerSettings
+    fallback: str | None = None
     version: str = field(default_factory=lambda: version("surrogym"))
 
 
@@ -116,7 +118,7 @@ class SamplerActor:
         try:
             with (
                 Api(plan.url, plan.token) as api,
-                closing(for_queries(plan.environment, plan.step_limit, plan.spec)) as environment,
+                closing(for_queries(plan.environment, plan.step_limit, plan.spec, plan.fallback)) as environment,
             ):
                 self._sampler = Sampler(api, plan.surrogate, environment, plan.settings, self._note)
                 if self._stopped:

@@ -19,6 +19,7 @@ from surrogym_shared.kinds import Function, LagKind
 from surrogym_shared.rates import Rate, rates
 from surrogym_shared.spec import BoxAction, Coordinate, EnvironmentSpec, Lag, Term, limits
 from surrogym_shared.spec.actions import Action
+from surrogym_shared.spec.safety import NamedFallback
 
 Array = NDArray[np.float64]
 Activation = Literal["none", "tanh", "relu"]
@@ -408,6 +409,11 @@ def _guard(spec: EnvironmentSpec, low: Array, high: Array) -> Guard | None:
         )
         for limit in spec.limits.keep
     )
+    if isinstance(spec.limits.fallback, NamedFallback):
+        raise NotDeployable(
+            f"limits: expected a fallback of terms, got the program {spec.limits.fallback.name!r}, which a controller "
+            "does not have: declare terms, and train again"
+        )
     fallback = []
     for entry, (term, least, most) in enumerate(zip(spec.limits.fallback, low, high, strict=True)):
         begin, end = np.clip(_ends(term.low, term.high), least, most)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from surrogym_sampler.original.loading import load_factory
+from surrogym_sampler.original.factories import load_factory
 from surrogym_trainer.policies.predict import PerEpisode
 
 Controller = Callable[[NDArray[np.float64]], Any]

@@ -104,7 +104,8 @@ def _require_classes(tasks: Sequence[str]) -> None:
     """Refuse a class that this machine does not have. Machines of a cluster may have others."""
     from surrogym_lab.peers.registry import task_of
     from surrogym_sampler.original.executables import is_executable
-    from surrogym_sampler.original.loading import is_own, load_factory
+    from surrogym_sampler.original.factories import load_factory
+    from surrogym_sampler.original.loading import is_own
 
     for environment in (task_of(name).environment for name in tasks):
         if is_own(environment) and not is_executable(environment):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Self
 
-from pydantic import Field, model_validator
+from pydantic import Discriminator, Field, Tag, model_validator
 
 from surrogym_shared.checks import Number, require
 from surrogym_shared.patterns import VISIBLE
@@ -41,15 +41,32 @@ class Limit(Frozen):
         return self
 
 
+class NamedFallback(Frozen):
+    """Fallback that is a program at the machine. The command line of the sampler gives the program for the name."""
+
+    name: Name
+
+
+def _fallback_kind(value: object) -> str:
+    return "program" if isinstance(value, dict | NamedFallback) else "terms"
+
+
+Fallback = Annotated[
+    Annotated[tuple[Term, ...], Field(min_length=1, max_length=MAX_DIMENSIONS), Tag("terms")]
+    | Annotated[NamedFallback, Tag("program")],
+    Discriminator(_fallback_kind),
+]
+
+
 class Limits(Frozen):
     """Limits that sampler, audits and evaluations keep, and the fallback near them.
 
     ``fallback``: for each entry of the action, a term of the state that gives its value near a limit, such as a
-    constant or a linear feedback. The value is clipped to the action's range.
+    constant or a linear feedback; or the name of a program at the machine. Values are clipped to the action's range.
 
     ``probability``: largest share of episodes that may leave a limit.
     """
 
     keep: tuple[Limit, ...] = Field(min_length=1, max_length=MAX_INEQUALITIES)
-    fallback: tuple[Term, ...] = Field(min_length=1, max_length=MAX_DIMENSIONS)
+    fallback: Fallback
     probability: Annotated[float, Field(gt=0, le=0.5, strict=True)] = 0.01

@@ -8,6 +8,7 @@ import numpy as np
 
 from surrogym_sampler.original.episode import Episode, Moment
 from surrogym_sampler.original.limits.guard import Guard, Watchdog
+from surrogym_sampler.original.limits.programs import program_of
 from surrogym_sampler.original.protocol import Array
 
 
@@ -15,11 +16,11 @@ class GuardedEpisode(Episode):
     """An episode that keeps the limits of its specification. The declared fallback controller acts in the place of the
     policy shortly before a limit would be left, and when no action comes for a sampling period."""
 
-    def __init__(self, episode: Episode) -> None:
+    def __init__(self, episode: Episode, fallback: str | None = None) -> None:
         super().__init__(episode.spec)
         self.parallel = episode.parallel
         self._episode = episode
-        self._guard = Guard(episode.spec)
+        self._guard = Guard(episode.spec, program_of(episode.spec, fallback))
         self._watchdog = Watchdog(episode.spec, self._guard, self._fall, waits=self.parallel)
 
     def reset(self, seed: int) -> Moment:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surrogym_sampler.original.errors import RAISED, StepFailed
+from surrogym_sampler.original.limits.programs import Program, called
 from surrogym_shared.limits import fallback_action, is_near, margins, room
 from surrogym_shared.spec import EnvironmentSpec
 
@@ -39,8 +40,9 @@ class Guard:
     value, and the fallback acts until all are measured again.
     """
 
-    def __init__(self, spec: EnvironmentSpec) -> None:
+    def __init__(self, spec: EnvironmentSpec, program: Program | None = None) -> None:
         self._spec = spec
+        self._program = program  # of a named fallback; None if the fallback is terms
         self._at = np.zeros(len(spec.coordinates))
         self._change = np.zeros(len(spec.coordinates))  # (C,) absolute change of each coordinate in the last step
         self._margins = margins(spec)
@@ -71,7 +73,9 @@ class Guard:
 
     def fallback(self) -> Array:
         """Return the action (F,) of the specification's fallback controller in the present state."""
-        return fallback_action(self._spec, self._at)
+        if self._program is None:
+            return fallback_action(self._spec, self._at)
+        return called(self._program, self._spec, self._at)
 
     @property
     def at(self) -> Array:

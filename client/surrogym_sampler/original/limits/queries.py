@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from surrogym_sampler.original.errors import StepRefused
 from surrogym_sampler.original.limits.guard import Guard, Watchdog
+from surrogym_sampler.original.limits.programs import Program, program_of
 from surrogym_sampler.original.protocol import (
     Environment,
     OriginalEnvironment,
@@ -23,12 +24,14 @@ Array = NDArray[np.float64]
 ENDS = "the environment is closed"
 
 
-def guarded(environment: Environment) -> Environment:
-    """Return an environment that keeps its specification's limits."""
+def guarded(environment: Environment, fallback: str | None = None) -> Environment:
+    """Return an environment that keeps its specification's limits. ``fallback`` gives the program of a named fallback,
+    as NAME=package.module:function."""
+    program = program_of(environment.spec(), fallback)
     if isinstance(environment, OriginalEnvironment) and environment.spec().query == "step":
         return GuardedSteps(environment)
     assert isinstance(environment, RolloutEnvironment)
-    return GuardedRollouts(environment)
+    return GuardedRollouts(environment, program)
 
 
 class GuardedSteps:
@@ -70,11 +73,11 @@ class GuardedRollouts:
     the machine to rest, and the episode ends. Returned steps have the action that was applied.
     """
 
-    def __init__(self, environment: RolloutEnvironment) -> None:
+    def __init__(self, environment: RolloutEnvironment, program: Program | None = None) -> None:
         self._environment: Any = environment  # Any, because the methods save, restore and resume are optional
         self._spec = environment.spec()
         self.parallel = runs_in_parallel(environment)
-        self._guard = Guard(self._spec)
+        self._guard = Guard(self._spec, program)
         self._watchdog = Watchdog(self._spec, self._guard, self._fall, waits=self.parallel)
         self.rest_seconds = self._watchdog.rest_seconds  # longest duration of the fallback in ``close``
 
