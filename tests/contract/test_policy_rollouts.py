@@ -174,7 +174,7 @@ def test_a_rollout_with_too_many_steps_over_all_environments_is_refused(port: Po
 def test_a_policy_layer_too_wide_for_the_number_of_environments_is_refused(port: PolicyPort, opened: Opened, harness):
     session = opened(num_envs=20_000)
     port.reset(session)
-    with pytest.raises(harness.errors.TooLarge, match="units times lanes"):
+    with pytest.raises(harness.errors.TooLarge, match="widest layer times lanes"):
         port.rollout_policy(session, random_policy((3, 1_000, 1)), 1)
 
 
