@@ -80,9 +80,8 @@ class ActingPolicy:
     deviation: Array  # (D,) number by which an observation minus ``mean`` is divided
     layers: tuple[Layer, ...]
     activation: Activation = "tanh"  # activation function of the hidden layers
-    log_deviations: Array | None = (
-        None  # (F,) log standard deviations of the noise of continuous actions; None without noise
-    )
+    # (F,) log standard deviations of the noise of continuous actions; None without noise.
+    log_deviations: Array | None = None
 
     def __post_init__(self) -> None:
         arrays = self._arrays_by_name()
@@ -158,9 +157,8 @@ class PolicyRun:
     policy: ActingPolicy
     steps: int
     noise: NoiseKey | None = None
-    until: NDArray[np.bool_] | None = (
-        None  # (N,) mask: stop once an episode has ended in each masked lane; None: T steps
-    )
+    # (N,) mask: stop once an episode has ended in each masked lane; None: T steps.
+    until: NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:
         if not 1 <= self.steps <= MAX_ROLLOUT:

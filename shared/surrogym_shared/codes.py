@@ -28,9 +28,8 @@ class Code(StrEnum):
     METHOD_NOT_ALLOWED = "method_not_allowed"
     SPEC_CONFLICT = "spec_conflict"  # a surrogate of this name exists with another specification
     IDEMPOTENCY_CONFLICT = "idempotency_conflict"  # an earlier request with the same idempotency key had another body
-    SEQ_CONFLICT = (
-        "seq_conflict"  # the number ``seq`` of a session's request is neither the next one nor that of the last request
-    )
+    # The number ``seq`` of a session's request is neither the next one nor that of the last request.
+    SEQ_CONFLICT = "seq_conflict"
     FOREIGN_LEASE = "foreign_lease"  # the lease token does not belong to a lease of the query
     LEASE_EXPIRED = "lease_expired"  # a lease, of a query or of a job, has ended before the request that names it
     NOT_RESET = "not_reset"  # a step before the first reset, or of a lane whose episode ended, with autoreset disabled
@@ -39,7 +38,8 @@ class Code(StrEnum):
     UNSUPPORTED_MEDIA_TYPE = "unsupported_media_type"
     REQUEST_TIMEOUT = "request_timeout"  # the body of the request did not arrive in time
     TOO_MANY_REQUESTS = "too_many_requests"  # a queue or a limit of the server is full
-    DEADLINE_EXCEEDED = "deadline_exceeded"  # the reply would have been late, so it was not computed
+    # The reply to a step would have come after the caller's deadline, so no step was taken.
+    DEADLINE_EXCEEDED = "deadline_exceeded"
     UNAVAILABLE = "unavailable"
     DAMAGED = "damaged"  # stored data are corrupt
     NOT_INSTALLED = "not_installed"  # stored data needs a plug-in that the server lacks

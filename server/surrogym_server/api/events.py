@@ -75,7 +75,7 @@ def _stream(request: Request, lines: AsyncIterator[str]) -> StreamingResponse:
     streams.require_room(request)
 
     async def counted() -> AsyncIterator[str]:
-        with streams.count(request):  # inside the generator, so that only a stream that has begun counts
+        with streams.count(request):  # here in the generator, so that a stream counts only after it has begun
             yield CONNECTED
             async for text in lines:
                 yield text

@@ -13,7 +13,8 @@ from surrogym_shared.codes import Code
 
 BODY_LIMIT = "surrogym.body_limit"  # key in the ASGI scope: largest size of this body in bytes, set by ``api.door``
 SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
-# Header Sec-Fetch-Site of requests by programs, by the server's own pages, and by an address that a person typed.
+# Values of the header Sec-Fetch-Site for programs (no header), the server's own pages, and an address typed by a
+# person.
 OWN_SITE = (b"", b"same-origin", b"none")
 
 

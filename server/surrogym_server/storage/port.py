@@ -506,8 +506,8 @@ class Sessions(ABC):
 class Events(ABC):
     """Part of the storage interface for events of surrogates.
 
-    Each change that may end a wait appends an event, because a claim that waits for queries or jobs asks again after
-    each event.
+    Each change that may end a wait appends an event, because a claim that waits for queries or jobs looks for them
+    again after each event.
     """
 
     @abstractmethod

@@ -38,7 +38,7 @@ class StepStream:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         engine: SessionEngine = scope["state"]["services"].engine
         id: str = scope["path_params"]["id"]
-        await receive()  # the message "websocket.connect"
+        await receive()  # the first message of ASGI, "websocket.connect"
         try:
             _admit(scope)
             shape = sessions.session_shape(await engine.describe(id))

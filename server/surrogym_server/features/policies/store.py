@@ -54,7 +54,7 @@ policy_files = checked(
     )
 )
 
-OWNED = (policy_files, policy_evaluations)  # tables whose rows may name a blob
+OWNED = (policy_files, policy_evaluations)  # tables whose rows may name a blob (stored file)
 
 
 class Policies:

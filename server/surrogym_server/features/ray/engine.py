@@ -28,7 +28,7 @@ logger = logging.getLogger(__name__)
 ANSWERING_SECONDS, TAKING_SECONDS = 5.0, 60.0  # longest wait for a host to answer a ping, and to take over a session
 ENDED, SILENT = "has ended and is started again", "does not answer now"
 MOVES = 3  # largest number of hosts that one request tries while its session changes hosts
-REMEMBERED = 10_000  # largest number of sessions whose host is cached, because it differs from the one in their id
+REMEMBERED = 10_000  # largest number of cached hosts of sessions, for sessions that have left the host in their id
 
 
 class _Gone(Exception):

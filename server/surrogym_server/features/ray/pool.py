@@ -39,7 +39,8 @@ def check(settings: Settings) -> None:
 
 
 def connect(settings: Settings, storage: Storage) -> SessionEngine:
-    """Connect to the cluster at ``ray_address``, wait until all session hosts are ready, and return its engine.
+    """Connect to the cluster at ``ray_address``, wait until all session hosts are ready, and return an engine that uses
+    them.
 
     Args:
         settings: settings of this server.

@@ -107,7 +107,8 @@ class LiveSessions:
     def record(self, lease: SessionLease, checkpoint: Checkpoint) -> bool:
         """Store a checkpoint of a leased session. If another process has taken the lease, store nothing and return
         False."""
-        with self._database.write() as connection:  # changes one row only, so it can't deadlock with ``renew``
+        # This transaction changes only one row, so it can't deadlock with ``renew``.
+        with self._database.write() as connection:
             update = _held(sa.update(live), lease).values(seq=checkpoint.seq, data=checkpoint.data)
             return connection.execute(update).rowcount == 1
 

@@ -62,8 +62,8 @@ BATCH = 250  # largest number of rows that one transaction writes or removes
 # Pause after each of several transactions that write rows in batches, so that a waiting writer can begin.
 PAUSE_SECONDS = 0.002
 POOL = {"pool_size": 8, "max_overflow": 56, "pool_timeout": BUSY_SECONDS}
-POSTGRESQL = {  # UTF-8 for every database, because with SQL_ASCII psycopg would return bytes instead of text
-    "client_encoding": "utf8",
+POSTGRESQL = {
+    "client_encoding": "utf8",  # also for a database in SQL_ASCII, of which psycopg would return bytes instead of text
     "connect_timeout": BUSY_SECONDS,
 }
 

@@ -302,7 +302,7 @@ models = sa.Table(
     sa.Column("damage", sa.Text),  # description of damage that was found; NULL: none
 )
 
-priors = sa.Table(  # prior model of a surrogate; if its blob is NULL, the design waits for it
+priors = sa.Table(  # prior of a surrogate; if its blob (file of a model) is NULL, the design waits for the prior
     "priors",
     metadata,
     owner(primary_key=True),
@@ -382,7 +382,7 @@ policy_evaluations = sa.Table(
     sa.Column("created_at", sa.Double, nullable=False),
     sa.Column("summary", Json("policy_evaluations.summary"), nullable=False),
     sa.Column("bytes", sa.BigInteger, nullable=False),
-    sa.Column("digest", sa.Text, nullable=False),  # SHA-256 of the file of episodes
+    sa.Column("digest", sa.Text, nullable=False),  # SHA-256 of the file with the episodes of the evaluation
     sa.Column("blob", sa.Text),  # name of the blob with the episodes; NULL: not stored
     sa.UniqueConstraint("surrogate_id", "version", "key"),
     policy_key(),
