@@ -76,11 +76,11 @@ class ActingPolicy:
         ValueError: arrays that don't fit together, that are too large, or that contain NaN or infinity.
     """
 
-    mean: Array  # (D,) mean that is subtracted from an observation
-    deviation: Array  # (D,) number by which an observation minus ``mean`` is divided
+    mean: Array  # (D,) mean of each of D observation entries, which is subtracted
+    deviation: Array  # (D,) number by which each of D observation entries minus its mean is divided
     layers: tuple[Layer, ...]
     activation: Activation = "tanh"  # activation function of the hidden layers
-    # (F,) log standard deviations of the noise of continuous actions; None without noise.
+    # (F,) log standard deviation of the noise of each of F continuous action entries; None without noise.
     log_deviations: Array | None = None
 
     def __post_init__(self) -> None:
@@ -157,7 +157,7 @@ class PolicyRun:
     policy: ActingPolicy
     steps: int
     noise: NoiseKey | None = None
-    # (N,) mask: stop once an episode has ended in each masked lane; None: T steps.
+    # (N,) mask of N lanes: stop once an episode has ended in each masked lane; None: take all ``steps``.
     until: NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:
@@ -171,8 +171,8 @@ class PolicyRun:
 class Acted(NamedTuple):
     """Actions of a policy in one step."""
 
-    action: Array  # (N, F) actions before they are clipped to their bounds
-    log_probability: Array | None  # (N,) log probability of each lane's action; None without noise
+    action: Array  # (N, F) actions of F entries in N lanes, before they are clipped to their bounds
+    log_probability: Array | None  # (N,) log probability of the action in each of N lanes; None without noise
     sent: NDArray[Any]  # (N, F) actions as a surrogate takes them: clipped to their bounds, or numbers of choices
 
 
@@ -186,8 +186,8 @@ class Actor:
 
     policy: ActingPolicy
     observation: int  # number of entries of an observation, D
-    low: NDArray[np.float64]  # (F,) lower bounds of continuous actions
-    high: NDArray[np.float64]  # (F,) upper bounds of continuous actions
+    low: NDArray[np.float64]  # (F,) lower bound of each of F continuous action entries
+    high: NDArray[np.float64]  # (F,) upper bound of each of F continuous action entries
     counts: tuple[int, ...] = ()  # number of choices of each entry of a discrete action; empty for a continuous one
     noisy: bool = False
 

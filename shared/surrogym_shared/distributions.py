@@ -44,8 +44,8 @@ class Bounded:
     """Normal distribution of continuous actions with the mean centre + reach tanh(outputs). The further parameters are
     log standard deviations (F,)."""
 
-    centre: Array  # (F,) middle of each action entry's range
-    reach: Array  # (F,) half the width of each action entry's range
+    centre: Array  # (F,) middle of the range of each of F action entries
+    reach: Array  # (F,) half the width of the range of each of F action entries
 
     @property
     def outputs(self) -> int:

@@ -67,8 +67,8 @@ class Network:
     whose bounds are ``low`` and ``high`` (F,).
     """
 
-    mean: Array  # (D,) mean that is subtracted from an observation
-    deviation: Array  # (D,) number by which an observation minus ``mean`` is divided
+    mean: Array  # (D,) mean of each of D observation entries, which is subtracted
+    deviation: Array  # (D,) number by which each of D observation entries minus its mean is divided
     layers: tuple[Layer, ...]
     low: Array
     high: Array

@@ -28,8 +28,8 @@ class Query:
     reset. A query that begins at coordinates has one action.
     """
 
-    coordinates: Vector  # (C,) state to set; () for a query that begins at a snapshot or a reset
-    actions: tuple[Vector, ...]  # (T, F) actions to apply in T steps, one after the other
+    coordinates: Vector  # (C,) the C coordinates of the state to set; () for a query from a snapshot or a reset
+    actions: tuple[Vector, ...]  # (T, F) actions of F entries to apply in T steps, one after the other
     snapshot: str | None = None  # name of the snapshot at which the steps begin; None: at coordinates or a reset
 
     @staticmethod
@@ -61,25 +61,25 @@ class Query:
 class RealStep:
     """One real step. ``coordinates`` and ``action`` are the achieved values, not the requested ones."""
 
-    coordinates: ArrayLike  # (C,) state before the step
-    action: ArrayLike  # (F,) applied action
-    next_coordinates: ArrayLike  # (C,) state after the step
+    coordinates: ArrayLike  # (C,) the C coordinates of the state before the step
+    action: ArrayLike  # (F,) applied action, with F entries
+    next_coordinates: ArrayLike  # (C,) the C coordinates of the state after the step
     reward: float
     terminated: bool = False
     truncated: bool = False
-    observation: ArrayLike | None = None  # (D,) observation before the step; None if it was not measured
-    next_observation: ArrayLike | None = None  # (D,) observation after the step; None if it was not measured
+    observation: ArrayLike | None = None  # (D,) observation of D entries before the step; None if not measured
+    next_observation: ArrayLike | None = None  # (D,) observation of D entries after the step; None if not measured
 
 
 @dataclass(frozen=True)
 class RealSteps:
     """Real steps as arrays with a row for each step, in order of arrival: the samples from which a model is learned."""
 
-    coordinates: NDArray[np.float64]  # (n, C) state before each step
-    action: NDArray[np.float64]  # (n, F) action applied in each step
-    next_coordinates: NDArray[np.float64]  # (n, C) state after each step
-    reward: NDArray[np.float64]  # (n,) reward of each step
-    terminated: NDArray[np.bool_]  # (n,) whether each step ended the episode
+    coordinates: NDArray[np.float64]  # (n, C) the C coordinates before each of n steps
+    action: NDArray[np.float64]  # (n, F) action of F entries in each of n steps
+    next_coordinates: NDArray[np.float64]  # (n, C) the C coordinates after each of n steps
+    reward: NDArray[np.float64]  # (n,) reward of each of n steps
+    terminated: NDArray[np.bool_]  # (n,) whether each of n steps ended the episode in a terminal state
     purpose: tuple[SamplePurpose, ...]  # purpose of each of n steps: why it was taken
 
     def __len__(self) -> int:

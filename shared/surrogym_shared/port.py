@@ -29,7 +29,7 @@ T = TypeVar("T")
 class ResetResult:
     """Result of a reset of N lanes."""
 
-    observation: Floats  # (N, D) first observations of the episodes
+    observation: Floats  # (N, D) first observation of the episode in each of N lanes, with D entries
     model_version: Ints  # (N,) version of the model that each lane's episode runs under
 
 
@@ -37,15 +37,16 @@ class ResetResult:
 class StepResult:
     """Result of one step of N lanes."""
 
-    observation: Floats  # (N, D) observation of each lane after the step
-    reward: Floats  # (N,) rewards, less the penalty for uncertainty
-    terminated: Bools  # (N,) whether the episode ended in a terminal state
-    truncated: Bools  # (N,) whether the episode ended for another reason
+    observation: Floats  # (N, D) observation of each of N lanes after the step, with D entries
+    reward: Floats  # (N,) reward in each of N lanes, less the penalty for uncertainty
+    terminated: Bools  # (N,) whether the episode in each of N lanes ended in a terminal state
+    truncated: Bools  # (N,) whether the episode in each of N lanes ended for another reason than a terminal state
     final_lanes: Ints  # (K,) numbers of the K lanes whose episode ended and that were reset within this step
-    final_observation: Floats  # (K, D) last observation of the ended episode in each lane of ``final_lanes``
+    # (K, D) last observation, of D entries, of the ended episode in each lane of ``final_lanes``.
+    final_observation: Floats
     model_version: Ints  # (N,) version of the model that each lane's episode runs under
-    reward_mean: Floats  # (N,) rewards without the penalty for uncertainty
-    deviation: Floats | None  # (N, O) predicted standard deviation of each output; None if it was not requested
+    reward_mean: Floats  # (N,) reward in each of N lanes without the penalty for uncertainty
+    deviation: Floats | None  # (N, O) predicted standard deviation of O outputs in N lanes; None if not requested
     # (N,) whether each lane was truncated because the model is too uncertain there; None in a session without
     # ``trust``.
     untrusted: Bools | None = None
@@ -55,17 +56,18 @@ class StepResult:
 class PolicyRollout:
     """Result of T steps of N lanes under a policy, with the policy's actions."""
 
-    action: Floats  # (T, N, F) float64 actions before they are clipped to their bounds
-    log_probability: Floats | None  # (T, N) float64 log probability of each action; None without noise
-    observation: Floats  # (T, N, D) observation after each step; action t was chosen at the observation of step t - 1
-    reward: Floats  # (T, N) rewards, less the penalty for uncertainty
-    terminated: Bools  # (T, N) whether the episode ended in a terminal state
-    truncated: Bools  # (T, N) whether the episode ended for another reason
+    action: Floats  # (T, N, F) float64 actions of F entries in T steps of N lanes, not clipped to their bounds
+    # (T, N) float64 log probability of each action, in T steps of N lanes; None without noise.
+    log_probability: Floats | None
+    observation: Floats  # (T, N, D) observation of D entries after each of T steps, in N lanes
+    reward: Floats  # (T, N) reward in T steps of N lanes, less the penalty for uncertainty
+    terminated: Bools  # (T, N) whether each of T steps ended the episode of a lane in a terminal state
+    truncated: Bools  # (T, N) whether each of T steps ended the episode of a lane for another reason
     final_steps: Ints  # (K,) for each of K ended episodes, the index of its last step, in ascending order
     final_lanes: Ints  # (K,) lane of each of the K ended episodes
-    final_observation: Floats  # (K, D) last observation of each of the K ended episodes
-    model_version: Ints  # (T, N) version of the model that each lane's episode ran under in each step
-    reward_mean: Floats  # (T, N) rewards without the penalty for uncertainty
+    final_observation: Floats  # (K, D) last observation, of D entries, of each of the K ended episodes
+    model_version: Ints  # (T, N) version of the model that each of N lanes' episodes ran under in each of T steps
+    reward_mean: Floats  # (T, N) reward in T steps of N lanes without the penalty for uncertainty
     # (T, N) whether a lane was truncated because the model is too uncertain there; None in a session without ``trust``.
     untrusted: Bools | None = None
 

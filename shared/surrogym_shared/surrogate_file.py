@@ -50,12 +50,12 @@ class NotASurrogateFile(ValueError):
 class RealSamples:
     """Real steps of a surrogate: those that its model was fitted to, and any later steps."""
 
-    coordinates: Floats  # (n, C) state before each step
-    action: Floats  # (n, F) action of each step
-    next_coordinates: Floats  # (n, C) state after each step
-    reward: Floats  # (n,) reward of each step
-    terminated: Bools  # (n,) whether the episode ended in a terminal state
-    truncated: Bools  # (n,) whether the episode ended for another reason
+    coordinates: Floats  # (n, C) the C coordinates before each of n steps
+    action: Floats  # (n, F) action of F entries in each of n steps
+    next_coordinates: Floats  # (n, C) the C coordinates after each of n steps
+    reward: Floats  # (n,) reward of each of n steps
+    terminated: Bools  # (n,) whether each of n steps ended the episode in a terminal state
+    truncated: Bools  # (n,) whether each of n steps ended the episode for another reason
     # (n,) whether a step comes from a log, so that the budget does not count it; None: no step does.
     logged: Bools | None = None
 

@@ -228,7 +228,7 @@ class SampleRecord(Sample):
     attempt: int  # number of the query's lease under which the sample came, from 1; 0 without a query
     late: bool  # whether the lease had ended when the sample came
     trajectory: int | None  # a number that all samples of one rollout share; None if the sample belongs to no rollout
-    requested_coordinates: Vector | None  # (C,) coordinates of the query; None without a query, and for a rollout
+    requested_coordinates: Vector | None  # (C,) the C coordinates in the query; None without one, or in a rollout
     created_at: float
 
 

@@ -52,7 +52,7 @@ def entry(*arguments: Any) -> Callable[[F], F]:
                     return cast(F, njit([arguments], cache=True, **chosen)(function))
             except NumbaError:
                 raise  # compiling without the cache would fail too
-            except Exception as error:  # numba unpickles its cache files, and its cache folder may be unwritable
+            except Exception as error:  # a cache file can't be unpickled, or the folder can't be written
                 logger.warning(
                     "compiled code can't be stored in %s, so the functions are compiled again: %s", folder, error
                 )

@@ -218,7 +218,8 @@ def ticks_of(rows: Rows, episode: Ints, left_out: Mapping[int, str]) -> Ticks | 
     begins = np.concatenate([[True], ~same])
     moment = np.cumsum(begins) - 1
     at, of, size = time[begins], number[begins], np.bincount(moment)
-    inner = np.zeros(len(size), dtype=np.bool_)  # excludes an episode's first and last time, which may lack rows
+    # Times that are not the first or last of an episode, at which rows may be missing.
+    inner = np.zeros(len(size), dtype=np.bool_)
     inner[1:-1] = (of[1:-1] == of[:-2]) & (of[1:-1] == of[2:])
     within = of[1:] == of[:-1]
     if not within.any():

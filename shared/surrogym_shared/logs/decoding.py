@@ -8,7 +8,7 @@ from surrogym_shared.logs.errors import UnusableLog
 
 MARKED = (
     (codecs.BOM_UTF8, "utf-8-sig"),
-    (codecs.BOM_UTF32_LE, "utf-32"),  # before UTF-16, whose byte order mark is the beginning of that of UTF-32
+    (codecs.BOM_UTF32_LE, "utf-32"),  # listed before UTF-16, whose byte order mark is the beginning of that of UTF-32
     (codecs.BOM_UTF32_BE, "utf-32"),
     (codecs.BOM_UTF16_LE, "utf-16"),
     (codecs.BOM_UTF16_BE, "utf-16"),

@@ -16,7 +16,7 @@ from surrogym_shared.logs.errors import UnusableLog
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
-Cells = NDArray[Any]  # (n,) cells of a column: numbers, or text
+Cells = NDArray[Any]  # (n,) cells of a column in n rows: numbers, or text
 
 TRUE, FALSE = ("true", "t", "yes"), ("false", "f", "no")
 NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
