@@ -7,7 +7,7 @@ import pytest
 
 from support.commands import command_line
 from surrogym.cli import COMMANDS
-from surrogym.cli.commands import ADVANCED, GROUPS
+from surrogym.cli.help import ADVANCED, GROUPS
 
 
 @pytest.mark.parametrize("command", [*COMMANDS, "serve"])

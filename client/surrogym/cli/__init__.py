@@ -11,8 +11,8 @@ from importlib.metadata import entry_points
 
 import typer
 
-from surrogym.cli.commands import Command, Commands
 from surrogym.cli.errors import sentence
+from surrogym.cli.help import Command, Commands
 from surrogym_shared.terminal import say
 
 COMMANDS = (
