@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 
-from surrogym.cli.audit import _require_fit, session_of
+from surrogym.cli.commands.audit import _require_fit
 from surrogym.cli.errors import CommandError
 from surrogym_sampler.original.classic import cartpole, pendulum
 from surrogym_shared.network import Network
 from surrogym_shared.wire import SurrogateView
 from surrogym_trainer.policies.card import PolicyCard
+from surrogym_trainer.training.cards import session_of
 
 
 def view(noise: float, sensor: float = 0.0) -> SurrogateView:

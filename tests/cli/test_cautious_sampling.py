@@ -14,7 +14,7 @@ import typer
 from support.controllers import network
 from support.limited import SPEC, NamedCart
 from support.programs import FALLS_BACK, KEEPS_LIMITS, program
-from surrogym.cli import sample
+from surrogym.cli.commands import sample
 from surrogym_shared.wire import Query
 
 CART = ("--env", "support.limited:PatientCart")

@@ -10,7 +10,7 @@ import pytest
 
 from support.server import ServerProcess
 from support.terminal import Terminal, on_terminal
-from surrogym.cli.train import _keeping
+from surrogym.cli.commands.train import _keeping
 from surrogym_client.transport import Api
 from surrogym_sampler.original.errors import EvaluationFailed
 from surrogym_shared.archives import stored

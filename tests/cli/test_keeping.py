@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from surrogym.cli.evaluate import _keep
+from surrogym.cli.commands.evaluate import _keep
 from surrogym_trainer.evaluation.evaluator import Evaluation, EvaluationSettings, Trace
 from surrogym_trainer.policies.pushing import waiting_path
 

@@ -103,7 +103,7 @@ def test_a_training_refuses_to_start_from_a_policy_of_another_environment(on_ser
     """It failed after 17 s, with the shapes of arrays."""
     policy(pendulum())
     trainable = (Machine.spec(None), "http://127.0.0.1:9")
-    monkeypatch.setattr("surrogym.cli.train._trainable", lambda *_, **__: trainable)
+    monkeypatch.setattr("surrogym.cli.commands.train._trainable", lambda *_, **__: trainable)
     said = on_server("train", name, "--start-from", "policy.zip", "--out", "next.zip")
     assert (said.code, said.out) == (1, "")
     assert said.err == (

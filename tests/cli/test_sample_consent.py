@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from support.rail import SPEC
+from surrogym.cli.commands.sample import _environment
 from surrogym.cli.errors import CommandError
-from surrogym.cli.sample import _environment
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from surrogym.cli import train
+from surrogym.cli.commands import train
 from surrogym_sampler.original.classic import pendulum
 from surrogym_sampler.original.loading import env_option
 from surrogym_trainer.training import TrainProgress, TrainResult, TrainSettings

@@ -11,7 +11,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-import surrogym.cli
+import surrogym.cli.commands
 from surrogym_sampler.diagnosis.access import Access, CheckFailed, examine
 from surrogym_sampler.diagnosis.doctor import environment
 from surrogym_sampler.original import RealStep
@@ -21,7 +21,7 @@ from surrogym_sampler.original.isolated import IsolatedEnvironment
 from surrogym_sampler.original.simulator import Simulated
 from surrogym_shared.spec import BoxAction, Coordinate, EnvironmentSpec, ObservationEntry, Term, Uniform
 
-CLI = Path(surrogym.cli.__file__).parent
+COMMANDS = Path(surrogym.cli.commands.__file__).parent
 PAGES = Path(__file__).parents[2] / "docs" / "how-to"
 RANGE = Uniform(low=-1, high=1)
 
@@ -136,7 +136,7 @@ def test_the_diagnosis_takes_the_number_of_real_steps_that_the_docs_state() -> N
     with IsolatedEnvironment(SavedRail) as opened:
         said = [finding.said for finding in environment(lambda: opened)]
     assert said[-1] == "set any state; this took 18 real steps and 4 resets at most"
-    told = (CLI / "doctor.py", *(PAGES / f"{name}.md" for name in ("environments-by-name", "own-environment")))
+    told = (COMMANDS / "doctor.py", *(PAGES / f"{name}.md" for name in ("environments-by-name", "own-environment")))
     for path in told:
         assert re.search(r"\b18 (real steps )?(at most|if)", text := path.read_text(encoding="utf-8")), path
         assert "14 real steps at most" not in text

@@ -86,7 +86,7 @@ def test_commands_refuse_steps_beyond_the_budget_in_one_sentence(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("SURROGYM_TOKEN", TOKENS["train"])
-    monkeypatch.setattr("surrogym.cli.train._trainable", lambda *_, **__: (pendulum(), guarded.url))
+    monkeypatch.setattr("surrogym.cli.commands.train._trainable", lambda *_, **__: (pendulum(), guarded.url))
     with pytest.raises(SystemExit) as ended:
         main([command[0], owned, *command[1:], "--server", guarded.url])
     said = capsys.readouterr().err

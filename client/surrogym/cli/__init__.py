@@ -1,5 +1,6 @@
-"""The ``surrogym`` command. Each file here is one command, with a function ``register(app)``. Other packages add
-commands through an entry point.
+"""The ``surrogym`` command. Each file of ``commands`` is one command. The other files here hold what the commands use.
+
+Other packages add commands through an entry point.
 """
 
 from __future__ import annotations
@@ -87,7 +88,9 @@ def build() -> typer.Typer:
     )
     app.callback()(_version)
     for name in COMMANDS:
-        register: Callable[[typer.Typer], None] = import_module(f"{__name__}.{name.replace('-', '_')}").register
+        register: Callable[[typer.Typer], None] = import_module(
+            f"{__name__}.commands.{name.replace('-', '_')}"
+        ).register
         register(app)
     for entry in entry_points(group=ENTRY_POINTS):
         entry.load()(app)

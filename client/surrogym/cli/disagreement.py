@@ -178,9 +178,9 @@ class Imagining:
     def changes(self, api: Api, view: SurrogateView, shifted: Systematic, weights: Any) -> Any:
         """Return the changes (K,) of the mean return of virtual episodes that K errors of the surrogate's model cause.
         ``shifted`` and ``weights`` describe the errors, as in ``changes_of``."""
-        from surrogym.cli.audit import session_of
         from surrogym_client.transport import HttpSurrogate
         from surrogym_trainer.evaluation.consequences import EFFECT_STARTS, changes_of
+        from surrogym_trainer.training.cards import session_of
 
         assert view.model_version is not None
         session = session_of(self.card, view)

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 from surrogym_client.runtime.versions import versions
 from surrogym_shared.spec import EnvironmentSpec
-from surrogym_shared.wire import CurvePoint
+from surrogym_shared.wire import CurvePoint, SurrogateView
 from surrogym_trainer.policies.card import NotedAddress, PolicyCard
 from surrogym_trainer.policies.pushing import thinned
 from surrogym_trainer.training.handover import Handover
-from surrogym_trainer.training.settings import TrainResult
+from surrogym_trainer.training.settings import TrainResult, noise_of
 
 
 def card_of(
@@ -51,3 +51,11 @@ def card_of(
         settings=result.settings,
         versions=versions(),
     )
+
+
+def session_of(card: PolicyCard, view: SurrogateView) -> dict[str, object]:
+    """Return the options of the session in which the policy was judged, from the policy's card. Noise that the design
+    has confirmed is added, unless the card has these options already."""
+    judged = card.settings.get("judge") or card.settings.get("session") or {}
+    noise: dict[str, object] = noise_of(view)
+    return {**noise, **judged} if isinstance(judged, dict) else noise

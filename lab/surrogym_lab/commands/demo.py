@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from surrogym.cli.demo import Budget, RunFolder, Steps, perform
+from surrogym.cli.commands.demo import Budget, RunFolder, Steps, perform
 from surrogym.cli.groups import add
 from surrogym.cli.options import ExitWithParent, Quiet
 from surrogym_lab.arms import ARMS

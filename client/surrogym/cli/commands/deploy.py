@@ -209,7 +209,7 @@ class LocalPolicy:
 
     def enter(self, comparison: Comparison) -> None:
         """Report the real steps of a check to the server, as steps of the surrogate."""
-        from surrogym.cli.evaluate import enter_steps, ledger_of
+        from surrogym.cli.commands.evaluate import enter_steps, ledger_of
 
         server, token = self.service.server, self.service.token_for(self.context)
         ledger = ledger_of(None, server, self.card, self.path, quiet=self.output.quiet)
@@ -308,8 +308,8 @@ def _local(
     """
     from tempfile import TemporaryDirectory
 
+    from surrogym.cli.commands.policy import parsed, stored_card
     from surrogym.cli.errors import CommandError
-    from surrogym.cli.policy import parsed, stored_card
     from surrogym_trainer.policies.card import write_card
     from surrogym_trainer.policies.files import card_of_policy
 

@@ -93,7 +93,7 @@ def _limits(api: Api, view: SurrogateView) -> list[str]:
 
 def _prior(api: Api, name: str) -> list[str]:
     """Return lines about the prior of a surrogate; empty if it has no prior and does not wait for one."""
-    from surrogym.cli.prior import words_of_prior
+    from surrogym.cli.commands.prior import words_of_prior
     from surrogym_client.transport.priors import PriorCalls
 
     stored = PriorCalls(api.connection).get(name)

@@ -79,6 +79,7 @@ def command(
     from surrogym_shared.terminal import progress
     from surrogym_trainer.evaluation.evaluator import EvaluationSettings
     from surrogym_trainer.policies.card import read_card, write_card
+    from surrogym_trainer.training.cards import session_of
     from surrogym_trainer.training.handover import AuditSettings, Subject, hand_over
     from surrogym_trainer.training.words import words_of_handover
 
@@ -191,16 +192,6 @@ def _floor(port: SurrogatePort, seed: int, session: dict[str, object]) -> float:
     spec = port.spec()
     predict = baseline(spec, default_baseline(spec), seed)
     return float(imagined_returns(port, predict, CHECK_EPISODES, seed, **session).mean())
-
-
-def session_of(card: PolicyCard, view: SurrogateView) -> dict[str, object]:
-    """Return the options of the session in which the policy was judged, from the policy's card. Noise that the design
-    has confirmed is added, unless the card has these options already."""
-    from surrogym_trainer.training.settings import noise_of
-
-    judged = card.settings.get("judge") or card.settings.get("session") or {}
-    noise: dict[str, object] = noise_of(view)
-    return {**noise, **judged} if isinstance(judged, dict) else noise
 
 
 def _actions(known: int | tuple[int, ...]) -> str:

@@ -249,7 +249,7 @@ def _words(name: str, policy: PolicyDetail) -> str:
 
 
 def _evaluation(one: EvaluationView) -> tuple[str | int, ...]:
-    from surrogym.cli.policies import words_of_mean
+    from surrogym.cli.commands.policies import words_of_mean
 
     success = "-" if one.success_rate is None else f"{one.success_rate:.0%}"
     kept = {True: "yes", False: "no", None: "not judged"}[one.promise_kept]

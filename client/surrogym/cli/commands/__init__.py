@@ -1,0 +1,1 @@
+"""The commands of ``surrogym``, one file each, with a function ``register(app)``."""
