@@ -1,4 +1,4 @@
-"""N lanes of one session, which survive the loss of the session. All environment classes use them.
+"""N lanes (environments that step together) of one session, which continue if the server loses the session.
 
 If the server loses a session (it crashed, or the session expired), the running episodes end as truncated at their last
 observation, with the reason. New episodes start in a new session. Nothing is reset silently.
@@ -73,7 +73,7 @@ def session_request(num_envs: int, mode: AutoresetMode, options: dict[str, Any])
 
 
 class Lanes:
-    """N lanes of one session of a surrogate. Making the object opens the session.
+    """The N lanes (environments that step together) of a session of a surrogate. Making the object opens the session.
 
     Args:
         port: the surrogate.

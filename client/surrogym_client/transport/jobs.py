@@ -62,6 +62,14 @@ class JobCalls:
         """Lease a job for a worker, and wait up to ``wait_seconds`` until there is one.
 
         A claim whose reply is lost is not sent again. Its lease expires, and the job returns to the queue.
+
+        Args:
+            surrogate: name of the surrogate.
+            worker: name of the worker.
+            most_episodes: largest number of real episodes of an evaluation that the worker accepts; 0: trainings only.
+            reference: whether the worker has a reference controller, which some evaluations need.
+            wait_seconds: longest wait for a job.
+            lease_seconds: length of the lease.
         """
         body = wire.ClaimJob(
             worker=worker,

@@ -9,7 +9,10 @@ from surrogym_shared.wire.priors import PriorView
 
 
 class PriorCalls:
-    """Methods for the routes of the prior of a surrogate. Every method raises the errors of ``Api``."""
+    """Methods for the routes of a surrogate's prior, a model of what is known before the first real step.
+
+    Every method raises the errors of ``Api``.
+    """
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection

@@ -1,4 +1,4 @@
-"""Logs of real steps: read, checked row by row, drafted into a specification, and sent to a surrogate.
+"""Read logs of real steps, check their rows, draft a specification from them, and send the steps to a surrogate.
 
 Examples:
     >>> from surrogym_sampler.logs import import_log

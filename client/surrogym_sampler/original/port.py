@@ -29,8 +29,8 @@ SEEDS = (2**20, 2**31)  # range of the seeds of resets, far from the seeds of ev
 
 
 class OriginalPort:
-    """A ``SurrogatePort`` whose episodes run in the original environment, in the autoreset mode of Stable-Baselines3
-    (same_step).
+    """A ``SurrogatePort``, the interface of sessions that trainers use, whose episodes run in the original environment.
+    Lanes are reset in the step that ends an episode (autoreset mode same_step), as in Stable-Baselines3.
 
     An environment that runs one instance at a time has one lane, in one session.
 

@@ -39,7 +39,7 @@ class Adjustable(Protocol):
 
 
 class Attributes:
-    """The numeric attributes of an object without the methods of ``Adjustable``, as its parameters."""
+    """Offers the numeric attributes of an object that lacks ``parameters`` and ``set_parameters`` as its parameters."""
 
     def __init__(self, plant: object) -> None:
         self._plant = plant

@@ -38,7 +38,7 @@ class Resettable(SnapshotEnvironment, Protocol):
 
 
 class Returning:
-    """The snapshots of an environment that answers queries.
+    """Saves states of an environment as snapshots, and returns to them for queries that begin there.
 
     Args:
         environment: saves and restores its state.

@@ -95,7 +95,7 @@ def _way_out(name: str) -> str:
 
 
 class _Gymnasium(Simulator):
-    """Resets and steps of a Gymnasium environment; the latest observation is kept."""
+    """Base class of simulators that reset and step a Gymnasium environment, and keep its latest observation."""
 
     def __init__(self, name: str, env: Any, limit: int | None) -> None:
         self._name, self._env, self._over = name, env, False

@@ -25,7 +25,7 @@ UNKNOWN_SPEED = 1.0  # assumed largest speed of a variable that never moved, in 
 
 
 class Ranges:
-    """The ranges of one simulator's variables, which are identified by their indices.
+    """Chooses the sampling range and the starts of each variable of a simulator. A variable is given by its index.
 
     Args:
         simulator: the simulator.

@@ -172,7 +172,7 @@ def _limits(variable: Declared) -> tuple[float, float] | None:
 
 
 def _shifted(variable: Declared, at: float) -> float:
-    """Return another start of a variable, shifted from ``at`` within its limits."""
+    """Return another start value of a variable: its present one, ``at``, shifted within its limits."""
     low, high = _limits(variable) or (at - 1.0, at + 1.0)
     shift = SHIFT * (high - low)
     return at + shift if at + shift <= high else at - shift
