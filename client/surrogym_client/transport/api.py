@@ -245,7 +245,7 @@ class Api:
         """Add queries of your own to the queue.
 
         A query is a state and an action: coordinates (n, C) and action (n, F). If the original environment can only be
-        reset, a query is a sequence of actions (T, F). Queries of an audit don't count towards the budget.
+        reset, a query is a sequence of T actions (T, F). Queries of an audit don't count towards the budget.
         """
         body = (wire.AuditModel if audit else wire.AddQueries)(
             coordinates=[list(row) for row in coordinates] or None,

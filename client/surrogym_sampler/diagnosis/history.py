@@ -70,7 +70,8 @@ class History:
 
 @dataclass(frozen=True)
 class _Episode:
-    """One episode: the coordinates read from the environment at each time (T + 1, R), and the actions (T, F)."""
+    """One episode of T steps: the R coordinates that the environment reports at each time (T + 1, R), and the actions
+    (T, F)."""
 
     read: Array
     action: Array
@@ -144,7 +145,8 @@ def _episodes(environment: RolloutEnvironment, spec: EnvironmentSpec, steps: int
 
 
 def _rows(episode: _Episode, changes: int, actions: int, turning: Bools, moving: Bools) -> tuple[Array, Array]:
-    """Return the regression's inputs (n, d) and next changes (n, M) from one episode.
+    """Return the d inputs of the regression (n, d) and the next changes of the M moving coordinates (n, M) in an
+    episode.
 
     The rows are the steps that have at least ``LONGEST`` earlier steps in the episode. So the errors of all histories
     come from the same steps and can be compared.
@@ -166,17 +168,17 @@ def _rows(episode: _Episode, changes: int, actions: int, turning: Bools, moving:
 
 
 def _changes(episode: _Episode, turning: Bools) -> Array:
-    """Return the change of each coordinate in each step (T, R). The change of an angle is the shorter way around the
-    circle."""
+    """Return the change of each of the R coordinates in each of the T steps (T, R). The change of an angle is the
+    shorter way around the circle."""
     change: Array = np.diff(episode.read, axis=0)
     change[:, turning] = (change[:, turning] + np.pi) % (2 * np.pi) - np.pi
     return change
 
 
 def _left_out_error(x: Array, y: Array) -> float:
-    """Return the leave-one-out error of a linear regression of changes y (n, M) on inputs x (n, d). For each
-    coordinate, it is the root mean square error as a share of the standard deviation of the coordinate's changes. The
-    largest of these is returned."""
+    """Return the leave-one-out error of a linear regression of n changes of M coordinates, y (n, M), on d inputs,
+    x (n, d). For each coordinate, it is the root mean square error as a share of the standard deviation of the
+    coordinate's changes. The largest of these is returned."""
     spread, size = x.std(0), y.std(0)
     z = np.hstack([np.ones((len(x), 1)), (x - x.mean(0)) / np.where(spread > 0, spread, 1.0)])
     gram = z.T @ z + RIDGE * len(z) * np.eye(z.shape[1])

@@ -23,7 +23,8 @@ NEXT = ("next_coordinates", "next_observations", "next_observation", "next_state
 
 
 def table_of_arrays(path: Path, arrays: dict[str, Any], names: Sequence[str] = ()) -> Table:
-    """Return the table of a log from a file's arrays: (n,) each, or (n, k) for states, actions and next states.
+    """Return the table of a log from a file's arrays: arrays (n,) with one value for each of n
+    steps, and arrays (n, k) with k coordinates, next coordinates or action entries.
 
     Args:
         path: the file, for messages.

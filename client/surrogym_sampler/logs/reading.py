@@ -216,8 +216,8 @@ def _is_plain(kind: Any) -> bool:
 
 
 def _of_column(path: Path, name: str, column: Any) -> Cells:
-    """Return a Parquet column as an array (n,), or (n, k) if its cells are lists. Equal texts share their memory; a
-    text that is too long raises ``UnusableLog``."""
+    """Return a Parquet column as an array (n,), or (n, k) if its cells are lists of k numbers. Equal texts share their
+    memory; a text that is too long raises ``UnusableLog``."""
     from pyarrow import compute, types
 
     if not types.is_dictionary(column.type):

@@ -19,7 +19,7 @@ def read_names(spec: EnvironmentSpec) -> tuple[str, ...]:
 
 
 def begun(spec: EnvironmentSpec, read: Array) -> Array:
-    """Return the coordinates (C,) after a reset in which the environment reported the values ``read`` (R,). The other
+    """Return the coordinates (C,) after a reset in which the environment reported R values, ``read`` (R,). The other
     coordinates are lags, which repeat earlier values: a lag that counts steps is 0, any other lag has the middle of its
     declared start.
 
@@ -37,7 +37,7 @@ def followed(spec: EnvironmentSpec, before: Array, action: Array, read: Array) -
         spec: the specification.
         before: coordinates (C,) before the step.
         action: the action (F,) of the step.
-        read: the values (R,) read after the step.
+        read: the R values (R,) that the environment reports after the step.
     """
     after = placed(spec, read, before)
     names = spec.coordinate_names
@@ -56,7 +56,7 @@ def followed(spec: EnvironmentSpec, before: Array, action: Array, read: Array) -
 
 
 def placed(spec: EnvironmentSpec, read: Array, lags: Array) -> Array:
-    """Return coordinates (C,) with the values ``read`` (R,) that the environment reported. Coordinates that repeat
+    """Return coordinates (C,) with the R values ``read`` (R,) that the environment reported. Coordinates that repeat
     earlier values (lags) are taken from ``lags`` (C,)."""
     placed = lags.copy()
     placed[[c.lag is None for c in spec.coordinates]] = read

@@ -49,7 +49,8 @@ class FromReset:
         """Reset the environment, and return the start coordinates (C,).
 
         Raises:
-            StepFailed: ``reset`` does not return a pair, or ``coordinates`` an array (R,).
+            StepFailed: ``reset`` does not return a pair, or ``coordinates`` not an array (R,) of the R coordinates
+                that are no lags.
         """
         self._at = None
         first: Any = self._environment.reset(seed=seed)
@@ -64,7 +65,8 @@ class FromReset:
         """Apply an action (F,), or the nearest one that keeps the declared rates, and return the real step.
 
         Raises:
-            StepFailed: no episode is running, or ``coordinates`` does not return an array (R,).
+            StepFailed: no episode is running, or ``coordinates`` does not return an array (R,) of the R coordinates
+                that are no lags.
         """
         if self._at is None:
             raise StepFailed(

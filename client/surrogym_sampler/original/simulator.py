@@ -110,11 +110,11 @@ class Simulator(ABC):
 
     @abstractmethod
     def read(self) -> Array:
-        """Return the state (V,)."""
+        """Return the V variables of the state (V,)."""
 
     @abstractmethod
     def write(self, state: Array) -> None:
-        """Set the state (V,), and clear all other memory of earlier steps."""
+        """Set the V variables of the state (V,), and clear all other memory of earlier steps."""
 
     def save(self) -> Array:
         """Return everything that the next step depends on, as K numbers (K,): more than ``read`` returns, if a solver
@@ -122,7 +122,7 @@ class Simulator(ABC):
         return self.read()
 
     def restore(self, saved: Array) -> None:
-        """Return to the state whose numbers (K,) ``save`` returned."""
+        """Return to the state whose K numbers (K,) ``save`` returned."""
         self.write(saved)
 
     @abstractmethod

@@ -38,7 +38,7 @@ class StatePart(Protocol):
         return self.read()
 
     def restore(self, saved: Array) -> None:
-        """Return to the state whose numbers (k,) ``save`` returned."""
+        """Return to the state whose k numbers (k,) ``save`` returned."""
         self.write(saved)
 
 

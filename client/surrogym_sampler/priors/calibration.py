@@ -100,7 +100,7 @@ def calibrate(
     Args:
         spec: the specification, which says which coordinates are angles.
         real: the real steps, at least two.
-        parameters: the parameters and their ranges, (P,). If there are none, only the error is computed.
+        parameters: the P parameters and their ranges. If there are none, only the error is computed.
         own: the simulator's own values, (P,).
         step: takes one step of the simulator; if it raises, the step counts as very wrong.
 
@@ -170,7 +170,7 @@ class _Errors:
 
 @dataclass(frozen=True)
 class _Scaling:
-    """Scaling of parameters to numbers x in [0, 1] (P,); parameters that are positive in their whole range are scaled
+    """Scaling of P parameters to numbers x in [0, 1] (P,); parameters that are positive in their whole range are scaled
     logarithmically."""
 
     low: Array
@@ -187,18 +187,18 @@ class _Scaling:
         )
 
     def values(self, x: Array) -> Array:
-        """Return the parameters' values for x (P,)."""
+        """Return the values (P,) of the P parameters for their scaled numbers x (P,)."""
         at = self.low + x * (self.high - self.low)
         return np.where(self.logarithmic, np.exp(np.where(self.logarithmic, at, 0.0)), at)
 
     def numbers(self, values: Array) -> Array:
-        """Return x (P,) for the parameters' values (P,)."""
+        """Return the scaled numbers x (P,) for the values (P,) of the P parameters."""
         at = np.where(self.logarithmic, np.log(np.where(self.logarithmic, values, 1.0)), values)
         return np.asarray((at - self.low) / (self.high - self.low))
 
 
 def _best(errors: _Errors, scaling: _Scaling, own: Array) -> Array:
-    """Return the scaled parameters x (P,) with the smallest weighted errors, found from several starting points.
+    """Return the P scaled parameters x (P,) with the smallest weighted errors, found from several starting points.
 
     The distance of each parameter from the simulator's own value, in standard deviations of its range, counts as one
     more error. So a parameter that the steps don't determine keeps that value.
@@ -226,8 +226,8 @@ def _best(errors: _Errors, scaling: _Scaling, own: Array) -> Array:
 
 
 def _weights(errors: Array) -> Array:
-    """Return the weight (M,) of each coordinate. A coordinate that is noisy, or that the simulator predicts badly, gets
-    a smaller weight."""
+    """Return the weight of each of the M coordinates that change (M,). A coordinate that is noisy, or that the
+    simulator predicts badly, gets a smaller weight."""
     sizes = np.sqrt((errors**2).mean(0))
     return np.asarray(1.0 / np.maximum(sizes, max(SMALLEST, LEAST_SHARE * sizes.max())))
 

@@ -52,7 +52,7 @@ def sample_of(query: Query, step: RealStep, size: int, number: int = 0) -> NewSa
 
 
 def _requested_actions(query: Query) -> list[list[float]]:
-    """Return the actions (T, F) of a query."""
+    """Return the actions of a query's T steps (T, F)."""
     return [query.action] if isinstance(query, StepQuery) else query.actions
 
 

@@ -42,7 +42,7 @@ def has_face(spec: EnvironmentSpec, terms: Sequence[Term], bounds: Array, states
     Args:
         spec: the environment.
         terms: quantities by which the points are compared.
-        bounds: points of the boundary (K, C).
+        bounds: K points of the boundary (K, C).
         states: states (n, C) that show the range of each quantity.
     """
     return any(face.points.sum() >= SURE for face in _faces(spec, terms, bounds, states))
@@ -54,7 +54,7 @@ def alone(spec: EnvironmentSpec, terms: Sequence[Term], bounds: Array, states: A
     Args:
         spec: the environment.
         terms: quantities by which the points are compared.
-        bounds: points of the boundary (K, C).
+        bounds: K points of the boundary (K, C).
         states: states (n, C) that show the range of each quantity.
     """
     left = np.ones(len(bounds), dtype=bool)
@@ -74,7 +74,7 @@ def box(
     Args:
         spec: the environment.
         terms: quantities that the inequalities may limit.
-        bounds: points of the boundary (K, C).
+        bounds: K points of the boundary (K, C).
         states: states inside and outside the region (n, C).
         inside: which of these states are in the region (n,).
     """

@@ -28,7 +28,7 @@ class Counted:
         self.name = name
 
     def reset(self, seed: int) -> Array:
-        """Begin an episode with a seed, and return the state (V,)."""
+        """Begin an episode with a seed, and return the V variables of the state (V,)."""
         self.resets += 1
         with self._failures(self.steps):
             self.simulator.reset(seed)
@@ -41,12 +41,12 @@ class Counted:
             return self.simulator.step(action)
 
     def read(self) -> Array:
-        """Return the state (V,)."""
+        """Return the V variables of the state (V,)."""
         with self._failures(self.steps):
             return self._read()
 
     def write(self, state: Array) -> None:
-        """Set the state (V,)."""
+        """Set the V variables of the state (V,)."""
         with self._failures(self.steps):
             self.simulator.write(state)
 
@@ -67,7 +67,8 @@ class Counted:
             return self.simulator.touches()
 
     def step_from(self, state: Array, action: Array) -> tuple[Array, Taken]:
-        """Set the state (V,) and take a step. Returns the next state (V,) and the step's results."""
+        """Set the V variables of the state (V,), and take a step. Returns the next state (V,) and the step's
+        results."""
         self.write(state)
         taken = self.step(action)
         return self.read(), taken

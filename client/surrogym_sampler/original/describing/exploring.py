@@ -31,8 +31,8 @@ class Seen:
     """The data of the explored episodes.
 
     Attributes:
-        starts: states after the resets (R, V).
-        states: states before each step (n, V).
+        starts: states after the R resets, each of V variables (R, V).
+        states: states before each of the n steps (n, V).
         actions: actions (n, F).
         next_states: states after each step (n, V).
         rewards: rewards (n,).
@@ -114,7 +114,7 @@ def _common_length(lengths: Sequence[int], longest: int) -> int | None:
 
 
 def _far_from(counted: Counted, visited: Array, state: Array, rng: np.random.Generator) -> Array:
-    """Set the simulator to a position far from the visited states, and return its state (V,).
+    """Set the simulator to a position far from the visited states, and return its state, V variables (V,).
 
     Of random positions within their limits and without contacts, the one farthest from all visited states is chosen. A
     distance is the norm of the positions' differences, each as a share of its range. If all positions have contacts,

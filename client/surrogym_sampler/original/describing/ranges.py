@@ -31,7 +31,7 @@ class Ranges:
         simulator: the simulator.
         seen: the explored steps.
         probed: results of repeated steps.
-        visited: all states of the explored episodes (n, V).
+        visited: all n states of the explored episodes, with V variables each (n, V).
     """
 
     def __init__(self, simulator: Simulator, seen: Seen, probed: Probed, visited: Array) -> None:

@@ -146,7 +146,7 @@ def _fitted(spec: EnvironmentSpec, steps: Paid, timing: Timing, size: float) -> 
 
 
 def _fewest(columns: Array, reward: Array, tolerance: float) -> Array | None:
-    """Return weights (k,) of the columns (n, k) that explain the reward (n,), as many of them 0 as possible; None if
+    """Return weights (k,) of the k columns (n, k) that explain the reward (n,), as many of them 0 as possible; None if
     all columns together don't explain it.
 
     Columns are left out one by one, beginning with the one that contributes least. This removes rounding errors and
@@ -171,18 +171,18 @@ def _fewest(columns: Array, reward: Array, tolerance: float) -> Array | None:
 
 
 def _read(spec: EnvironmentSpec, q: Array, u: Array) -> Array:
-    """Return the values (n, k) of the quantities of a quadratic reward in states (n, C) under actions (n, F)."""
+    """Return the values (n, k) of the k quantities of a quadratic reward in states (n, C) under actions (n, F)."""
     return np.stack([_values(spec, one, q, u) for one in _quantities(spec)], axis=1)
 
 
 def _scaled(x: Array) -> tuple[Array, Array, Array]:
-    """Return the columns of x (n, k) centred and scaled, the centre (k,), and the scale (k,)."""
+    """Return the k columns of x (n, k), centred and scaled, their centres (k,), and their scales (k,)."""
     centre, reach = x.mean(0), np.where(np.ptp(x, axis=0) > 0, x.std(0), 1.0)
     return (x - centre) / reach, centre, reach
 
 
 def _columns(z: Array) -> Array:
-    """Return the columns of the quadratic fit: 1, the columns of z (n, k), and the product of each pair of these,
+    """Return the columns of the quadratic fit: 1, the k columns of z (n, k), and the product of each pair of these,
     including their squares."""
     first, second = np.triu_indices(z.shape[1])
     return np.concatenate([np.ones((len(z), 1)), z, z[:, first] * z[:, second]], axis=1)

@@ -154,8 +154,8 @@ class _Boundary:
         return self.points
 
     def beside(self, chosen: NDArray[np.bool_]) -> None:
-        """Add a neighbouring boundary point for each of the chosen points (K,), unless an earlier call has done or
-        tried this."""
+        """Add a neighbouring boundary point for each chosen one of the K points (K,), unless an earlier call has done
+        or tried this."""
         width = np.ptp(self._steps.q, axis=0)
         new = self._paired + np.flatnonzero(chosen[self._paired :])
         self._paired = len(chosen)
@@ -242,7 +242,7 @@ def regions(spec: EnvironmentSpec, group: Sequence[Term], bounds: Array, states:
     Args:
         spec: the environment.
         group: the terms whose level or ellipsoid may be the boundary.
-        bounds: states (K, C) on the boundary.
+        bounds: K states (K, C) on the boundary.
         states: states (n, C) that show the range of each term.
     """
     x, elsewhere = (np.stack([evaluate(spec, term, q) for term in group], axis=1) for q in (bounds, states))
@@ -262,7 +262,7 @@ def _ellipsoid(group: Sequence[Term], x: Array, elsewhere: Array) -> tuple[Quant
 
     Args:
         group: the terms (k) that the points are values of.
-        x: points of the boundary (K, k).
+        x: K points of the boundary, by the values of the k terms (K, k).
         elsewhere: the values of other states (n, k).
     """
     middle, reach = x.mean(0), x.std(0)

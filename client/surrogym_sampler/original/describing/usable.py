@@ -28,7 +28,8 @@ def require_variables(name: str, variables: Sequence[Variable]) -> None:
 
 
 def require_few(name: str, variables: Sequence[Variable], moved: NDArray[np.bool_]) -> None:
-    """Raise ``UnknownEnvironment`` if too many variables moved; ``moved`` (V,) marks those that did.
+    """Raise ``UnknownEnvironment`` if too many variables moved; ``moved`` (V,) marks those that did among the
+    V variables.
 
     Variables that a drafted specification may leave out don't count: those that are held through an episode, and slides
     without limits.
@@ -38,7 +39,7 @@ def require_few(name: str, variables: Sequence[Variable], moved: NDArray[np.bool
 
 
 def require_numbers(name: str, states: Sequence[Array], rewards: Array) -> None:
-    """Raise ``UnknownEnvironment`` if states, each (n, V), or rewards (n,) are infinite or NaN."""
+    """Raise ``UnknownEnvironment`` if states, arrays (n, V) of V variables, or rewards (n,) are infinite or NaN."""
     if not all(np.isfinite(some).all() for some in states):
         raise UnknownEnvironment(
             f"{name} reached states with infinite values or NaN: expected finite numbers; narrow the "

@@ -80,7 +80,7 @@ class Process:
 
     @property
     def values(self) -> Array:
-        """The values (V,) of the FMU's variables after the last answer.
+        """The values of the V variables that are read (V,), after the last answer.
 
         Raises:
             StepFailed: the last request failed, so the values are unknown.
