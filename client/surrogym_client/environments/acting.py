@@ -21,8 +21,8 @@ class Taken:
     """Record of T steps of a policy, with the observations that it acted on."""
 
     rollout: PolicyRollout
-    seen: Floats  # (T, N, D) observations before each step
-    cut: Bools  # (T, N) whether a step ends an episode because the server lost the session
+    seen: Floats  # (T, N, D) observations of the N lanes before each of the T steps
+    cut: Bools  # (T, N) whether a step ends the episode of a lane, because the server lost the session
 
 
 class ActingLanes:
@@ -102,7 +102,7 @@ class _Done:
     """Record of the steps that a rollout has taken so far, with an entry of each list for each step."""
 
     results: list[StepResult]
-    actions: list[Floats]  # (N, F) actions of each step
+    actions: list[Floats]  # (N, F) actions of the N lanes in each step
     logs: list[Floats]  # (N,) log probabilities of each step's actions; empty without noise
     cut: list[Bools]  # (N,) lanes whose episode each step ends because the server lost the session
 

@@ -49,8 +49,8 @@ class FromReset:
         """Reset the environment, and return the start coordinates (C,).
 
         Raises:
-            StepFailed: ``reset`` does not return a pair, or ``coordinates`` not an array (R,) of the R coordinates
-                that are no lags.
+            StepFailed: ``reset`` does not return a pair, or ``coordinates`` does not return an array (R,) of the R
+                coordinates that are no lags.
         """
         self._at = None
         first: Any = self._environment.reset(seed=seed)
@@ -117,7 +117,7 @@ class FromReset:
 
         Raises:
             StepFailed: the snapshot is too short to contain the coordinates, or ``coordinates`` does not return an
-                array (R,).
+                array (R,) of the R coordinates that are no lags.
         """
         self._at = None
         if len(snapshot) < self._prefix:
