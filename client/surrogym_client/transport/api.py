@@ -178,7 +178,7 @@ class Api:
         *,
         max_queries: int = 1,
         wait_seconds: float = 0.0,
-        lease_seconds: float = wire.LEASE_SECONDS,
+        lease_seconds: float = wire.QUERY_LEASE_SECONDS,
         retries: Retries | None = None,
     ) -> wire.ClaimedQueries:
         """Lease up to ``max_queries`` queries for a sampler, and wait up to ``wait_seconds`` for the first one. The
@@ -213,7 +213,7 @@ class Api:
         query_id: int,
         lease_token: str,
         *,
-        lease_seconds: float = wire.LEASE_SECONDS,
+        lease_seconds: float = wire.QUERY_LEASE_SECONDS,
         retries: Retries | None = None,
     ) -> None:
         """Extend the lease of a query. ``retries`` replaces the retry budget of the connection.

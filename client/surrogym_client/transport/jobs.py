@@ -57,7 +57,7 @@ class JobCalls:
         most_episodes: int = 0,
         reference: bool = False,
         wait_seconds: float = 0.0,
-        lease_seconds: float = wire.LEASE_SECONDS,
+        lease_seconds: float = wire.JOB_LEASE_SECONDS,
     ) -> wire.LeasedJob | None:
         """Lease a job for a worker, and wait up to ``wait_seconds`` until there is one.
 
@@ -89,7 +89,7 @@ class JobCalls:
         lease_token: str,
         *,
         state: wire.JobState | None = None,
-        lease_seconds: float = wire.LEASE_SECONDS,
+        lease_seconds: float = wire.JOB_LEASE_SECONDS,
         retries: Retries | None = None,
     ) -> bool:
         """Renew the lease of a job, and store its progress. Returns whether the worker has to stop, because a person

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 from surrogym_sampler.queries.snapshots import Bounds
-from surrogym_shared.wire import LEASE_SECONDS, Phase
+from surrogym_shared.wire import QUERY_LEASE_SECONDS, Phase
 
 Outcome = Literal["answered", "failed", "dropped", "refused", "impossible"]
 
@@ -39,7 +39,7 @@ class SamplerSettings:
     name: str = field(default_factory=worker_name)
     batch: int = 4
     wait_seconds: float = 20.0
-    lease_seconds: float = LEASE_SECONDS
+    lease_seconds: float = QUERY_LEASE_SECONDS
     once: bool = False
     until_done: bool = False
     max_queries: int | None = None

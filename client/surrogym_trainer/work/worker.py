@@ -44,7 +44,7 @@ class WorkerSettings:
     name: str = field(default_factory=worker_name)
     folder: Path = Path("work")
     wait_seconds: float = 20.0
-    lease_seconds: float = wire.LEASE_SECONDS
+    lease_seconds: float = wire.JOB_LEASE_SECONDS
     once: bool = False
 
 

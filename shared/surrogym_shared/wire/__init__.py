@@ -25,14 +25,14 @@ if TYPE_CHECKING:
 
 _NAMES = {
     "base": (
-        "LEASE_SECONDS MAX_BATCH MAX_CLAIM MAX_DRAWS MAX_IMAGINED MAX_LANES MAX_MEASURED MAX_PARTICLES MAX_ROLLOUT "
-        "PROTOCOL AutoresetMode Key Matrix Measured Phase Purpose QueryKind QueryStatus Reply Request Role "
-        "SamplePurpose Seed Seq SurrogateName Variant Vector"
+        "MAX_BATCH MAX_CLAIM MAX_DRAWS MAX_IMAGINED MAX_LANES MAX_MEASURED MAX_PARTICLES MAX_ROLLOUT PROTOCOL "
+        "AutoresetMode Key Matrix Measured Phase Purpose QueryKind QueryStatus Reply Request Role SamplePurpose Seed "
+        "Seq SurrogateName Variant Vector"
     ),
     "jobs": (
-        "MAX_JOB_EPISODES MAX_JOB_POINTS MAX_JOB_STEPS AddJob ClaimedJob ClaimJob EvaluateTask FinishJob "
-        "JobAlgorithm JobDetail JobEnd JobList JobPoint JobPreset JobStage JobState JobStatus JobView LeasedJob "
-        "ReportedJob ReportJob Task TrainTask WorkerView"
+        "JOB_LEASE_SECONDS MAX_JOB_EPISODES MAX_JOB_POINTS MAX_JOB_STEPS AddJob ClaimedJob ClaimJob EvaluateTask "
+        "FinishJob JobAlgorithm JobDetail JobEnd JobList JobPoint JobPreset JobStage JobState JobStatus JobView "
+        "LeasedJob ReportedJob ReportJob Task TrainTask WorkerView"
     ),
     "logs": "MAX_LOG MAX_REJECTED AddedLog AddLog DraftedLog DraftLog LogReport RejectedRow",
     "models": "Imagine Imagined ImaginedEpisode ModelList ModelView Points Prediction Uncertainty",
@@ -43,9 +43,10 @@ _NAMES = {
         "PutAlias TraceRank"
     ),
     "queries": (
-        "AddedSamples AddQueries AddSamples AuditModel ClaimedQueries ClaimQueries DroppedSnapshots DropSnapshots "
-        "FailQuery Improve LeasedQuery NewSample Query QueryList QueryView RenewLease ReportSteps RolloutQuery "
-        "SamplePage SampleView SnapshotList SnapshotView StepQuery WithdrawnQueries WithdrawQueries"
+        "QUERY_LEASE_SECONDS AddedSamples AddQueries AddSamples AuditModel ClaimedQueries ClaimQueries "
+        "DroppedSnapshots DropSnapshots FailQuery Improve LeasedQuery NewSample Query QueryList QueryView RenewLease "
+        "ReportSteps RolloutQuery SamplePage SampleView SnapshotList SnapshotView StepQuery WithdrawnQueries "
+        "WithdrawQueries"
     ),
     "service": "Access Event Health Ready",
     "sessions": (

@@ -19,7 +19,6 @@ from surrogym_shared.states import QueryStatus as QueryStatus
 from surrogym_shared.states import SamplePurpose as SamplePurpose
 
 PROTOCOL = 1
-LEASE_SECONDS = 60.0  # default duration of a lease, on a query by a sampler or on a job by a worker
 MAX_LANES = 65_536
 MAX_PARTICLES = 1_000_000
 MAX_CLAIM = 256

@@ -9,8 +9,9 @@ from pydantic import Field, model_validator
 from surrogym_shared.patterns import POLICY, VISIBLE
 from surrogym_shared.states import JobEnd as JobEnd
 from surrogym_shared.states import JobStatus as JobStatus
-from surrogym_shared.wire.base import LEASE_SECONDS, Key, Measured, Reply, Request
+from surrogym_shared.wire.base import Key, Measured, Reply, Request
 
+JOB_LEASE_SECONDS = 60.0  # default duration of a worker's lease of a job
 MAX_JOB_EPISODES = 1_000  # largest number of real episodes of an evaluation
 MAX_JOB_STEPS = 10_000_000  # largest number of virtual steps of a training
 MAX_JOB_POINTS = 200  # largest number of points of a training's learning curve
@@ -132,7 +133,7 @@ class ClaimJob(Request):
         default=0.0, description="seconds that the reply may wait for a job; 0: reply at once"
     )
     lease_seconds: LeaseSeconds = Field(
-        default=LEASE_SECONDS, description="seconds until the lease ends, unless a report renews the lease"
+        default=JOB_LEASE_SECONDS, description="seconds until the lease ends, unless a report renews the lease"
     )
 
 
@@ -188,7 +189,7 @@ class ReportJob(Request):
     """Report of a worker on the progress of its job, which extends the job's lease to ``lease_seconds`` from now."""
 
     lease_token: Key = Field(description="token of the lease")
-    lease_seconds: LeaseSeconds = Field(default=LEASE_SECONDS, description="seconds from now until the lease ends")
+    lease_seconds: LeaseSeconds = Field(default=JOB_LEASE_SECONDS, description="seconds from now until the lease ends")
     state: JobState | None = Field(
         default=None, description="progress of the job; null: unchanged since the last report"
     )

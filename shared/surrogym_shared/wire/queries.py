@@ -8,7 +8,6 @@ from pydantic import Field
 
 from surrogym_shared.spec import MAX_ROLLOUT_QUERY
 from surrogym_shared.wire.base import (
-    LEASE_SECONDS,
     MAX_BATCH,
     MAX_CLAIM,
     Key,
@@ -25,6 +24,8 @@ from surrogym_shared.wire.base import (
 )
 from surrogym_shared.wire.surrogates import Ledger
 
+QUERY_LEASE_SECONDS = 60.0  # default duration of a sampler's lease of a query
+
 ActionSequence = Annotated[list[Vector], Field(min_length=1, max_length=MAX_ROLLOUT_QUERY)]
 
 
@@ -39,7 +40,7 @@ class ClaimQueries(Request):
         default=0.0, description="seconds that the reply may wait for a query; 0: reply at once"
     )
     lease_seconds: Annotated[float, Field(gt=0, le=86_400)] = Field(
-        default=LEASE_SECONDS, description="seconds until the leases end, unless the sampler renews them"
+        default=QUERY_LEASE_SECONDS, description="seconds until the leases end, unless the sampler renews them"
     )
 
 
@@ -98,7 +99,7 @@ class RenewLease(Request):
 
     lease_token: Key = Field(description="token of the lease")
     lease_seconds: Annotated[float, Field(gt=0, le=86_400)] = Field(
-        default=LEASE_SECONDS, description="seconds from now until the lease ends"
+        default=QUERY_LEASE_SECONDS, description="seconds from now until the lease ends"
     )
 
 

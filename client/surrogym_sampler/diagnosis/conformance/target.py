@@ -109,7 +109,7 @@ class Target:
         answer: dict[str, Any] = reply.json()
         return answer
 
-    def claim(self, lease_seconds: float = wire.LEASE_SECONDS) -> wire.StepQuery:
+    def claim(self, lease_seconds: float = wire.QUERY_LEASE_SECONDS) -> wire.StepQuery:
         """Claim one query of the surrogate under a lease of ``lease_seconds``. Raises ``Mismatch`` if there is none
         within 5 s."""
         claimed = self.api.claim(self.surrogate, "conformance", lease_seconds=lease_seconds, wait_seconds=5.0)
