@@ -1,7 +1,7 @@
 """Interface between ``app.py`` and the optional features.
 
-A feature is one folder of ``features``, with its routes, its service and its database tables. It imports other parts of
-the server, and only ``app.py`` imports it.
+A feature is one folder of ``features``, with its routes, its service and the database tables that only it reads. It
+imports other parts of the server, and only ``app.py`` imports it.
 """
 
 from __future__ import annotations

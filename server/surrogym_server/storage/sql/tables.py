@@ -1,7 +1,7 @@
 """The tables of the database. Vectors are little-endian float64 bytes, which keeps all bits; JSON is text.
 
 Rows of a surrogate are deleted with it (``ON DELETE CASCADE``). Ids are never used twice. An optional feature defines
-its tables in its own folder, with the same ``metadata``.
+the tables that only it reads in its own folder, with the same ``metadata``. Other parts read the policies and priors.
 """
 
 from __future__ import annotations
