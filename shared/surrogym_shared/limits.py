@@ -66,6 +66,10 @@ def is_near(margin: Array, now: Array, before: Array) -> Bools:
     one more step with the same change, as booleans (n,).
 
     ``margin`` (L,) has the margins, ``now`` and ``before`` (n, L) the distances now and one step earlier.
+
+    The sampler's guard and ``surrogym_trainer.deployment.reference`` call this function. Three files write the rule in
+    another form, and must agree with it: ``surrogym_server.environment.safety`` for tensors,
+    ``surrogym_trainer.deployment.c.source`` in C, and ``surrogym_trainer.deployment.st.source`` in structured text.
     """
     with np.errstate(invalid="ignore"):  # a limit without ends has an infinite distance, and inf - inf is NaN
         return np.asarray((np.fmin(now, 2 * now - before) < margin).any(axis=-1))

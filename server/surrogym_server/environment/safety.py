@@ -57,6 +57,6 @@ class Limits:
     def falls_back(self, q: Tensor, q_next: Tensor) -> Tensor:
         """Return whether the fallback action takes over after a step from q (..., C) to q_next (..., C), (...) bool. It
         does if the distance to an end of a limit is below the limit's margin at q_next, or would be after one more step
-        in which the distance changes as much as in this one."""
+        in which the distance changes as much as in this one: the rule of ``surrogym_shared.limits.is_near``."""
         now = self.room(q_next)
         return (torch.minimum(now, 2 * now - self.room(q)) < self.margin).any(-1)

@@ -101,7 +101,7 @@ def parts_of(controller: Controller, prefix: str) -> dict[str, str]:
 
 def _guard(controller: Controller, prefix: str) -> dict[str, str]:
     """Return the parts of the source that replace the policy's action if a limit would be left soon; they are empty if
-    the controller has no limits."""
+    the controller has no limits. The source computes the rule of ``surrogym_shared.limits.is_near`` in C."""
     guard = controller.guard
     if guard is None:
         return {"limited": "", "known": "", "guard": "", "not_limited": "status"}

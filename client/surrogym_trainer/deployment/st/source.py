@@ -203,7 +203,7 @@ END_IF"""
 
 def _guard(controller: Controller, real: str) -> dict[str, str]:
     """Return the parts of the source that replace the policy's action if a limit would be left soon; they are empty if
-    the controller has no limits."""
+    the controller has no limits. The source computes the rule of ``surrogym_shared.limits.is_near``."""
     guard = controller.guard
     if guard is None:
         return {"guard": "", "guard_variables": "", "limited": ""}
