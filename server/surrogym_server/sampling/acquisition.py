@@ -112,6 +112,10 @@ class IntegratedVariance(Acquisition):
     """Criterion: by how much a real step at the candidate would reduce the variance at reference points, which are
     spread over the sampling range and the states that policies visited.
 
+    The model computes the reduction: ``ProcessOutlook.reduction`` of ``models.gaussian_process.prediction.lookahead``,
+    or ``NearbyAnswers`` of ``sampling.outlook`` for models without lookahead. This is the default acquisition, which
+    ``surrogym_shared.presets`` chooses.
+
     Reference: D. Cohn (1993), NIPS 6.
     """
 
