@@ -203,7 +203,7 @@ class Actor:
                 f"policy: expected {outputs} units in the last layer, as the action space needs, got {policy.units[-1]}"
             )
         if self.counts and log is not None:
-            raise ValueError("policy: expected no log_deviations with discrete actions, got some")
+            raise ValueError("policy: expected no log_deviations with discrete actions, got some: leave them out")
         if self.noisy and not self.counts and log is None:
             raise ValueError("policy: expected log_deviations with noise, got none: give them, or request no noise")
         if log is not None and log.size != len(self.low):

@@ -122,7 +122,9 @@ def _require_once(names: list[str]) -> None:
 def _stream(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> IO[bytes]:
     """Open an entry of a zip file, from which at most the number of bytes in its header can be read."""
     if entry.compress_type not in INFLATED:
-        raise ValueError(f"expected {entry.filename!r} uncompressed or deflated, got zip method {entry.compress_type}")
+        raise ValueError(
+            f"expected {entry.filename!r} in a zip file uncompressed or deflated, got method {entry.compress_type}"
+        )
     return archive.open(entry)
 
 
@@ -131,7 +133,7 @@ def _content(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> bytes:
         content = file.read(entry.file_size)
     if len(content) != entry.file_size:
         raise ValueError(
-            f"expected {entry.file_size} bytes of {entry.filename!r}, got {len(content)}: the file is damaged"
+            f"expected {entry.file_size} bytes of {entry.filename!r}, got {len(content)}: the zip file is damaged"
         )
     return content
 
@@ -163,4 +165,6 @@ def _array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, name: str) -> NDArr
         try:
             return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
         except ValueError as error:
-            raise ValueError(f"expected {entry.file_size} bytes of {name!r}, got fewer: the file is damaged") from error
+            raise ValueError(
+                f"expected {entry.file_size} bytes of {name!r}, got fewer: the zip file is damaged"
+            ) from error

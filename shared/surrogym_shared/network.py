@@ -224,7 +224,9 @@ def _require_chain(head: _Head, headers: Mapping[str, Header]) -> None:
     """
     names = {*OUTSIDE, *(name for names in head.names for name in names)}
     if names != set(headers):
-        raise ValueError(f"expected the arrays {', '.join(sorted(names))}, got {', '.join(sorted(headers)) or 'none'}")
+        raise ValueError(
+            f"expected the arrays {', '.join(sorted(names))} of a network, got {', '.join(sorted(headers)) or 'none'}"
+        )
     for name, shape in _chained(head, headers).items():
         header = headers[name]
         if header.shape != shape or header.dtype.kind != "f":

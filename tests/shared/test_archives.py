@@ -118,7 +118,7 @@ def test_a_zip_with_an_unbounded_compression_method_is_refused(kind: int):
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w", kind) as archive:
         archive.writestr("a", b"content")
-    with pytest.raises(ValueError, match="'a' uncompressed or deflated, got zip method"):
+    with pytest.raises(ValueError, match="'a' in a zip file uncompressed or deflated, got method"):
         read_entries(file.getvalue(), MEBIBYTE)
 
 

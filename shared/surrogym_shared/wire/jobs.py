@@ -54,7 +54,7 @@ class TrainTask(Request):
     @model_validator(mode="after")
     def _one_length(self) -> TrainTask:
         if self.preset == "quick" and self.steps is not None:
-            raise ValueError("expected steps or preset quick, got both: leave one out")
+            raise ValueError("expected steps or the preset quick, which sets the steps, got both: leave one out")
         return self
 
 

@@ -80,7 +80,9 @@ class FolderBlobs(Blobs):
         try:
             return (self._folder / _checked(name)).read_bytes()
         except OSError as error:
-            raise damaged(f"a file of a policy can't be read from {self._folder}: {error.strerror}") from error
+            raise damaged(
+                f"a file of a policy can't be read from {self._folder}: {error.strerror}; restore it from a backup"
+            ) from error
 
     def remove(self, names: Freed) -> None:
         for name in names:
@@ -123,7 +125,7 @@ class RowBlobs(Blobs):
         with self._database.read() as connection:
             content = connection.execute(sa.select(blobs.c.content).where(blobs.c.name == name)).scalar()
         if content is None:
-            raise damaged(f"the file {name} of a policy is missing in the table blobs")
+            raise damaged(f"the file {name} of a policy is missing in the table blobs: restore it from a backup")
         return bytes(content)
 
     def remove(self, names: Freed) -> None:

@@ -68,7 +68,9 @@ class PriorService:
         except NotASurrogateFile as error:
             raise InvalidInput(str(error)) from error
         except ValidationError as error:
-            raise InvalidInput(f"the description of the prior in this file is invalid: {first_fault(error)}") from error
+            raise InvalidInput(
+                f"the description of the prior in this file is invalid: {first_fault(error)}; export the prior again"
+            ) from error
         _require_alike(spec, file.spec)
         try:
             with plugin_calls(definition, interrupts=True):

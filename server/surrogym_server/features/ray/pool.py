@@ -66,7 +66,9 @@ def connect(settings: Settings, storage: Storage) -> SessionEngine:
     except RuntimeError as error:  # for example, the versions of Ray or Python differ
         said = " ".join(str(error).split())
         if "ersion mismatch" in said:
-            raise InvalidInput(f"engine ray: expected a cluster of the same versions: {said}") from error
+            raise InvalidInput(
+                f"engine ray: expected a cluster with this server's versions of Ray and Python: {said}"
+            ) from error
         raise Unavailable(f"engine ray: the cluster can't be used: {said}") from error
     return _of_hosts(HostSettings.of(settings), storage.part(LiveSessions))
 

@@ -55,7 +55,7 @@ class SqlModels(port.Models):
         with self._database.read() as connection:
             row = _one(connection, name, version, models.c.version, models.c.blob, models.c.checksum)
         if checksum(row.blob) != row.checksum:
-            raise damaged(f"model {row.version} of {name!r} has changed since it was stored: its checksum differs")
+            raise damaged(f"model {row.version} of {name!r} has changed since it was stored, as its checksum shows")
         return bytes(row.blob)
 
     def set_aside(self, name: str, version: int, damage: str) -> bool:

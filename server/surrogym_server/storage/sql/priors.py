@@ -33,7 +33,9 @@ class SqlPriors(port.Priors):
         if row is None or row.blob is None:
             return None
         if checksum(row.blob) != row.checksum:
-            raise damaged(f"the prior of {name!r} has changed since it was stored: its checksum differs")
+            raise damaged(
+                f"the prior of {name!r} has changed since it was stored, as its checksum shows: store the prior again"
+            )
         return bytes(row.blob)
 
     def put(self, name: str, blob: bytes, about: JSON) -> None:

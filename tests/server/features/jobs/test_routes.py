@@ -105,7 +105,7 @@ def test_more_unfinished_jobs_than_the_limit_are_refused(api: Api, known: str):
     [
         ({"kind": "train", "algorithm": "os:system"}, "algorithm"),
         ({"kind": "train", "steps": 10**9}, "steps"),
-        ({"kind": "train", "steps": 5, "preset": "quick"}, "expected steps or preset quick"),
+        ({"kind": "train", "steps": 5, "preset": "quick"}, "expected steps or the preset quick"),
         ({"kind": "train", "hyperparameters": {}}, "hyperparameters"),
         ({"kind": "evaluate", "env": "os:system"}, "env"),
         ({"kind": "evaluate", "episodes": 10**6}, "episodes"),

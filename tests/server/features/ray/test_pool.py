@@ -21,7 +21,9 @@ def test_a_cluster_with_another_ray_version_is_refused_in_one_sentence(monkeypat
 
     monkeypatch.setattr(ray, "init", init)
     settings = Settings(database="postgresql+psycopg://here/there", engine="ray")
-    with pytest.raises(InvalidInput, match=r"expected a cluster of the same versions: .* Ray: 2\.50\.0") as refused:
+    with pytest.raises(
+        InvalidInput, match=r"expected a cluster with this server's versions of Ray and Python: .* Ray: 2\.50\.0"
+    ) as refused:
         pool.connect(settings, None)  # type: ignore[arg-type]
     assert "\n" not in str(refused.value)
 
