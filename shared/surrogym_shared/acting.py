@@ -210,7 +210,8 @@ class Actor:
             raise ValueError(f"policy: expected log_deviations of {len(self.low)} entries, got {log.size}")
 
     def act(self, observation: NDArray[Any], noise: NoiseKey | None) -> Acted:
-        """Return the policy's actions for observations (N, D): with the noise of a key, or without noise if it is None.
+        """Return the policy's actions for N observations of D entries, (N, D): with the noise of a key, or the most
+        probable actions if ``noise`` is None.
 
         Raises:
             ValueError: the network's outputs are not finite.

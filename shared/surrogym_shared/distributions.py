@@ -18,8 +18,9 @@ Array = NDArray[np.floating[Any]]  # of float32 during a training
 
 
 class Sampled(Protocol):
-    """Distribution of actions (B, F), given the outputs of an actor (B, A) and further parameters (K,), such as
-    logarithms of standard deviations."""
+    """Distribution of actions of F entries for B observations, (B, F), given A outputs of an actor for each, (B, A),
+    and
+    K further parameters (K,), such as logarithms of standard deviations."""
 
     @property
     def outputs(self) -> int:
@@ -27,15 +28,16 @@ class Sampled(Protocol):
         ...
 
     def sample(self, outputs: Array, further: Array, rng: np.random.Generator) -> tuple[Array, Array]:
-        """Draw actions (B, F), not yet clipped to bounds, and return them with their log probabilities (B,)."""
+        """Draw B actions (B, F) with F entries, not clipped to bounds. Return them and their log probabilities (B,)."""
         ...
 
     def sent(self, actions: Array) -> NDArray[Any]:
-        """Convert sampled actions (B, F) to those that a surrogate takes: clipped to bounds, or integer choices."""
+        """Convert B sampled actions (B, F) to actions that a surrogate takes: clipped to bounds, or integer choices."""
         ...
 
     def log_probability(self, outputs: Array, further: Array, actions: Array) -> Array:
-        """Return the log probabilities (B,) of actions (B, F)."""
+        """Return the log probability of each of B actions (B, F) with F entries, (B,), given the actor's outputs (B,
+        A)."""
         ...
 
 
@@ -96,7 +98,7 @@ class Choices:
         return log
 
     def parts(self, outputs: Array) -> list[Array]:
-        """Split the outputs (B, A) of an actor into the logits of each action entry."""
+        """Split an actor's A outputs for B observations, (B, A), into the logits of each action entry."""
         return np.split(outputs, np.cumsum(self.counts)[:-1], axis=1)
 
 

@@ -226,7 +226,8 @@ def reset_request(seq: int | None, seed: int | Sequence[int] | None, mask: Bools
 
 
 def step_request(seq: int | None, action: Array, mask: Bools | None, deviations: bool) -> StepRequest:
-    """Build the request of a step with an action (N, F). ``mask`` (N,) is True for the lanes to step; None steps all.
+    """Build the request of a step with the actions (N, F) of N lanes. ``mask`` (N,) is True for the lanes to step; None
+    steps all.
     With
     ``deviations``, the reply has the predicted standard deviation of each output."""
     view = None if mask is None else _flat(mask, BOOL)
@@ -273,12 +274,12 @@ def mask_of(request: ResetRequest | StepRequest, shape: Shape) -> Bools | None:
 
 
 def action_of(request: StepRequest, shape: Shape) -> NDArray[np.float64]:
-    """Return the action (N, F) of a request, as a view of the frame. Raises ``FrameError``."""
+    """Return the actions (N, F) of N lanes in a request, as a view of the frame. Raises ``FrameError``."""
     return _array("action", request.action, FLOAT64, (shape.lanes, shape.action))
 
 
 def actions_of(request: RolloutRequest, shape: Shape) -> NDArray[np.float64]:
-    """Return the actions (T, N, F) of a request, as a view of the frame. Raises ``FrameError``."""
+    """Return the actions (T, N, F) of T steps of N lanes, as a view of the frame. Raises ``FrameError``."""
     lanes, size, nbytes = shape.lanes, shape.action, request.actions.nbytes
     steps, rest = divmod(nbytes, lanes * size * FLOAT64.itemsize)
     if rest or not 1 <= steps <= MAX_ROLLOUT:

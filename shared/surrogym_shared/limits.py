@@ -31,8 +31,8 @@ def limits_of(spec: EnvironmentSpec) -> Limits:
 
 
 def room(spec: EnvironmentSpec, coordinates: Array) -> Array:
-    """Return the distances (n, L) from coordinates (n, C) to the nearer end of each of L limits, in the limit's unit.
-    A distance is negative beyond the end."""
+    """Return the distances (n, L) of n states with coordinates (n, C) from the nearer end of each of L limits, in the
+    limit's unit. A distance is negative beyond the end."""
     columns = []
     for limit in limits_of(spec).keep:
         value = evaluate(spec, limit.term, coordinates)
@@ -57,7 +57,7 @@ def falls_back(spec: EnvironmentSpec, before: Array, coordinates: Array) -> Bool
 
 
 def margins(spec: EnvironmentSpec) -> Array:
-    """Return the margin (L,) of each limit."""
+    """Return the margin of each of the L limits of a specification, (L,)."""
     return np.array([limit.margin for limit in limits_of(spec).keep])
 
 
@@ -76,7 +76,7 @@ def is_near(margin: Array, now: Array, before: Array) -> Bools:
 
 
 def fallback_action(spec: EnvironmentSpec, coordinates: Array) -> Array:
-    """Return the action (F,) that the fallback takes at coordinates (C,)."""
+    """Return the action (F,), with F entries, that the fallback takes in a state with coordinates (C,)."""
     terms = limits_of(spec).fallback
     assert not isinstance(terms, NamedFallback)  # a program at the machine, which is not called here
     return clipped_action(spec, [float(evaluate(spec, term, coordinates[None])[0]) for term in terms])

@@ -102,12 +102,13 @@ class Network:
         return np.concatenate([part.ravel() for layer in parts for part in layer])
 
     def __call__(self, observation: NDArray[Any]) -> NDArray[Any]:
-        """Return the actions (..., N, F) for N observations (..., N, D); int64 (..., N) for one discrete entry."""
+        """Return actions of F entries (..., N, F) for N observations of D entries (..., N, D). For an action of one
+        discrete entry, they are int64 (..., N)."""
         return most_probable(self.outputs(observation), self.low, self.high, self.counts)
 
     def outputs(self, observation: NDArray[Any]) -> NDArray[np.floating[Any]]:
-        """Return the outputs (..., N, A) of the last layer: continuous actions before their tanh, or scores of discrete
-        choices."""
+        """Return the A outputs (..., N, A) of the last layer for N observations (..., N, D): continuous actions before
+        their tanh, or scores of discrete choices."""
         x = (np.asarray(observation, dtype=np.float64) - self.mean) / self.deviation
         return forward(self.layers, self.activation, x)
 
@@ -156,7 +157,7 @@ class Network:
 
 
 def forward(layers: Sequence[Layer], activation: Activation, x: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
-    """Return the outputs (..., N, A) of a network's layers for inputs (..., N, D)."""
+    """Return the A outputs of a network's layers for N inputs of D entries: (..., N, A) for ``x`` (..., N, D)."""
     *hidden, last = layers
     for weights, bias in hidden:
         x = x @ weights + bias[..., None, :]
@@ -191,7 +192,7 @@ def counts_of(spec: EnvironmentSpec) -> tuple[int, ...]:
 
 
 def bounds_of(spec: EnvironmentSpec) -> tuple[Array, Array]:
-    """Return the bounds (F,) of a continuous action; empty for a discrete one."""
+    """Return the lower and the upper bounds (F,) of a continuous action of F entries; both empty for a discrete one."""
     if isinstance(spec.action, BoxAction):
         return np.array(spec.action.low), np.array(spec.action.high)
     return np.zeros(0), np.zeros(0)

@@ -48,12 +48,12 @@ class Query:
 
     @property
     def action(self) -> Vector:
-        """The first action (F,), which is the only one of a single step."""
+        """The first action (F,), of F entries, which is the only action of a query of one step."""
         return self.actions[0]
 
     @property
     def steps(self) -> int:
-        """Largest number of real steps of the answer, T."""
+        """Largest number of real steps in the answer to the query: its number of actions, T."""
         return len(self.actions)
 
 

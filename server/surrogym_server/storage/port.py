@@ -278,8 +278,8 @@ class Queries(ABC):
         """End the lease of a query that could not be answered. The query becomes pending again, or is set aside after
         its last attempt. A refused query is not leased again.
 
-        A repeat changes nothing. If the query begins at a snapshot that was dropped during the lease, it is removed, or
-        set aside if a step may have been taken.
+        A repeat changes nothing. If the query begins at a snapshot that was dropped during the lease, the query is
+        removed, or set aside if a step may have been taken.
 
         Args:
             name: name of the surrogate.
@@ -374,7 +374,8 @@ class Snapshots(ABC):
 
     @abstractmethod
     def all(self, name: str) -> dict[str, Vector]:
-        """Return the coordinates (C,) of each snapshot of a surrogate, by the snapshot's name, oldest first."""
+        """Return the coordinates (C,) of the state in each snapshot of a surrogate, by the snapshot's name, oldest
+        first."""
 
     @abstractmethod
     def drop(self, name: str, snapshots: Sequence[str]) -> int:

@@ -197,7 +197,7 @@ def _units(names: Iterable[str], columns: Iterable[str | None]) -> dict[str, str
 
 
 def _as_time(one: Heading) -> Heading | None:
-    """Return a column's heading split into name and unit if the column has times; otherwise None."""
+    """Return the heading of a column of times, split into name and unit; None for a heading that is not of times."""
     for quantity in (one, timed(one)):
         short = len(quantity.plain) == 1
         units = SHORT_TIMES if short and quantity is not one else TIMES
@@ -304,7 +304,8 @@ def _choices(mapped: LogMapping, action: Mapping[str, str], where: str) -> dict[
 
 
 def _single(role: str, pairs: Iterable[tuple[str, str]]) -> dict[str, str]:
-    """Return the column of each state or action, by its name. Raises ``UnusableLog`` if two have the same name."""
+    """Return the column of each state or action, by the name of the state or action. Raises ``UnusableLog`` if two
+    columns have the same name."""
     columns: dict[str, str] = {}
     for name, column in pairs:
         if name in columns:

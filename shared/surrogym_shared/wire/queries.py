@@ -151,7 +151,7 @@ class QueryView(Reply):
 
 
 class QueryList(Reply):
-    """Queries of a surrogate."""
+    """Reply with queries of a surrogate."""
 
     queries: list[QueryView] = Field(description="the listed or added queries, oldest first")
 

@@ -229,7 +229,7 @@ class SessionView(Reply):
 
 
 class SessionActivity(Reply):
-    """Activity of a session since this server process opened or restored it."""
+    """Virtual steps and imagined returns of a session since this server process opened or restored it."""
 
     id: str = Field(description="id of the session")
     num_envs: int = Field(description="number of lanes")
@@ -252,7 +252,7 @@ class SessionActivity(Reply):
 
 
 class SessionList(Reply):
-    """Activity of a surrogate's open sessions."""
+    """The open sessions of a surrogate, with their virtual steps and imagined returns."""
 
     sessions: list[SessionActivity] = Field(description="open sessions, oldest first")
 
