@@ -63,7 +63,7 @@ def test_training_rounds_that_raise_the_budget_of_real_steps_require_an_admin_to
 
 def test_the_server_refuses_improve_beyond_the_budget_and_changes_nothing(guarded: ServerProcess, owned: str) -> None:
     with Api(guarded.url, TOKENS["train"]) as api:
-        with pytest.raises(BeyondBudget, match="at most 8 more queries"):
+        with pytest.raises(BeyondBudget, match="at most 8 more real steps"):
             api.improve(owned, 10_000)
         assert (api.surrogate(owned).budget, api.surrogate(owned).budget_left) == (12, 8)
         assert (api.improve(owned, 8).budget_raised_by, api.surrogate(owned).budget_left) == (0, 0)

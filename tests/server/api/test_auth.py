@@ -101,7 +101,7 @@ def test_a_train_token_cannot_raise_the_budget_and_an_admin_token_can(guarded: h
 
     refused = ask(left + 1, train)
     assert (refused.status_code, refused.json()["code"]) == (403, "beyond_budget")
-    assert f"at most {left} more queries" in refused.json()["detail"]
+    assert f"at most {left} more real steps" in refused.json()["detail"]
     assert "surrogym change owned --budget" in refused.json()["detail"]
     within = ask(left, train).raise_for_status().json()
     assert (within["budget"], within["budget_left"], within["budget_raised_by"]) == (pendulum.BUDGET, 0, 0)
