@@ -3,7 +3,8 @@
 To use an ability, code calls ``offers`` and has a fallback for models without it. The ability's docstring states the
 fallback.
 
-Shapes as in ``models.port``; r reference points, b paths of T steps, N lanes, W numbers of a drawn function.
+Letters of shapes are those of ``models.port``, and r reference points, b paths of T steps, N sampled functions of W
+weights.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ class TakesPrior(ABC):
     """Ability of a ``Learner`` to use a prior: an earlier model of the same family and definition, such as a model of a
     simulator of the environment.
 
-    A learner without this ability: ``services`` refuses the prior.
+    If a learner lacks this ability, ``services`` refuses a prior for it.
     """
 
     @abstractmethod
@@ -52,8 +53,8 @@ class TakesPrior(ABC):
 
 
 class FunctionDraws(ABC):
-    """Ability to sample functions from the posterior. An episode can follow one of them: equal inputs then give equal
-    predictions throughout the episode.
+    """Ability to sample functions from the posterior. An episode can follow a sampled function: equal inputs then give
+    equal predictions throughout the episode.
 
     For a model without this ability, ``models.draws`` draws one standard normal number for each transition output and
     episode, and adds this number of standard deviations to the output's mean at all states.
@@ -70,7 +71,7 @@ class FunctionDraws(ABC):
         """Return the weights (N, W) of N sampled functions, each computed from one row of standard normal numbers
         ``noise`` (N, W).
 
-        The weights of a function depend on its own row alone, except for the last bits.
+        Except for rounding errors, the weights of a function depend on its own row of ``noise`` alone.
         """
 
     @abstractmethod
@@ -84,17 +85,17 @@ class FunctionDraws(ABC):
         stds: bool = False,
         reward_std: bool = False,
     ) -> Transition:
-        """Predict as ``transition`` does, but with the values of a sampled function, one for each row, instead of the
-        mean.
+        """Predict as ``transition`` does, but with values of sampled functions instead of the mean. Each of the m rows
+        has its own function.
 
         Args:
             paths: (m, W') weights of the function of each row, W' >= W; the first W = ``path_size`` columns are used.
-            q, u, process, stds, reward_std: as for ``transition``.
+            q, u, process, stds, reward_std: as for ``DynamicsModel.transition``.
         """
 
 
 class UncertainHyperparameters(ABC):
-    """Ability to sample functions with sampled hyperparameters, because few samples don't determine the
+    """Ability to sample functions whose hyperparameters are sampled too, because few samples don't determine the
     hyperparameters.
 
     For a model without this ability, ``virtual`` samples functions with the optimal hyperparameters, see
@@ -104,10 +105,10 @@ class UncertainHyperparameters(ABC):
     @property
     @abstractmethod
     def uncertain_functions(self) -> FunctionDraws:
-        """Sampler of functions that also samples the hyperparameters of each function.
+        """Object that samples functions, each with sampled hyperparameters.
 
-        The first use of this property may take as long as a fit. If the sampler has compiled steps, it offers them by
-        the ability ``CompiledSteps``, independently of the model.
+        The first use of this property may take as long as a fit. If the object can predict by compiled code, it has
+        the ability ``CompiledSteps`` itself, whether or not the model has it.
         """
 
 
@@ -116,8 +117,8 @@ class LeaveOneOutErrors:
     """Errors of one output when each sample in turn is predicted from all others."""
 
     error: float  # root mean square error, in the output's unit
-    within_one: float  # share of the samples within one predictive standard deviation; ideally 0.68
-    within_two: float  # share of the samples within two predictive standard deviations; ideally 0.95
+    within_one: float  # share of errors up to one predictive standard deviation; 0.68 would be ideal
+    within_two: float  # share of errors up to two predictive standard deviations; 0.95 would be ideal
 
 
 class LeaveOneOut(ABC):
@@ -135,28 +136,27 @@ class LeaveOneOut(ABC):
 class LearnedNoise(ABC):
     """Ability to learn the noise of a single step together with the function.
 
-    For a model without this ability, ``sampling`` treats the environment as noiseless and repeats no query.
+    For a model without this ability, ``sampling`` treats the environment as noiseless and repeats no real step.
     """
 
     @property
     @abstractmethod
     def noise_stds(self) -> tuple[float, ...]:
-        """Standard deviation of each output's noise, in the output's unit, (O,)."""
+        """Standard deviation of the noise that was learned for each output, in the output's unit, (O,)."""
 
     @property
     def possible_noise(self) -> tuple[float, ...]:
-        """Greatest standard deviation of each output's noise that is plausible, (O,). If a fit with more noise makes
-        the samples at least as likely as the learned model does, it is the noise of that fit, otherwise ``noise_stds``.
-        """
+        """Greatest plausible standard deviation of each output's noise, (O,): the noise of another fit if the samples
+        are at least as likely under it as under this model, otherwise that in ``noise_stds``."""
         return self.noise_stds
 
 
 @dataclass(frozen=True)
 class AtSamples:
-    """Values of one output at k of the samples, and the prior covariance of its function there, in the output's
-    unit."""
+    """Values of one output at those k samples from which it is learned, and the prior covariance of its function there,
+    in the output's unit."""
 
-    rows: Tensor  # (k,) indices of the samples
+    rows: Tensor  # (k,) indices of these samples among all samples
     targets: Tensor  # (k,) values of the output less their mean
     covariance: Tensor  # (k, k) prior covariance of the function at the samples, without noise
     noise_variance: float
@@ -166,20 +166,20 @@ class SampledFunctions(ABC):
     """Ability to give the prior covariance of an output's function at the samples. With it, ``sampling`` tests whether
     noise is independent from step to step or comes from a sensor or from hidden state.
 
-    For a model without this ability, ``sampling`` does not distinguish sensor noise from process noise.
+    For a model without this ability, ``sampling`` treats all noise as independent from step to step.
     """
 
     @abstractmethod
     def at_samples(self, samples: Samples, column: int) -> AtSamples | None:
-        """Return values and prior covariance of the output with index ``column`` at the samples from which it is
-        learned; None for an output that never varied."""
+        """Return values and prior covariance of the transition output with index ``column`` at the samples from which
+        it is learned; None for an output that never varied."""
 
 
 class OutputOutlook(ABC):
-    """Forecast of one output's standard deviations at m candidates, in the output's unit, as if certain queries had
-    been answered."""
+    """Forecast of one output's standard deviations at m candidates for real steps, in the output's unit, as if certain
+    other real steps had been taken."""
 
-    learns: Tensor  # (m,) bool: whether the output would learn from a sample at the candidate
+    learns: Tensor  # (m,) bool, true for each candidate at which a real step would teach the output something
 
     @property
     @abstractmethod
@@ -188,21 +188,19 @@ class OutputOutlook(ABC):
 
     @abstractmethod
     def reduction(self, weights: Tensor) -> Tensor:
-        """Return by how much a sample at each of m candidates lowers the weighted sum of the variances at r reference
-        points.
-
-        Shapes: weights (r,), result (m,)."""
+        """Return by how much a real step at each of m candidates would lower the sum of the variances at r reference
+        points, weighted by ``weights`` (r,); result (m,)."""
 
     @abstractmethod
     def observe(self, index: int) -> OutputOutlook:
-        """Return the forecast as if the candidate ``index`` had been sampled too."""
+        """Return the forecast as if a real step had also been taken at the candidate with this index."""
 
 
 class PathOutlook(ABC):
     """Forecast of one output along b predicted paths of T steps: its standard deviations at these steps, and the
     information that real steps along the paths would give about the output."""
 
-    learns: Tensor  # (b, T) bool: whether the output would learn from a real step at that point of a path
+    learns: Tensor  # (b, T) bool, true for each step of a path that would teach the output something
 
     @property
     @abstractmethod
@@ -211,10 +209,8 @@ class PathOutlook(ABC):
 
     @abstractmethod
     def information(self, weight: Tensor, tolerance: float) -> Tensor:
-        """Return the information about this output that each path would give up to each of its steps, in nats, (b, T).
-
-        Each step counts with what it adds to the earlier steps of its path, so a state that is visited again adds
-        little.
+        """Return the information about this output that the first 1, 2, ... T real steps along each path would give
+        together, in nats, (b, T). So a state that is visited again adds little.
 
         Args:
             weight: (b, T) weight of each step.
@@ -224,7 +220,7 @@ class PathOutlook(ABC):
 
 @dataclass(frozen=True)
 class PredictedSteps:
-    """Steps of predicted paths, such as b paths of T steps.
+    """Predicted steps: any number of them, for example b paths of T steps with leading dimensions (b, T).
 
     Attributes:
         q: coordinates before each step, (..., C).
@@ -253,27 +249,28 @@ class Lookahead(ABC):
 
     @abstractmethod
     def outlook(self, candidates: Points, reference: Points, assumed: Points) -> tuple[OutputOutlook | None, ...]:
-        """Forecast every output (O,) at m candidates and r reference points, as if the queries ``assumed`` had been
-        answered.
+        """Return for each of the O outputs a forecast of its standard deviations at m candidates and r reference
+        points, as if real steps at the points ``assumed`` had been taken.
 
         The entry of an output that never varied is None.
         """
 
     @abstractmethod
     def along(self, steps: PredictedSteps, column: int) -> PathOutlook | None:
-        """Forecast the output ``column`` along steps (b, T, ...); None for an output that never varied."""
+        """Return the forecast of the output with index ``column`` along b paths of T steps; None for an output that
+        never varied."""
 
     @abstractmethod
     def as_if_answered(self, steps: PredictedSteps) -> DynamicsModel:
-        """Return the model as if T real steps had been taken with the predicted results: standard deviations decrease,
-        means stay."""
+        """Return the model as if the T real steps ``steps`` had been taken with the predicted results: standard
+        deviations decrease, means stay."""
 
 
 class RewardEdges(ABC):
     """Ability to find regions of states inside which the reward is higher or lower by a constant, so that it jumps at
     their edge.
 
-    For a model without this ability, ``sampling`` knows no such edges and spends no query on them.
+    For a model without this ability, ``sampling`` requests no real steps to locate such edges.
     """
 
     @abstractmethod
@@ -285,7 +282,7 @@ class RewardEdges(ABC):
 class RewardPeaks(ABC):
     """Ability to learn rewards that are nearly zero almost everywhere, so that the design can search for their peaks.
 
-    For a model without this ability, ``sampling`` spends no query on such a search.
+    For a model without this ability, ``sampling`` requests no real steps for such a search.
     """
 
     @property
@@ -296,11 +293,10 @@ class RewardPeaks(ABC):
 
     @abstractmethod
     def promise(self, q: Tensor, u: Tensor) -> Tensor:
-        """Return an optimistic score of the reward of steps from q (m, C) under u (m, F), (m,). It is higher where the
-        reward may be larger, given the model's uncertainty.
+        """Return an optimistic score of the reward of steps from q (m, C) under u (m, F), (m,). The score is higher
+        where the reward may be larger, given the model's uncertainty.
 
-        Only the order of the scores matters, which is that of the optimistic rewards. It is also meaningful among
-        points whose rewards are nearly zero.
+        Only the order of the scores matters. It is also meaningful among points whose rewards are nearly zero.
         """
 
 
@@ -312,14 +308,14 @@ class ArrayTransition:
     """Predicted step from each of m points, as NumPy arrays."""
 
     q_next: Floats  # (m, C) coordinates after the step
-    reward: Floats  # (m,) mean, without the penalty and without the terminal reward
-    std: Floats  # (m, O) requested standard deviations, the reward's last
+    reward: Floats  # (m,) mean reward, without the terminal reward and without a penalty for uncertainty
+    std: Floats  # (m, O) standard deviations of the outputs, the reward last; only those requested are valid
     terminated: NDArray[np.bool_]  # (m,) whether the step ends the episode
 
 
 class ArraySteps(ABC):
-    """Function that computes a model's ``transition`` and ``terminated`` in one call on NumPy arrays. Two objects are
-    equal only if they are the same object."""
+    """Callable object that computes a model's ``transition`` and ``terminated`` in one call on NumPy arrays. Two such
+    objects are equal only if they are the same object."""
 
     definition: EnvironmentDefinition
 
@@ -345,8 +341,8 @@ class ArraySteps(ABC):
 
 
 class CompiledSteps(ABC):
-    """Ability to predict steps by compiled code on CPU arrays. Results agree with ``transition`` except for the last
-    bits. For few rows, compiled code takes a tenth of the time.
+    """Ability to predict steps by compiled code on CPU arrays. Results equal those of ``transition`` except for
+    rounding errors. For few rows, compiled code takes a tenth of the time.
 
     For a model without this ability, ``virtual`` calls ``transition`` and ``terminated``.
     """
@@ -383,8 +379,8 @@ class WrittenInC(ABC):
 
     @abstractmethod
     def step_source(self) -> StepSource | None:
-        """Return the C source of the mean step, which agrees with ``transition`` except for the last bits.
+        """Return the C source of the mean step, whose results equal those of ``transition`` except for rounding errors.
 
-        None if numba is not installed, which the model's tables of numbers need, if the model adds to a prior model, or
-        if it is on another device than the CPU.
+        The result is None if numba is not installed, which is needed to arrange the model's numbers, if the model adds
+        to the predictions of a prior model, or if it is on another device than the CPU.
         """

@@ -1,4 +1,4 @@
-"""Functions sampled from any model: by its ``FunctionDraws``, or by a fallback if its family has no such ability."""
+"""Sampling of functions from any model: by the model's ability ``FunctionDraws``, or by a fallback without it."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from surrogym_server.models.port import DynamicsModel, Transition
 
 
 def function_draws(model: DynamicsModel, functions: int | None = None) -> FunctionDraws:
-    """Return the object that samples functions of a model: the model itself, or ``ConstantErrors`` if the model's
-    family can't sample functions.
+    """Return the object that samples functions of a model: usually the model itself, or ``ConstantErrors`` if the
+    model's family can't sample functions.
 
     Args:
         model: the model.
         functions: number of functions that the lanes (parallel environments) share, or None if each episode samples a
-            function. With a number, hyperparameters are sampled too, so that few functions also cover the uncertainty
-            of hyperparameters.
+            function. With a number, the object also samples hyperparameters if the model can, so that few functions
+            cover the uncertainty of hyperparameters too.
     """
     if functions is not None and (able := offers(model, UncertainHyperparameters)) is not None:
         return able.uncertain_functions
@@ -27,10 +27,10 @@ def function_draws(model: DynamicsModel, functions: int | None = None) -> Functi
 
 @dataclass(frozen=True)
 class ConstantErrors(FunctionDraws):
-    """Sampler of functions for any model: each function is the mean plus a constant number of standard deviations of
-    each transition output. The reward is its mean.
+    """Sampler of functions for any model: in each function, every transition output is its mean plus a constant number
+    of its standard deviations. The reward is its mean.
 
-    The weights of a function are these numbers, drawn from the standard normal distribution.
+    The weights of a function are these constant numbers, drawn from the standard normal distribution.
     """
 
     model: DynamicsModel

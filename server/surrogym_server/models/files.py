@@ -1,4 +1,4 @@
-"""A model as one file: safetensors with a JSON header that names its family. Nothing in it is pickled or evaluated."""
+"""A model as one file: safetensors with a JSON header that names its family. The file holds no pickles and no code."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from surrogym_server.models.registry import learner_of
 
 METADATA = "surrogym"
 FAMILY, CHECKSUM = "family", "checksum"
-AGAIN = "export the model again"
 SHOWN = 80  # greatest number of characters of a file's content that a message quotes
 MALFORMED = (SafetensorError, ValueError, LookupError, TypeError, AttributeError, RecursionError, OverflowError)
 
@@ -47,11 +46,12 @@ def from_bytes(definition: EnvironmentDefinition, data: bytes) -> DynamicsModel:
         return _model(definition, header, tensors)
     except KeyError as error:
         raise InvalidInput(
-            f"expected a model file with the entry {str(error)[:SHOWN]}, got one without it; {AGAIN}"
+            f"expected a model file with the entry {str(error)[:SHOWN]}, got a file without it; export the model again"
         ) from error
     except MALFORMED as error:
         raise InvalidInput(
-            f"expected a model file whose entries have valid types and sizes, got one with an invalid entry; {AGAIN}"
+            "expected a model file whose entries have valid types and sizes, got a file with an invalid entry; "
+            "export the model again"
         ) from error
 
 
@@ -65,11 +65,11 @@ def _content(data: bytes) -> tuple[dict[str, Any], dict[str, Tensor]]:
         written = header.pop(CHECKSUM)
     except MALFORMED as error:
         raise InvalidInput(
-            f"expected a model file of Surrogym (safetensors with a checksum), got {len(data)} bytes that are none; "
-            f"{AGAIN}"
+            f"expected a model file of Surrogym (safetensors with a checksum), got {len(data)} bytes of another form; "
+            "export the model again"
         ) from error
     if written != _checksum(header, tensors):
-        raise InvalidInput(f"the model file is damaged: its content does not match its checksum; {AGAIN}")
+        raise InvalidInput("the model file is damaged: its content does not match its checksum; export the model again")
     return header, tensors
 
 
@@ -77,7 +77,9 @@ def _model(definition: EnvironmentDefinition, header: dict[str, Any], tensors: d
     expected, got = definition.learning.model, header.pop(FAMILY)
     if got != expected.name:
         raise InvalidInput(
-            f"expected a model of the family {expected.name!r}, as the specification says, got one of {str(got)[:80]!r}"
+            f"expected a model of the family {expected.name!r}, as the specification says, "
+            f"got one of {str(got)[:80]!r}; load a model of the expected family, or change `model` in the "
+            "specification's `design`"
         )
     return learner_of(expected).codec.decode(definition, StoredModel(header, tensors))
 

@@ -1,6 +1,6 @@
-"""Guard around the code of a model family, which may be a plugin: errors become messages, and arrays are checked.
+"""Calls to the code of a model family, which may be a plugin: its errors become messages, and its arrays are checked.
 
-Shapes as in ``models.port``.
+Letters of shapes are those of ``models.port``.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ POINTS = 16  # number of samples at which a new model is checked
 
 
 def failure_of(definition: EnvironmentDefinition, error: BaseException) -> SurrogymError:
-    """Return an error whose message is one sentence: it names the model family, whose code raised ``error``, and says
-    what ``error`` was."""
+    """Return an error whose message is one sentence: it names the model family whose code raised ``error``, and quotes
+    ``error``."""
     return failed(_family(definition), PluginFailed, error)
 
 
@@ -53,7 +53,11 @@ def learn(
             result = learner.learn(definition, samples, warm)
         model: object = getattr(result, "model", result)
         if not isinstance(model, DynamicsModel):
-            raise _wrong(definition, "expected learn to return a Learned with a DynamicsModel", type(model).__name__)
+            raise _wrong(
+                definition,
+                "expected `learn` to return a `Learned` that contains a `DynamicsModel`",
+                type(model).__name__,
+            )
         for name, array in result.warm.items():
             if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiub":
                 raise _wrong(
@@ -66,7 +70,8 @@ def learn(
 
 def require_sound(model: DynamicsModel, q: Tensor, u: Tensor) -> None:
     """Raise ``PluginFailed`` unless a model's attributes, and its predictions at q (m, C) under u (m, F), have the
-    shapes of the port and are finite, standard deviations are not negative, and probabilities lie in 0 to 1."""
+    shapes that ``models.port`` states and are finite, standard deviations are not negative, and probabilities lie
+    between 0 and 1."""
     definition, outputs = model.definition, len(model.definition.outputs)
     predicted = model.transition(q, u, stds=True, reward_std=True)
     require_shapes(model, predicted, q, stds=True)
@@ -91,11 +96,11 @@ def require_sound(model: DynamicsModel, q: Tensor, u: Tensor) -> None:
 
 
 def require_shapes(model: DynamicsModel, predicted: Transition, q: Tensor, *, stds: bool = False) -> None:
-    """Raise ``PluginFailed`` unless a prediction from q (m, C) has the shapes of the port. With ``stds`` it must
-    include standard deviations."""
+    """Raise ``PluginFailed`` unless the prediction of steps from q (m, C) has the shapes that ``models.port`` states.
+    With ``stds`` it must include standard deviations."""
     definition, rows = model.definition, len(q)
     if not isinstance(predicted, Transition):
-        raise _wrong(definition, "expected transition to return a Transition", type(predicted).__name__)
+        raise _wrong(definition, "expected `transition` to return a `Transition`", type(predicted).__name__)
     _require_shape(definition, "next coordinates", predicted.q_next, q.shape)
     _require_shape(definition, "reward", predicted.reward, (rows,))
     if stds or predicted.std is not None:

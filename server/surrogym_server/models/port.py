@@ -1,12 +1,13 @@
-"""The port of dynamics models: all that sampling, virtual, engine and services know of a model.
+"""The interface of dynamics models: the rest of the server uses a model only by these classes.
 
-A family of models is three classes: a ``DynamicsModel``, the ``Learner`` that fits it to samples, and the
-``ModelCodec`` that turns it into named arrays and back. Their docstrings are the laws that every family keeps;
-``surrogym_server.testing`` checks them. Abilities that only some families have are separate classes in
+A family of models consists of three classes: a ``DynamicsModel``, the ``Learner`` that fits it to samples, and the
+``ModelCodec`` that converts it to named arrays and back. Their docstrings state the rules that every family obeys;
+``surrogym_server.testing`` checks these. Abilities that only some families have are separate classes in
 ``models.abilities``.
 
-Shapes: m points, n samples, C coordinates, F action entries, M transition outputs, O = M + 1 outputs in the order of
-``definition.outputs``: the increments, then the reward. Every tensor is float64 and lives on ``definition.device``.
+Letters of shapes: m points, n samples, C coordinates, F action entries, M transition outputs (changes of coordinates or
+of observation entries), O = M + 1 outputs in the order of ``definition.outputs``: the transition outputs, then the
+reward. Every tensor is float64 and on ``definition.device``.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ class Transition:
     """Predicted step from each of m points."""
 
     q_next: Tensor  # (m, C) coordinates after the step
-    # (m,) mean reward without the terminal reward, which ``step_rules.paid`` adds, and without a penalty.
+    # (m,) mean reward, without the terminal reward, which ``step_rules.paid`` adds, and without an uncertainty penalty.
     reward: Tensor
     std: Tensor | None  # (m, M) standard deviation of each transition output, if requested
     reward_std: Tensor | None  # (m,) standard deviation of the reward, if requested
@@ -45,22 +46,23 @@ class Transition:
 class DynamicsModel(ABC):
     """Model of one environment, fitted and ready to predict.
 
-    Laws:
+    Rules:
 
     - It is immutable, and a pure function of its samples and settings: the same call gives the same numbers.
-    - Predictions of a point do not depend on the points beside it, except for the last bits.
+    - Except for rounding errors, the prediction at a point does not depend on the other points of the same call.
     - Next states obey the environment's rules: ``step_rules.settle`` has been applied to them.
     - Standard deviations are those of the unknown function, without the noise of a single step. They are finite, not
       negative and in the unit of each output.
-    - What the definition declares is not learned. So a declared reward has a standard deviation of 0 at a known state.
+    - A reward or termination that the definition declares is not learned. So a declared reward has a standard deviation
+      of 0 at a known state.
     - A model that is a frozen dataclass of tensors, tuples, mappings and dataclasses inherits ``on``; other classes
       override it.
     """
 
     definition: EnvironmentDefinition
-    terminal_reward: float  # added to the reward of ``transition`` in a step that ends the episode
-    samples: int  # number of samples of the fit
-    digest: str  # ``Samples.digest`` of the samples of the fit
+    terminal_reward: float  # reward that a step that ends the episode gives in addition to the reward of ``transition``
+    samples: int  # number of samples to which the model was fitted
+    digest: str  # ``Samples.digest`` of the samples to which the model was fitted
 
     @abstractmethod
     def transition(
@@ -105,7 +107,7 @@ class DynamicsModel(ABC):
         return self.learned_termination(q) if self.definition.learns_termination else self.terminated(q).to(q.dtype)
 
     def terminated(self, q: Tensor) -> Tensor:
-        """Return whether an episode ends on arriving at q (m, C), (m,) bool."""
+        """Return whether the model predicts that an episode ends on arriving at q (m, C), (m,) bool."""
         if self.definition.learns_termination:
             return self.learned_termination(q) > 0.5
         return self.definition.terminated(q)
@@ -113,7 +115,7 @@ class DynamicsModel(ABC):
     @property
     @abstractmethod
     def scales(self) -> Tensor:
-        """Standard deviation of each output over the samples, (O,), in its own unit; 1 for an output that never
+        """Standard deviation of each output over the samples, (O,), in the output's unit; 1 for an output that never
         varied."""
 
     @property
@@ -124,7 +126,8 @@ class DynamicsModel(ABC):
     @property
     @abstractmethod
     def description(self) -> dict[str, Any]:
-        """Describe the model in detail as JSON: ``outputs`` with one entry each, and further fields of the family."""
+        """Describe the model in detail, as values for JSON: ``outputs``, a list with one entry for each output, and
+        further fields of the family."""
 
     def on(self, device: torch.device) -> DynamicsModel:
         """Return the same model with its arrays on ``device``."""
@@ -162,16 +165,17 @@ def require_sums(terminal_reward: float, samples: int) -> None:
     if not math.isfinite(terminal_reward) or not 1 <= samples <= MOST_SAMPLES:
         got = f"{terminal_reward} and {samples if abs(samples) <= MOST_SAMPLES else 'more'}"
         raise InvalidInput(
-            f"expected a finite terminal_reward and samples from 1 to {MOST_SAMPLES}, got {got}; export the model again"
+            f"expected a model with a finite terminal_reward and samples from 1 to {MOST_SAMPLES}, got {got}; "
+            "export the model again"
         )
 
 
 class ModelCodec(ABC):
     """Conversion of a family's models to data and back, without pickles and without code.
 
-    Laws:
+    Rules:
 
-    - ``decode(definition, encode(model))`` predicts the same as the model, bit for bit, and repeats no long
+    - ``decode(definition, encode(model))`` predicts exactly the same numbers as the model, and repeats no long
       computation.
     - The header has no entry ``family`` or ``checksum``, which ``models.files`` adds. Names of tensors do not begin
       with ``samples.``, which files of whole surrogates use. Tensors are float64.
@@ -202,11 +206,11 @@ class Learner(ABC):
     A learner is a frozen dataclass. Its fields are the settings in the specification: numbers, booleans and strings. An
     invalid setting raises a ValueError that states the allowed values.
 
-    Laws:
+    Rules:
 
     - ``learn`` is a pure function of its arguments and the settings: any randomness in it is seeded.
     - A warm start consists of named arrays from an earlier fit of the same definition to fewer samples; it may be
-      empty. It changes how long a fit takes and which optimum it finds, not what the result means.
+      empty. It only influences how long a fit takes and which optimum the fit finds.
     """
 
     @property
@@ -216,7 +220,7 @@ class Learner(ABC):
 
     @abstractmethod
     def learn(self, definition: EnvironmentDefinition, samples: Samples, warm: Warm | None = None) -> Learned:
-        """Fit transition and reward to samples, and termination if that is not declared.
+        """Fit a model of transition and reward to samples, and of termination if termination is not declared.
 
         Raises:
             InvalidInput: too few samples to learn from.

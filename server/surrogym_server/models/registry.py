@@ -1,4 +1,4 @@
-"""Registry of model families: those of this package, and those of installed packages."""
+"""Registry of model families: those of this package, and those that installed plugins add."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from surrogym_server.models.port import Learner
 from surrogym_server.plugins import Choice, Registry
 
 GAUSSIAN_PROCESS = "gaussian_process"
-# Short names, each of which stands for a family with some settings; see ``in_full``.
+# Short names that a specification may use. Each stands for a family with certain settings.
 SHORT: dict[str, Choice] = {"sparse_gaussian_process": Choice(GAUSSIAN_PROCESS, (("inducing", 300),))}
 BUILT_IN: dict[str, type[Learner] | str] = {
     GAUSSIAN_PROCESS: GaussianProcesses,
@@ -26,7 +26,7 @@ def learner_of(choice: Choice) -> Learner:
 def in_full(choice: Choice) -> Choice:
     """Replace a short name by the family and the settings for which it stands.
 
-    Settings in ``choice`` override those of the short name. A choice whose name is no short name is returned unchanged.
+    Settings in ``choice`` override those of the short name. A choice with any other name is returned unchanged.
     """
     if (short := SHORT.get(choice.name.casefold())) is None:
         return choice

@@ -1,4 +1,4 @@
-"""Model family of network ensembles: the disagreement of networks trained on the same samples is the uncertainty."""
+"""Model family of ensembles of neural networks: the disagreement of the networks is the model's uncertainty."""
 
 from surrogym_server.models.ensemble.family import NetworkEnsembles
 

@@ -1,4 +1,4 @@
-"""NetworkEnsembleCodec: convert an ensemble to named arrays and back, and check every shape and number."""
+"""Conversion of an ensemble of networks to named arrays and back, with a check of every shape and number."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ class Header:
         terminal_reward: reward that is added on a step that ends an episode.
         samples: number of samples to which the model was fitted.
         digest: ``Samples.digest`` of these samples.
-        label: the label of termination that all samples have in common, 0 or 1; None if there are both. It is not
-            checked here.
+        label: 1 if all samples ended an episode, 0 if none did, None if some did or if termination is declared. Code
+            that reads it checks it.
     """
 
     terminal_reward: float
@@ -53,7 +53,9 @@ class Header:
 class NetworkEnsembleCodec(ModelCodec):
     def encode(self, model: DynamicsModel) -> StoredModel:
         if not isinstance(model, NetworkEnsembleModel):
-            raise TypeError(f"expected a model of an ensemble of networks, got {type(model).__name__}")
+            raise TypeError(
+                f"expected a model of an ensemble of networks, got {type(model).__name__}; use its own family's codec"
+            )
         tensors = _regression_arrays(TRANSITIONS, model.transitions)
         if model.reward is not None:
             tensors |= _regression_arrays(REWARD, model.reward)
@@ -108,7 +110,8 @@ def _regression(name: str, arrays: Arrays, inputs: int, outputs: int, *, quadrat
     _require_shapes(name, {"centre": centre, "scale": scale}, {"centre": (outputs,), "scale": (outputs,)})
     if bool((scale < 0).any()):
         raise InvalidInput(
-            f"{name}: expected each entry of scale to be at least 0, got {float(scale.min()):g}; export the model again"
+            f"model, part {name}: expected each entry of scale (standard deviations of outputs) to be at least 0, "
+            f"got {float(scale.min()):g}; export the model again"
         )
     return Regression(_networks(name, arrays, inputs, outputs, quadratic=quadratic), centre, scale)
 
@@ -118,7 +121,8 @@ def _noise(name: str, arrays: Arrays, inputs: int, outputs: int) -> Noise:
     _require_shapes(name, {"size": size}, {"size": (outputs,)})
     if bool((size < 0).any()):
         raise InvalidInput(
-            f"{name}: expected each entry of size to be at least 0, got {float(size.min()):g}; export the model again"
+            f"model, part {name}: expected each entry of size (standard deviations of noise) to be at least 0, "
+            f"got {float(size.min()):g}; export the model again"
         )
     return Noise(_networks(name, arrays, inputs, outputs, quadratic=False), size)
 
@@ -128,8 +132,8 @@ def _networks(name: str, arrays: Arrays, d: int, p: int, *, quadratic: bool) -> 
     k, h = len(networks.skip), networks.last.shape[1]
     if not (2 <= k <= MAX_MEMBERS and 1 <= h <= MAX_UNITS):
         raise InvalidInput(
-            f"{name}: expected 2 to {MAX_MEMBERS} networks with 1 to {MAX_UNITS} units in a layer, got {k} with {h}; "
-            "export the model again"
+            f"model, part {name}: expected 2 to {MAX_MEMBERS} networks with 1 to {MAX_UNITS} units in a layer, "
+            f"got {k} networks with {h} units; export the model again"
         )
     shapes = {
         "skip": (k, 1 + (2 if quadratic else 1) * d, p),
@@ -162,24 +166,28 @@ def _checked_header(definition: EnvironmentDefinition, stored: StoredModel) -> H
         if array.dtype != torch.float64 or not bool(torch.isfinite(array).all()):
             came = "NaN or infinity" if array.dtype == torch.float64 else array.dtype
             raise InvalidInput(
-                f"expected the array {name} as finite numbers in torch.float64, got {came}; export the model again"
+                f"expected the model's array {name} as finite numbers in torch.float64, got {came}; "
+                "export the model again"
             )
     return Header(terminal_reward, samples, str(header["digest"]), header["ending"])
 
 
 def _require_shapes(name: str, arrays: Mapping[str, Tensor], shapes: Mapping[str, tuple[int, ...]]) -> None:
     """Raise ``InvalidInput`` unless each of the arrays has the shape that ``shapes`` gives for its name. ``name`` is
-    the part of the model, for the message."""
+    the part of the model that the message names."""
     for part, shape in shapes.items():
         if (got := tuple(arrays[part].shape)) != shape:
-            raise InvalidInput(f"{name}: expected {part} of shape {shape}, got {got}; export the model again")
+            raise InvalidInput(
+                f"model, part {name}: expected the array {part} of shape {shape}, got {got}; export the model again"
+            )
 
 
 def _only_label(label: object) -> float:
-    """Return the stored label of termination, which all samples share. Raises ``InvalidInput`` unless it is 0 or 1."""
+    """Return the stored label of termination that all samples share: 1 if all ended an episode, 0 if none did. Raises
+    ``InvalidInput`` unless it is 0 or 1."""
     if label not in (0.0, 1.0):
         raise InvalidInput(
-            "ending: expected 0 or 1, the label that all samples share, because no network of termination is stored, "
-            f"got {str(label)[:80]}; export the model again"
+            "model, part ending: expected 0 or 1, because the model has no network that predicts terminations (1: all "
+            f"samples ended an episode, 0: none did), got {str(label)[:80]}; export the model again"
         )
     return float(bool(label))

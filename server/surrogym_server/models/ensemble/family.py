@@ -1,4 +1,4 @@
-"""NetworkEnsembles: a few anchored networks, as a family for the registry of models."""
+"""The family of models that are ensembles of neural networks, for the registry of models."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ LEAST = {"members": 2, "units": 1, "steps": 1, "seed": 0}
 
 @dataclass(frozen=True)
 class NetworkEnsembles(Learner):
-    """Learner of ensembles: networks of two hidden layers, each pulled towards its own random initial weights, and
-    networks that predict the noise at each state.
+    """Learner of ensembles: networks with two hidden layers, each regularised towards its own random initial weights,
+    and networks that predict the noise at each state.
 
-    Each fit starts anew, without a warm start: networks whose training continues would fit the first samples better
-    than later ones.
+    A fit never starts at the result of an earlier fit: networks whose training continues would fit the first samples
+    better than later ones.
 
     Attributes:
         members: number of networks.
@@ -30,7 +30,7 @@ class NetworkEnsembles(Learner):
         steps: number of steps of gradient descent.
         seed: seed of initial weights and of batches.
         beta: weighting of the samples in the likelihood, from 0 to 1. With 0, samples with much predicted noise hardly
-            influence the mean; with 1, all samples influence it equally.
+            influence the mean; with 1, all samples influence the mean equally.
     """
 
     members: int = 5

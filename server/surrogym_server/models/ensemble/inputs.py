@@ -1,4 +1,4 @@
-"""Inputs of the networks of one environment: fixed features with mean near 0 and standard deviation near 1."""
+"""Encoding of states and actions as inputs of networks: features with mean near 0 and standard deviation near 1."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from surrogym_server.tensors import cached
 
 @dataclass(frozen=True)
 class Inputs:
-    """Encodings of states and actions as inputs of the networks of one environment."""
+    """Encodings of the states and actions of one environment as inputs of networks."""
 
     definition: EnvironmentDefinition
 
@@ -43,7 +43,7 @@ class Inputs:
 
     @cached
     def _of_state(self) -> Encoder:
-        """Encoder of the coordinates, and of the observation if it combines coordinates."""
+        """Encoder of the coordinates, and also of the observation if its entries combine coordinates."""
         combined = self.definition.observation_combines or self.definition.moves_observation
         more: tuple[State, ...] = ("observation",) if combined else ()
         return self._encoder("both", *more)

@@ -1,4 +1,4 @@
-"""Learning of networks from samples: targets, left-out samples, and the terminal reward."""
+"""Learning of an ensemble of networks from samples: transitions, reward, terminal reward and termination."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from surrogym_server.models.ensemble.model import NetworkEnsembleModel, Noise, R
 from surrogym_server.models.ensemble.networks import Networks
 from surrogym_server.models.ensemble.training import Training, cross_entropy, squared_error, train, train_with_noise
 
-MIN_POINTS = 2  # least number of samples to learn from
+MIN_POINTS = 2  # a model can't be learned from fewer samples than this
 CONSTANT = 1e-9  # an output whose standard deviation is below this share of its absolute mean counts as constant
 # Added to the seed, so that networks of reward and termination have other initial weights than those of transitions.
 REWARD_SEED, END_SEED = 1, 2
@@ -40,7 +40,7 @@ def learn(training: Training, definition: EnvironmentDefinition, samples: Sample
 
 def _reward(training: Training, inputs: Inputs, samples: Samples) -> tuple[Regression | None, float]:
     """Fit networks to the rewards of non-terminating steps. Return the networks (None if the reward is declared), and
-    the terminal reward: the mean reward that terminating steps pay in addition."""
+    the terminal reward: the mean reward that terminating steps give in addition to the networks' prediction."""
     if (declared := inputs.definition.declared_reward) is not None:
         return None, declared.terminal
     goes_on = enough(~samples.terminated)
@@ -53,7 +53,8 @@ def _reward(training: Training, inputs: Inputs, samples: Samples) -> tuple[Regre
 
 
 def _ending(training: Training, x: Tensor, ended: Tensor) -> Networks | float:
-    """Fit networks that predict which states end an episode; if all samples have the same label, return this label."""
+    """Fit networks to inputs x (n, d) that predict which of n steps ``ended`` (n,) an episode. If all samples have the
+    same label, return this label, 0 or 1, instead."""
     if bool(ended.all()) or not bool(ended.any()):
         return float(ended[0])
     return train(training, x, ended.double()[:, None], cross_entropy)
@@ -76,15 +77,15 @@ def _noiseless(training: Training, x: Tensor, y: Tensor) -> Regression:
 
 
 def standardised(y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Standardise targets y (n, p). Return them with their means (p,) and standard deviations (p,), 0 for a target that
-    never varied."""
+    """Return standardised targets (n, p) of the targets y (n, p), the means (p,) of y, and its standard deviations
+    (p,), 0 for a target that never varied."""
     centre, scale = y.mean(0), y.std(0, correction=0)
     scale = torch.where(scale > CONSTANT * centre.abs(), scale, 0.0)
     return (y - centre) / torch.where(scale > 0, scale, 1.0), centre, scale
 
 
 def enough(chosen: Tensor) -> Tensor:
-    """Return the mask ``chosen`` (n,), or if it selects too few samples to learn from, a mask that selects all."""
+    """Return the mask ``chosen`` (n,). If it selects fewer than two samples, return a mask that selects all."""
     return chosen if int(chosen.sum()) >= MIN_POINTS else torch.ones_like(chosen)
 
 

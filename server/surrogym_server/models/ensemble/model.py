@@ -1,4 +1,4 @@
-"""NetworkEnsembleModel: a few networks fitted to one environment, whose disagreement is the uncertainty."""
+"""Model that consists of a few networks fitted to one environment, whose disagreement is its uncertainty."""
 
 from __future__ import annotations
 
@@ -18,35 +18,36 @@ from surrogym_server.tensors import cached
 
 @dataclass(frozen=True)
 class Noise:
-    """Learned noise of single steps, which depends on the inputs. Its unit is the standard deviation of each output
-    over the samples."""
+    """Learned noise of single steps, which depends on the inputs. Its unit is the standard deviation of each of the p
+    outputs over the samples."""
 
-    networks: Networks  # networks of the log variance of the noise
-    size: Tensor  # (p,) root mean square of the noise over the samples
+    networks: Networks  # networks that predict the log variance of the noise
+    size: Tensor  # (p,) root mean square of the predicted noise of each output over the samples
 
     def std(self, x: Tensor) -> Tensor:
-        """Return the standard deviation of the noise at x (m, d), (m, p): the root of the mean variance over the
-        networks."""
+        """Return the standard deviation of the noise of p outputs at inputs x (m, d), (m, p): the root of the mean
+        variance over the networks."""
         return bounded(self.networks(x)).exp().mean(0).sqrt()
 
 
 @dataclass(frozen=True)
 class Regression:
-    """Predictor of some outputs by networks f: centre + scale * f(x), in the units of the outputs. An output that never
+    """Predictor of p outputs by networks f: centre + scale * f(x), in the units of the outputs. An output that never
     varied has scale 0."""
 
     networks: Networks
     centre: Tensor  # (p,) mean of each output over the samples
     scale: Tensor  # (p,) standard deviation of each output over the samples
-    noise: Noise | None = None  # None for rewards, because their noise is not learned
+    noise: Noise | None = None  # learned noise of transition outputs; None for rewards, whose noise is not learned
 
     def __call__(self, x: Tensor) -> Tensor:
-        """Return the predictions of each of the K networks at inputs x (m, d), in the outputs' units, (K, m, p)."""
+        """Return the predictions of p outputs by each of K networks at inputs x (m, d), in the outputs' units, (K, m,
+        p)."""
         return self.centre + self.scale * self.networks(x)
 
     def shaken(self, x: Tensor, process: Tensor) -> Tensor:
-        """Return the noise at x (m, d), in the outputs' units, for standard normal numbers ``process`` (m, p):
-        (m, p)."""
+        """Return sampled noise of p outputs at inputs x (m, d), in the outputs' units, (m, p), computed from standard
+        normal numbers ``process`` (m, p)."""
         assert self.noise is not None
         return self.scale * self.noise.std(x) * process
 
@@ -54,14 +55,15 @@ class Regression:
 @dataclass(frozen=True)
 class NetworkEnsembleModel(SteppedInBlocks, LearnedNoise):
     """Model of K networks (members). A prediction has the mean and the standard deviation of the networks' predictions.
-    The noise of a transition depends on the state; the reward has none."""
+    The learned noise of a transition depends on the state; no noise of the reward is learned."""
 
     rows = 8_192
 
     definition: EnvironmentDefinition
-    transitions: Regression  # networks of the M transition outputs
-    reward: Regression | None  # None if the reward is declared
-    # Networks of the logit of termination, or the label that all samples share; None if termination is declared.
+    transitions: Regression  # networks that predict the M transition outputs (changes of coordinates)
+    reward: Regression | None  # networks that predict the reward; None if the specification declares the reward
+    # Networks that predict the logit of termination. If all samples have the same label, this label, 0 or 1, instead.
+    # None if termination is declared.
     ending: Networks | float | None
     terminal_reward: float
     samples: int
@@ -89,8 +91,8 @@ class NetworkEnsembleModel(SteppedInBlocks, LearnedNoise):
         return torch.cat([change, reward[:, None]], -1)
 
     def learned_termination(self, q: Tensor) -> Tensor:
-        """Return the mean over the networks of the probability of termination at q (m, C), (m,); if all samples have
-        the same label, that label."""
+        """Return the probability of termination at q (m, C), as a mean over the networks, (m,). If all samples have the
+        same label, the result is this label, 0 or 1."""
         if isinstance(self.ending, Networks):
             return self.ending(self._inputs.of_end(q))[..., 0].sigmoid().mean(0)
         return q.new_full((len(q),), self.ending or 0.0)
@@ -142,7 +144,7 @@ class NetworkEnsembleModel(SteppedInBlocks, LearnedNoise):
         return q_next, _of_member(rewards, member), spread, doubt
 
     def _rewards(self, q: Tensor, u: Tensor, q_next: Tensor) -> Tensor:
-        """Return the reward that each of the K networks predicts, (K, m)."""
+        """Return the reward that each of the K networks predicts for m steps, (K, m)."""
         if (declared := self.definition.declared_reward) is not None:
             return declared(q_next if declared.after else q, u).expand(self.transitions.networks.members, -1)
         assert self.reward is not None

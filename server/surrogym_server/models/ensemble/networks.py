@@ -1,7 +1,7 @@
-"""K networks of one shape, evaluated together. K members, d inputs, h hidden units, p outputs.
+"""K networks (members) with the same numbers of units, evaluated together: d inputs, h units in a layer, p outputs.
 
-A member is f(x) = b(x) S + tanh(tanh(x W_1 + c_1) W_2 + c_2) W_3 with b(x) = [1, x], or [1, x, x^2] of a quadratic one:
-a linear part takes no hidden units, and extrapolates.
+A member is f(x) = b(x) S + tanh(tanh(x W_1 + c_1) W_2 + c_2) W_3 with b(x) = [1, x], or [1, x, x^2] if its linear part
+also reads squares. The linear part b(x) S needs no hidden units, and extrapolates. b(x) has s terms.
 """
 
 from __future__ import annotations
@@ -13,19 +13,19 @@ import torch
 from torch import Tensor
 from torch.nn.functional import softplus
 
-LEAST_NOISE, MOST_NOISE = 0.003, 10.0  # bounds of the noise, as shares of an output's standard deviation
+LEAST_NOISE, MOST_NOISE = 0.003, 10.0  # bounds of the predicted noise, as shares of an output's standard deviation
 
 
 @dataclass(frozen=True)
 class Networks:
     """Weights of K networks, the members."""
 
-    skip: Tensor  # weights of the linear part, S (K, s, p)
-    first: Tensor  # weights of the first hidden layer, W_1 (K, d, h)
-    first_bias: Tensor  # biases of the first hidden layer, c_1 (K, 1, h)
-    second: Tensor  # weights of the second hidden layer, W_2 (K, h, h)
-    second_bias: Tensor  # biases of the second hidden layer, c_2 (K, 1, h)
-    last: Tensor  # weights of the last layer, W_3 (K, h, p)
+    skip: Tensor  # (K, s, p) weights S of the linear part, for K networks with s linear terms and p outputs
+    first: Tensor  # (K, d, h) weights W_1 of the first hidden layer, for K networks with d inputs and h hidden units
+    first_bias: Tensor  # (K, 1, h) biases c_1 of the first hidden layer, for K networks with h units in a layer
+    second: Tensor  # (K, h, h) weights W_2 of the second hidden layer, for K networks with h units in a layer
+    second_bias: Tensor  # (K, 1, h) biases c_2 of the second hidden layer, for K networks with h units in a layer
+    last: Tensor  # (K, h, p) weights W_3 of the last layer, for K networks with h units in a layer and p outputs
 
     @property
     def members(self) -> int:
@@ -43,13 +43,14 @@ class Networks:
 
 
 def bounded(log_variance: Tensor) -> Tensor:
-    """Return log variances of noise, softly limited to the range from ``LEAST_NOISE`` to ``MOST_NOISE``."""
+    """Return log variances of noise, softly limited so that standard deviations are between ``LEAST_NOISE`` and
+    ``MOST_NOISE``."""
     low, high = 2 * math.log(LEAST_NOISE), 2 * math.log(MOST_NOISE)
     return low + softplus(high - softplus(high - log_variance) - low)
 
 
 def basis(x: Tensor, quadratic: bool) -> Tensor:
-    """Return the terms of the linear part for inputs x (m, d): [1, x], or [1, x, x^2] if ``quadratic``, (m, s)."""
+    """Return the s terms of the linear part for inputs x (m, d), (m, s): [1, x], or [1, x, x^2] if ``quadratic``."""
     return torch.cat([torch.ones_like(x[:, :1]), x, *([x.square()] if quadratic else [])], -1)
 
 

@@ -1,4 +1,4 @@
-"""Steps of models whose sampled functions are members of an ensemble, computed in blocks of rows."""
+"""Prediction of steps in blocks of rows, for models that are ensembles and whose sampled functions are its members."""
 
 from __future__ import annotations
 
@@ -64,12 +64,12 @@ class SteppedInBlocks(DynamicsModel, FunctionDraws):
             q: coordinates (m, C).
             u: actions (m, F).
             noise: number of standard deviations that are added to the mean of each transition output, (m, M), or None.
-            process: standard normal numbers of the learned noise, (m, M), or None.
+            process: standard normal numbers, (m, M), by which the learned noise moves each transition output, or None.
             paths: weights of the sampled function that each row follows, (m, W), or None for the mean.
 
         Returns:
-            Next coordinates (m, C), rewards (m,), standard deviations of transition outputs (m, M), or (m, 0) if they
-            are not needed, and standard deviations of the reward (m,).
+            Next coordinates (m, C), rewards (m,), standard deviations of transition outputs (m, M), and standard
+            deviations of the reward (m,). Standard deviations that are not needed are (m, 0).
         """
 
     def _in_blocks(
@@ -99,8 +99,8 @@ class SteppedInBlocks(DynamicsModel, FunctionDraws):
 
 
 def drawn_member(noise: Tensor, members: int) -> Tensor:
-    """Return indices of networks (members), below ``members`` and all equally likely, as floats. Each is computed from
-    one of the standard normal numbers ``noise``."""
+    """Return random indices of networks, from 0 to ``members`` - 1 with equal probability, as floats. Each is computed
+    from one of the standard normal numbers ``noise``."""
     numbers: Tensor = (members * torch.special.ndtr(noise)).floor().clamp_max(members - 1)
     return numbers
 

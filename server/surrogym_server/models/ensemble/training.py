@@ -1,19 +1,19 @@
-"""Training of anchored networks: each member is pulled towards the random weights with which it started.
+"""Training of anchored networks: each is regularised towards the random weights (anchor) with which it started.
 
-Of member k the weights minimise, over n samples (x_i, y_i) of standardised inputs and outputs,
+The weights w of network k minimise, over n samples (x_i, y_i) of standardised inputs and outputs,
 
     1/n sum_i |y_i - f_k(x_i)|^2 + sigma^2 / n sum_j (w_j - w_kj)^2 / v_j,
 
-with w_k drawn from a normal prior of variances v, and sigma the standard deviation of the noise. For a linear model the
-members are samples of the posterior; for networks they are so approximately. Far from samples the members differ as
-their priors do.
+with anchors w_k drawn from a normal prior of variances v, and sigma the standard deviation of the noise. For a linear
+model the K minima are samples of the posterior; for networks they are so approximately. Far from samples the networks
+differ as their anchors do.
 
-With noise, each member has a second network g_k for the log variance of a step, and 1/2 (log v + |y - f|^2 / v) with
-v = exp(g_k(x)) takes the place of the squared error. So the mean need not follow steps that it can't predict, such as
-those near a contact. The pull keeps its weight. What no mean of these networks predicts counts as noise.
+With learned noise, each f_k has a second network g_k for the log variance of a step, and 1/2 (log s + |y - f|^2 / s)
+with s = exp(g_k(x)) replaces the squared error. So the mean need not follow steps that it can't predict, such as those
+near a contact, and their errors count as noise. The weight of the second term stays the same.
 
-With 0 < beta <= 1, each step's term is weighted by v^beta, through which no gradient passes. With 1 the mean has the
-gradient of the squared error, and learns also those steps that the noise could explain.
+With 0 < beta <= 1, each step's loss is weighted by s^beta, through which no gradient passes. With beta = 1 the mean has
+the gradient of the squared error, and also learns steps that the noise could explain.
 
 References: T. Pearce, F. Leibfried, A. Brintrup, "Uncertainty in neural networks: approximately Bayesian ensembling",
 AISTATS 2020, eq. 9; B. Lakshminarayanan, A. Pritzel, C. Blundell, "Simple and scalable predictive uncertainty
@@ -34,15 +34,16 @@ from torch.nn.functional import binary_cross_entropy_with_logits
 from surrogym_server.models.ensemble.networks import Networks, basis, bounded, nonlinear
 from surrogym_server.tensors import in_rows
 
-# Assumed noise sigma of networks without learned noise (see the module), as a share of an output's standard deviation.
+# Standard deviation sigma of the noise in the weight sigma^2 / n of the regularisation, as a share of an output's
+# standard deviation.
 NOISE = 0.01
-RIDGE = 1e-3  # ridge penalty of the linear part
+RIDGE = 1e-3  # ridge penalty in the regression that gives the initial weights of the linear part
 RATE = 0.01  # initial learning rate; it decays to 0 by a cosine
 LARGEST_BATCH = 512
-# Predicted noise before training, as a share of an output's standard deviation. If it begins at 0.05, training fails
-# near contacts, where the motion changes suddenly.
+# Noise that networks predict before training, as a share of an output's standard deviation. If it begins at 0.05,
+# training fails near contacts, where the motion changes suddenly.
 NOISE_BEGINS = math.exp(-1.5)
-Loss = Callable[[Tensor, Tensor], Tensor]  # arguments: predictions (K, m, p) and targets (m, p)
+Loss = Callable[[Tensor, Tensor], Tensor]  # arguments: predictions of K networks (K, m, p), and targets (m, p)
 
 
 @dataclass(frozen=True)
@@ -55,20 +56,22 @@ class Training:
 
 
 def squared_error(predicted: Tensor, target: Tensor) -> Tensor:
-    """Return the squared error, summed over networks (members) and outputs and averaged over samples."""
+    """Return the squared error of predictions (K, m, p) of targets (m, p), summed over K networks and p outputs and
+    averaged over m samples."""
     return (predicted - target).square().mean(1).sum()
 
 
 def cross_entropy(predicted: Tensor, target: Tensor) -> Tensor:
-    """Return the cross entropy of logits and labels 0 or 1, summed over networks (members) and averaged over
-    samples."""
+    """Return the cross entropy of logits (K, m, p) and labels 0 or 1 (m, p), summed over K networks and p outputs and
+    averaged over m samples."""
     each = binary_cross_entropy_with_logits(predicted, target.expand_as(predicted), reduction="none")
     total: Tensor = each.mean(1).sum()
     return total
 
 
 def train(training: Training, x: Tensor, y: Tensor, loss: Loss, *, quadratic: bool = False) -> Networks:
-    """Fit networks to inputs x (n, d) and targets y (n, p); ``quadratic`` adds squares to the linear part."""
+    """Fit networks to inputs x (n, d) and targets y (n, p) by minimising ``loss``. If ``quadratic``, their linear part
+    also reads the squares of the inputs."""
     generator = torch.Generator().manual_seed(training.seed)
     anchors, variances = _priors(training, x.shape[1], y.shape[1], generator)
     linear = basis(x, quadratic)
@@ -86,8 +89,8 @@ def train(training: Training, x: Tensor, y: Tensor, loss: Loss, *, quadratic: bo
 
 
 def train_with_noise(training: Training, x: Tensor, y: Tensor) -> tuple[Networks, Networks]:
-    """Fit networks to inputs x (n, d) and targets y (n, p), and further networks to the log variance of the noise.
-    Return both."""
+    """Fit networks to inputs x (n, d) and targets y (n, p), together with networks of the log variance of the noise.
+    Return the former and the latter."""
     generator = torch.Generator().manual_seed(training.seed)
     anchors, variances = _priors(training, x.shape[1], y.shape[1], generator)
     drawn, _ = _priors(training, x.shape[1], y.shape[1], generator)
@@ -105,7 +108,7 @@ def train_with_noise(training: Training, x: Tensor, y: Tensor) -> tuple[Networks
         return _unlikely(mean, log_variance, y[rows], training.beta) + NOISE**2 / len(x) * torch.stack(pull).sum()
 
     _descend((skip, *hidden, log_noise, *noisy), objective, training.steps)
-    # The linear part of the noise networks is a constant, so the weights of the inputs are 0.
+    # The linear part of the networks of the noise is a constant, so its weights of the inputs are 0.
     constant = torch.cat([log_noise, log_noise.new_zeros(len(log_noise), x.shape[1], y.shape[1])], 1)
     return Networks(*map(in_rows, (skip, *hidden))), Networks(*map(in_rows, (constant, *noisy)))
 

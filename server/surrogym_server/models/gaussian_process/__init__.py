@@ -1,4 +1,4 @@
-"""Model family of Gaussian processes: structure chosen by evidence, every posterior in closed form."""
+"""Model family of Gaussian processes, whose inputs and kernels are chosen by evidence."""
 
 from surrogym_server.models.gaussian_process.family import GaussianProcesses
 

@@ -1,4 +1,4 @@
-"""Samples that ended at a bound. Their increments are cut off there, so they say little about the dynamics."""
+"""Find samples that ended at a bound. Their increments are cut off there, so they say little about the dynamics."""
 
 from __future__ import annotations
 
@@ -15,11 +15,13 @@ from surrogym_server.environment.samples import saturated
 def usable(
     definition: EnvironmentDefinition, column: int, q_next: Tensor, feature_map: FeatureMap, *, past_limits: bool
 ) -> Tensor:
-    """Return from which samples, ending at q_next (m, C), a transition output learns, (m,) bool. It does not learn from
-    samples whose result a limit may have changed.
+    """Return for each of m samples, with next states q_next (m, C), whether a transition output learns from it, (m,)
+    bool. It does not learn from samples whose result a limit may have changed.
 
     Args:
+        definition: the environment.
         column: index of the transition output.
+        q_next: states in which the samples ended.
         feature_map: features that the output's process reads.
         past_limits: whether the output also learns from samples that end at a limit of another coordinate.
     """
@@ -33,10 +35,11 @@ def usable(
 
 
 def stopped(definition: EnvironmentDefinition, index: int, q_next: Tensor) -> Tensor:
-    """Return which samples, ending at q_next (n, C), reached a bound that may have changed the result of coordinate
-    ``index``, (n,) bool: a bound of this coordinate, or a wall, which stops another coordinate.
+    """Return for each of n samples, with next states q_next (n, C), whether it reached a bound that may have changed
+    the result of the coordinate ``index``, (n,) bool: a bound of this coordinate, or a wall, at which another
+    coordinate, such as a speed, becomes 0.
 
-    A limit of another coordinate that stops nothing, such as the pressure limit of a relief valve, does not count.
+    A limit of another coordinate that is no wall, such as the pressure limit of a relief valve, does not count.
     """
     limits = [i for i in definition.moving if i != index and definition.coordinates[i].stops is None]
     others = q_next.clone()
@@ -45,8 +48,9 @@ def stopped(definition: EnvironmentDefinition, index: int, q_next: Tensor) -> Te
 
 
 def saturates(definition: EnvironmentDefinition, index: int, q_next: Tensor) -> Tensor:
-    """Return which samples, ending at q_next (n, C), reached a bound of coordinate ``index``, or of any other
-    coordinate except the leading ones, whose clipped next values the output can read, (n,) bool."""
+    """Return for each of n samples, with next states q_next (n, C), whether it reached a bound of the coordinate
+    ``index`` or of another coordinate, (n,) bool. Leading coordinates (see ``features.leading``) don't count as other
+    coordinates, because their clipped next values can be inputs of the output."""
     others = q_next.clone()
     others[:, leading(definition)] = math.nan
     others[:, index] = q_next[:, index]

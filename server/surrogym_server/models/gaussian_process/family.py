@@ -1,4 +1,4 @@
-"""GaussianProcesses: Gaussian processes as a family for the registry of models."""
+"""The family of models that consist of Gaussian processes, for the registry of models."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from surrogym_server.models.port import DynamicsModel, Learned, Learner, ModelCo
 
 @dataclass(frozen=True)
 class GaussianProcesses(Settings, Learner, TakesPrior):
-    """Learner of one Gaussian process for each output, whose structure (such as its inputs) is chosen by evidence. A
-    fit can start at the hyperparameters of an earlier fit (warm start)."""
+    """Learner of one Gaussian process for each output. The structure of each process, such as its inputs, is chosen by
+    evidence. A fit can start at the hyperparameters of an earlier fit (warm start)."""
 
     @property
     def codec(self) -> ModelCodec:

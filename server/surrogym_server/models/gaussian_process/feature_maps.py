@@ -1,4 +1,7 @@
-"""Candidate feature maps for the choice by evidence, and the mirror image of each. Nothing here knows a task."""
+"""Candidate feature maps (encodings of state and action as inputs of a process), and the symmetry of each.
+
+Learning chooses among the candidates by evidence. They are the same for all environments.
+"""
 
 from __future__ import annotations
 
@@ -11,14 +14,16 @@ from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.features import Drift, Encoding, Feature, FeatureMap, Parity, State, features, leading
 from surrogym_server.gp import Reflection
 
-CENTRED = 1e-9  # a range counts as centred at 0 if its middle is no farther from 0 than this share of its scale
+# A coordinate's range counts as centred at 0 if its middle is no farther from 0 than this share of its scale.
+CENTRED = 1e-9
 
 
 def reward_candidates(definition: EnvironmentDefinition) -> tuple[FeatureMap, ...]:
-    """Return candidate feature maps of the reward: of the state before the step, after it, or both, as the definition's
-    ``reward_timing`` says.
+    """Return candidate feature maps (encodings of state and action) of the reward: of the state before the step, of the
+    state after the step, or maps of both kinds, as the definition's ``reward_timing`` says.
 
-    Rewards often depend on features that the observation combines, such as the distance to a target.
+    The observation is a candidate too if it combines coordinates, because rewards often depend on such combinations,
+    for example the distance to a target.
     """
     timings = {"before": (False,), "after": (True,), "auto": (False, True)}[definition.reward_timing]
     maps = candidates(definition, follows=False, parity="even")
@@ -30,15 +35,14 @@ def reward_candidates(definition: EnvironmentDefinition) -> tuple[FeatureMap, ..
 def candidates(
     definition: EnvironmentDefinition, follows: bool, drift: Drift = (), parity: Parity = "odd"
 ) -> tuple[FeatureMap, ...]:
-    """Return candidate feature maps of one output. If the environment has lags (coordinates that repeat past values),
-    each map also occurs with every shorter history of lags.
+    """Return candidate feature maps (encodings of state and action) of one output. If the environment has lags
+    (coordinates that repeat past values), each map also occurs with fewer past values.
 
     Args:
         definition: the environment.
-        follows: whether the output may read the predicted next values of the leading coordinates, see
-            ``features.leading``.
-        drift: for each angle, weights of the coordinates that predict the angle's increment; or empty.
-        parity: parity of the output if the environment has mirror symmetry.
+        follows: whether the predicted next values of the leading coordinates (see ``features.leading``) may be inputs.
+        drift: for each angle, weights of the coordinates that predict the angle's increment; empty without them.
+        parity: symmetry that maps with mirror symmetry have: the output is an ``odd`` or ``even`` function.
     """
     if definition.moves_observation:
         return (FeatureMap(state="observation"),)
@@ -60,10 +64,10 @@ def candidates(
 
 def reflection(definition: EnvironmentDefinition, feature_map: FeatureMap) -> Reflection | None:
     """Return the symmetry of a process with a feature map: whether each feature changes its sign if all coordinates and
-    the action change their signs, and the map's parity.
+    the action change their signs, and the map's parity (even or odd).
 
-    None if the map has no parity, or if a feature neither stays equal nor changes its sign: a coordinate whose range is
-    not centred at 0, a one-hot action, or an observation.
+    The result is None if the map has no parity, or if a feature neither stays equal nor changes its sign. This is so
+    for a coordinate whose range is not centred at 0, a one-hot action, or an observation.
     """
     if not feature_map.parity:
         return None
@@ -75,15 +79,15 @@ def reflection(definition: EnvironmentDefinition, feature_map: FeatureMap) -> Re
 
 
 def _sign(definition: EnvironmentDefinition, feature: Feature) -> int:
-    """Return 1 if a feature stays the same when all coordinates and the action change their signs, -1 if it changes its
-    sign then, 0 otherwise."""
+    """Return 1 if a feature stays the same when all coordinates and the action change their signs, -1 if the feature
+    changes its sign, 0 otherwise."""
     match feature.function:
         case "cos" | "turned_cos":
             return 1
         case "sin" | "turned_sin" | "wrapped":
             return -1
         case "affine" if feature.entry >= len(definition.coordinates) and definition.action.nvec:
-            # The mirror image of a discrete action has the reverse number, so the centred number changes its sign.
+            # The mirror image of number i of k discrete actions is k - 1 - i, so the centred number changes its sign.
             return -1
         case "affine" | "lead":
             return -1 if abs(feature.centre) <= CENTRED * feature.scale else 0

@@ -1,4 +1,4 @@
-"""GaussianProcessModel: Gaussian processes fitted to one environment. A stored one repeats no computation."""
+"""Model that consists of Gaussian processes fitted to one environment."""
 
 from __future__ import annotations
 
@@ -53,7 +53,9 @@ from surrogym_shared import compiled
 if TYPE_CHECKING:
     from surrogym_server.models.gaussian_process.prediction.compiled.step import StepsOfModel
 
-COMPILED_SOLVES = 300  # if a process has more points than this, a linear algebra library is faster than compiled code
+# If a process has more points than this, standard deviations are computed faster by a linear algebra library than by
+# compiled code.
+COMPILED_SOLVES = 300
 
 
 @dataclass(frozen=True)
@@ -76,17 +78,17 @@ class GaussianProcessModel(
     definition: EnvironmentDefinition
     transitions: tuple[OutputModel, ...]  # the M transition outputs, in the order of definition.outputs
     reward: OutputModel
-    terminal_reward: float  # reward that terminating steps pay in addition to the prediction of the reward process
+    terminal_reward: float  # reward that steps that end an episode give in addition to the prediction of ``reward``
     samples: int
     digest: str
     ending: Region | None = None  # region in which episodes end, if termination is learned
-    jumps: tuple[Jump, ...] = ()  # jumps of the reward, which are added to the prediction of the reward process
-    # Prior model; its predictions are added to those outputs that have a ``size_with_prior``.
+    jumps: tuple[Jump, ...] = ()  # regions of states with the constants that are added to the reward inside them
+    # Prior model, for example of a simulator. Its predictions are added to outputs with a ``size_with_prior``.
     prior: GaussianProcessModel | None = None
 
     @property
     def outputs(self) -> tuple[OutputModel, ...]:
-        """All outputs, the reward last."""
+        """Models of all outputs, the reward last."""
         return (*self.transitions, self.reward)
 
     def transition(
@@ -226,8 +228,8 @@ class GaussianProcessModel(
         return self.reward.warp is not None and self.reward.warp.sign > 0
 
     def promise(self, q: Tensor, u: Tensor) -> Tensor:
-        """Return an optimistic score of the reward, (m,): the mean plus one standard deviation of the reward's process,
-        which predicts the reward or its logarithm."""
+        """Return an optimistic score of the reward of steps from q (m, C) under u (m, F), (m,): the mean plus one
+        standard deviation of the reward's process, which predicts the reward or its logarithm."""
         steps = PredictedSteps(q, u, self._predictor.transition(q, u, None, None, None, False, False).q_next)
         mean, std = self.reward.target(process_inputs(self.definition, self.reward, steps))
         return mean + std
@@ -248,8 +250,8 @@ class GaussianProcessModel(
         return step_source(self.definition, tables_of(self._predictor, self.ending))
 
     def _learns(self, column: int, q_next: Tensor) -> Tensor:
-        """Return from which samples, ending at q_next (m, C), the output with index ``column`` would learn, (m,)
-        bool."""
+        """Return for each of m steps to q_next (m, C) whether the output with index ``column`` would learn from it,
+        (m,) bool."""
         if column == len(self.transitions):
             return ~self.terminated(q_next)
         output = self.transitions[column]

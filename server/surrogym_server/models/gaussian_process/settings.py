@@ -1,4 +1,4 @@
-"""Settings of the family of Gaussian processes, as in a specification."""
+"""Settings of the family of Gaussian processes, which a specification can change."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from surrogym_server.models.setting_checks import require_whole
 
 CHOICES = {"kernel": ("composite", "squared_exponential"), "symmetry": ("auto", "none")}
-FEWEST, MOST = 10, 2_000  # allowed numbers of inducing points
+FEWEST, MOST = 10, 2_000  # the setting ``inducing`` must be 0 or between these numbers
 
 
 @dataclass(frozen=True)
@@ -16,17 +16,18 @@ class Settings:
     points are used.
 
     Attributes:
-        kernel: kernel of every process; ``composite`` adds a linear part, and for the reward a quadratic one.
+        kernel: kernel of every process. ``composite`` adds a linear part to the squared exponential, and for the reward
+            also a quadratic part.
         reward_jumps: whether the reward may be higher or lower by a constant inside learned regions of states.
-        symmetry: ``auto`` also compares feature maps with mirror symmetry, ``none`` does not.
+        symmetry: ``auto`` also compares functions with mirror symmetry, ``none`` does not.
         rates: whether a transition output may change faster the larger an input is; see ``gp.growth``.
         reward_peaks: whether the reward may be learned by its logarithm, if it is nearly zero almost everywhere.
         drop_inputs: whether an output may ignore inputs that don't matter to it; see ``gp.selection``.
         repeated_parts: whether outputs that are the same function of different inputs may share samples; see
             ``gp.pooling``. Needs ``drop_inputs``.
-        inducing: greatest number of inducing points of a process. With more samples than that, hyperparameters maximise
-            the variational bound of all samples. 0 selects ``learning.many.BySubsets`` instead, which fits them to
-            subsets.
+        inducing: greatest number of inducing points of a process. With more than 150 samples, hyperparameters maximise
+            the variational bound of all samples. 0 selects ``learning.many.BySubsets`` instead, which fits
+            hyperparameters to subsets of the samples.
     """
 
     kernel: str = "composite"

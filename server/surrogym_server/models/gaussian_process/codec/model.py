@@ -1,4 +1,4 @@
-"""GaussianProcessCodec: convert a model to a header and named arrays, and back. Loading repeats no computation."""
+"""Conversion of a model of Gaussian processes to a header and named arrays, and back, without repeated computations."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ from surrogym_server.models.gaussian_process.prediction.regions import TERMINATI
 from surrogym_server.models.port import DynamicsModel, ModelCodec, StoredModel, require_format, require_sums
 
 FORMAT = 8
-JUMP = "jump"  # prefix of the names of a jump's arrays
-PRIOR = "prior."  # prefix of the names of the arrays of a model's prior
+JUMP = "jump"  # in a stored model, names of arrays that belong to a jump of the reward begin with this
+PRIOR = "prior."  # in a stored model, names of arrays that belong to its prior model begin with this
 
 
 class GaussianProcessCodec(ModelCodec):
@@ -37,7 +37,9 @@ class GaussianProcessCodec(ModelCodec):
 
     def encode(self, model: DynamicsModel) -> StoredModel:
         if not isinstance(model, GaussianProcessModel):
-            raise TypeError(f"expected a model of Gaussian processes, got {type(model).__name__}")
+            raise TypeError(
+                f"expected a model of Gaussian processes, got {type(model).__name__}; use its own family's codec"
+            )
         return StoredModel(_header(model), _tensors(model))
 
     def decode(self, definition: EnvironmentDefinition, stored: StoredModel) -> GaussianProcessModel:
@@ -111,14 +113,14 @@ def _require_consistent(model: GaussianProcessModel) -> None:
     definition, reward = model.definition, model.reward
     if model.prior is None and any(output.size_with_prior is not None for output in model.outputs):
         raise InvalidInput(
-            "an output needs the prior beside which it was learned, but the model contains no prior; export the "
-            "model again"
+            "expected a model that contains a prior model, because one of its outputs adds to the prior's predictions, "
+            "got a model with no prior; export the model again"
         )
     require_sums(model.terminal_reward, model.samples)
     if any(output.feature_map.after for output in model.transitions):
         raise InvalidInput(
-            "a transition output reads the state after the step; expected all of them to read the state before it; "
-            "export the model again"
+            "expected a model that predicts the next state from the state before the step, got a model with an output "
+            "that reads the state after the step; export the model again"
         )
     if (model.ending is not None) != definition.learns_termination:
         learned, got = ("learned" if x else "declared" for x in (definition.learns_termination, model.ending))

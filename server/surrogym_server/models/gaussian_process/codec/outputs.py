@@ -30,7 +30,8 @@ KNOWN_MAPS = frozenset(
 
 
 def output_tensors(output: OutputModel, prefix: str) -> dict[str, Tensor]:
-    """Return the arrays of an output by name, each name with the prefix; none for an output that never varied."""
+    """Return the arrays of an output by name. Each name begins with ``prefix``. An output that never varied has no
+    arrays."""
     if (posterior := output.posterior) is None:
         return {}
     arrays = {"x": posterior.x, "y": posterior.y, "factor": posterior.factor, "weights": posterior.weights}
@@ -39,8 +40,8 @@ def output_tensors(output: OutputModel, prefix: str) -> dict[str, Tensor]:
 
 
 def require_output(definition: EnvironmentDefinition, output: OutputModel) -> None:
-    """Raise ``InvalidInput`` unless an output's arrays have the right shapes and all its numbers are ones that a fit
-    can give."""
+    """Raise ``InvalidInput`` unless an output's arrays have the right shapes and all its numbers are possible results
+    of a fit."""
     _require_drift(definition, output)
     _require_dropped(definition, output)
     _require_warp(output)
@@ -94,11 +95,15 @@ def read_output(
     shorter = (None, *range(max(definition.ages)))
     plain = replace(feature_map, drift=(), history=None, rates=(), dropped=())
     if plain not in KNOWN_MAPS or feature_map.history not in shorter:
-        raise ValueError(f"expected a feature map that this version knows, got {feature_map}; export the model again")
+        raise ValueError(
+            f"expected a feature map (encoding of state and action) that this version knows, got {feature_map}; "
+            "export the model again"
+        )
     mirror = reflection(definition, feature_map)
     if feature_map.parity and mirror is None:
         raise ValueError(
-            f"expected a feature map without parity, because the environment has no mirror symmetry, got {feature_map}"
+            "expected a feature map (encoding of state and action) without parity, because the environment has no "
+            f"mirror symmetry, got {feature_map}; export the model again"
         )
     posterior = None
     if (header := entry["posterior"]) is not None:
@@ -151,51 +156,52 @@ def _require_drift(definition: EnvironmentDefinition, output: OutputModel) -> No
     shape = (len(definition.angles), len(definition.coordinates))
     if len(drift) != shape[0] or any(len(row) != shape[1] or not all(map(math.isfinite, row)) for row in drift):
         raise InvalidInput(
-            f"output {output.name!r}: expected the drift as finite numbers of shape {shape}, got {drift}; export the "
-            "model again"
+            f"output {output.name!r}: expected the drift as finite numbers, one row for each angle and one column for "
+            f"each coordinate: {shape}, got {drift}; export the model again"
         )
 
 
 def _require_dropped(definition: EnvironmentDefinition, output: OutputModel) -> None:
-    """Raise ``InvalidInput`` unless the dropped features are features of the map in ascending order, and at least one
-    feature remains."""
+    """Raise ``InvalidInput`` unless the features that an output ignores are features of its feature map, in ascending
+    order, and at least one feature remains."""
     if not (places := output.feature_map.dropped):
         return
     count = len(features(definition, replace(output.feature_map, rates=(), dropped=())))
     ordered = list(places) == sorted(set(places))
     if output.posterior is None or not ordered or len(places) >= count or not 0 <= min(places) <= max(places) < count:
         raise InvalidInput(
-            f"output {output.name!r}: expected `dropped` as ascending indices of some, not all, of the inputs 0 to "
-            f"{count - 1}, got {places}; export the model again"
+            f"output {output.name!r}: expected `dropped`, the inputs that it ignores, as ascending indices of some, "
+            f"not all, of the inputs 0 to {count - 1}, got {places}; export the model again"
         )
 
 
 def _require_size(output: OutputModel) -> None:
-    """Raise ``InvalidInput`` unless an output that adds to a model's prior has a finite ``size_with_prior`` above 0 and
-    no ``warp`` (learned logarithm)."""
+    """Raise ``InvalidInput`` unless an output that adds to a prior model's prediction has a finite ``size_with_prior``
+    above 0 and is not learned by its logarithm (``warp``)."""
     size = output.size_with_prior
     if size is not None and (not 0 < size < math.inf or output.warp is not None):
         raise InvalidInput(
-            f"output {output.name!r}: expected `size_with_prior` as a finite number above 0, and no `warp` beside it, "
-            f"got {size} and {output.warp}; export the model again"
+            f"output {output.name!r}: expected `size_with_prior` (its standard deviation, if it adds to a prior model) "
+            f"as a finite number above 0, without a `warp` (learned logarithm), got {size} and {output.warp}; export "
+            "the model again"
         )
 
 
 def _require_warp(output: OutputModel) -> None:
-    """Raise ``InvalidInput`` if an output other than a learned reward has a ``warp``, that is, was learned by its
-    logarithm."""
+    """Raise ``InvalidInput`` if an output other than a learned reward has a ``warp`` (was learned by its logarithm), or
+    if the numbers of the ``warp`` are invalid."""
     if output.warp is None:
         return
     if output.name != REWARD or output.posterior is None or not output.warp.finite:
         raise InvalidInput(
-            f"output {output.name!r}: expected `warp` only for a learned reward and with finite numbers, got "
-            f"{output.warp}; export the model again"
+            f"output {output.name!r}: expected `warp` (learned logarithm) only for a learned reward and with finite "
+            f"numbers, got {output.warp}; export the model again"
         )
 
 
 def _require_rates(definition: EnvironmentDefinition, output: OutputModel) -> None:
-    """Raise ``InvalidInput`` unless only transition outputs have rates, one for each feature, and the amplitude is
-    above 0 at all points."""
+    """Raise ``InvalidInput`` if an output has invalid rates (see ``gp.growth``). Valid are rates of a transition
+    output, one for each feature, with which the amplitude is above 0 at all points of its process."""
     if not (rates := output.feature_map.rates):
         return
     plain = replace(output.feature_map, rates=())
@@ -214,37 +220,37 @@ def _require_rates(definition: EnvironmentDefinition, output: OutputModel) -> No
         )
     if not bool((1 + output.posterior.x * torch.tensor(rates, dtype=torch.float64) > 0).all()):
         raise InvalidInput(
-            f"output {output.name!r}: expected `rates` with which the amplitude is above 0 at all samples, got "
-            f"{rates}; export the model again"
+            f"output {output.name!r}: expected `rates`, with which its changes grow along its inputs, whose factor is "
+            f"above 0 at all samples, got {rates}; export the model again"
         )
 
 
 def _require_at_limit(definition: EnvironmentDefinition, output: OutputModel) -> None:
-    """Raise ``InvalidInput`` unless ``at_limit``, which says which points observe a limit, has one entry for each point
-    and belongs to a transition output."""
+    """Raise ``InvalidInput`` unless ``at_limit``, which marks the points that ended at a limit of the output, belongs
+    to a transition output and has one entry for each point of its process."""
     if not (sides := output.at_limit):
         return
     count = 0 if output.posterior is None else len(output.posterior.y)
     if output.name not in definition.outputs[:-1] or len(sides) != count or not set(sides) <= {-1, 0, 1}:
         raise InvalidInput(
-            f"output {output.name!r}: expected `at_limit` only for a transition: -1, 0 or 1 for each of {count} "
-            f"samples, got {len(sides)} entries; export the model again"
+            f"output {output.name!r}: expected `at_limit` (which samples ended at its lower or upper limit) only for a "
+            f"transition, and -1, 0 or 1 for each of {count} samples, got {len(sides)} entries; export the model again"
         )
 
 
 def _require_shared(definition: EnvironmentDefinition, output: OutputModel) -> None:
-    """Raise ``InvalidInput`` if an output that learned from samples of other outputs, or one of these, is not a
-    transition output."""
+    """Raise ``InvalidInput`` if an output has learned from samples of other outputs, unless it and the other outputs
+    are transition outputs."""
     transitions = definition.outputs[:-1]
     if output.shared and not {output.name, *output.shared} <= set(transitions):
         raise InvalidInput(
-            f"output {output.name!r}: expected `shared` to name some of {', '.join(transitions)}, got "
-            f"{output.shared}; export the model again"
+            f"output {output.name!r}: expected `shared` (outputs from whose samples it learned too) to name some of "
+            f"{', '.join(transitions)}, got {output.shared}; export the model again"
         )
 
 
 def _require_numbers(output: OutputModel) -> None:
-    """Raise ``InvalidInput`` unless every number is finite, and positive where it must be."""
+    """Raise ``InvalidInput`` unless every number of an output is finite, and positive or not negative where needed."""
     finite, positive, least_zero, tensors = [output.centre], [output.scale], [0.0], []
     if (posterior := output.posterior) is not None:
         hyper = posterior.hyper
@@ -264,8 +270,8 @@ def _require_numbers(output: OutputModel) -> None:
         and all(bool(torch.isfinite(t).all()) for t in tensors)
     ):
         raise InvalidInput(
-            f"output {output.name!r}: expected finite numbers, and scale, length scales and variances above 0; "
-            "got others; export the model again"
+            f"output {output.name!r}: expected finite numbers, with scale, length scales and variances above 0, "
+            "got a number that is not; export the model again"
         )
 
 

@@ -1,4 +1,4 @@
-"""Conversion of a learned region to header and tensors, and back, with a check of every number."""
+"""Conversion of a learned region of states to header and tensors, and back, with a check of every number."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def region_header(region: Region) -> dict[str, Any]:
 
 
 def region_tensors(region: Region, prefix: str) -> dict[str, Tensor]:
-    """Return the arrays of a region by name, each name with the prefix."""
+    """Return the arrays of a region by name. Each name begins with ``prefix``."""
     tensors: dict[str, Tensor] = {}
     for index, (_, form) in enumerate(region.forms):
         if isinstance(form, Classifier):
@@ -61,7 +61,7 @@ def read_region(
 def read_jumps(
     definition: EnvironmentDefinition, entries: Any, tensors: Mapping[str, Tensor], prefix: str
 ) -> tuple[Jump, ...]:
-    """Build the jumps from their entries in the header and their arrays.
+    """Build the jumps of a reward from their entries in the header and their arrays.
 
     Raises:
         LookupError, TypeError, ValueError: an entry is malformed.
@@ -70,7 +70,9 @@ def read_jumps(
     for index, (size, entry) in enumerate(entries):
         region = read_region(definition, entry, tensors, f"{prefix}.{index}")
         if region is None:
-            raise ValueError(f"jump {index}: expected a region, got none; export the model again")
+            raise ValueError(
+                f"expected a region of states for jump {index} of the reward, got none; export the model again"
+            )
         jumps.append(Jump(region, float(size)))
     return tuple(jumps)
 
@@ -80,8 +82,8 @@ def require_region(region: Region) -> None:
     weights = [weight for weight, _ in region.forms]
     if not weights or min(weights) <= 0 or not math.isclose(sum(weights), 1, abs_tol=1e-6):
         raise InvalidInput(
-            f"expected weights of a region's forms that are above 0 and add up to 1, got {weights[:4]}; export the "
-            "model again"
+            "expected a learned region of states whose parts have weights above 0 that add up to 1, got the weights "
+            f"{weights[:4]}; export the model again"
         )
     for _, form in region.forms:
         if isinstance(form, Classifier):
@@ -108,8 +110,8 @@ def _read_form(definition: EnvironmentDefinition, entry: Any, tensors: Mapping[s
 def _require_classifier(classifier: Classifier) -> None:
     if classifier.process.feature_map.lead:
         raise InvalidInput(
-            "expected a region's classifier to read the state alone, got one that also reads its change (`lead`); "
-            "export the model again"
+            "expected a learned region of states whose classifier reads the state alone, got a classifier that also "
+            "reads next values (`lead`); export the model again"
         )
     require_output(classifier.definition, classifier.process)
 
@@ -127,8 +129,8 @@ def _require_thresholds(thresholds: Thresholds) -> None:
     )
     if not (sound and thresholds.rules and all(thresholds.rules)):
         raise InvalidInput(
-            f"expected a region's thresholds on the axes 0 to {axes - 1}, each with outside < inside and a "
-            f"weight above 0 and at most 1, got {cuts[:4]}; export the model again"
+            f"expected a learned region of states with thresholds on the axes 0 to {axes - 1}, each with outside < "
+            f"inside and a weight above 0 and at most 1, got {cuts[:4]}; export the model again"
         )
 
 

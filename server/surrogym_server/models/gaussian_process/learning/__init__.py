@@ -1,1 +1,1 @@
-"""Learning of a model from samples: targets, evidence, regions, jumps of the reward."""
+"""Learning of a model of Gaussian processes from samples."""

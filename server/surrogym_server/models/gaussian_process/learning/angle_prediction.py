@@ -1,7 +1,7 @@
-"""Drift: the angle that a joint reaches within a step by its present motion, learned from samples.
+"""Drift: the change of an angle within a step by its present motion, predicted by a linear regression.
 
 A fast pole turns far within a step. The forces on it depend on all angles on the way, not only on the first angle. So
-cosine and sine of angle + drift are better inputs than those of the angle alone. The drift is a linear regression.
+cosine and sine of angle + drift are better inputs than those of the angle alone.
 """
 
 from __future__ import annotations
@@ -14,14 +14,15 @@ from surrogym_server.environment.distributions import scaling
 from surrogym_server.environment.features import Drift
 from surrogym_server.environment.samples import Samples
 
-POINTS_A_WEIGHT = 3  # least number of samples for each weight of the regression
+POINTS_A_WEIGHT = 3  # the regression of the drift needs at least this many samples for each of its weights
 
 
 def learn_drift(definition: EnvironmentDefinition, samples: Samples) -> Drift:
     """Fit, for each angle, weights w (C,) of the coordinates q that predict the angle's increment as w . q + constant,
-    by least squares.
+    by least squares. Return the weights without the constant.
 
-    Only linear coordinates have a weight other than 0. Return () if there is no angle or if the samples are too few.
+    Angles and past actions among the coordinates have the weight 0. The result is () if there is no angle or if there
+    are too few samples.
     """
     moved_by = [i for i, c in enumerate(definition.coordinates) if c.kind == "linear" and not _is_action(c.lag)]
     if not definition.angles or not moved_by or len(samples) < POINTS_A_WEIGHT * (len(moved_by) + 1):

@@ -1,4 +1,4 @@
-"""Choice by evidence which inputs an output leaves out, see ``gp.selection`` and ``gp.bound``."""
+"""Decide by evidence which inputs the process of an output ignores; see ``gp.selection`` and ``gp.bound``."""
 
 from __future__ import annotations
 
@@ -15,11 +15,12 @@ from surrogym_server.models.gaussian_process.learning.output_learner import Outp
 from surrogym_server.models.gaussian_process.learning.rates import inputs_of
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 
-ODDS = -1.0  # prior log odds of leaving out one input
-# Log odds per sample by which fewer inputs must be likelier; with a smaller value some predictions were overconfident.
+ODDS = -1.0  # prior log odds of leaving out an input
+# Inputs are left out only if the log evidence increases by at least this much per sample. With a smaller value, some
+# predictions were overconfident.
 WIN = 2.0
-LESS = 0.5  # greatest leave-one-out error with fewer inputs, as a share of the error with all inputs
-# Least number of samples with which inputs are left out; with fewer samples some wrong inputs were left out.
+LESS = 0.5  # inputs are left out only if the leave-one-out error falls to at most this share
+# No inputs are left out if there are fewer samples than this, because wrong inputs were left out then.
 FEWEST = 20
 
 
@@ -29,9 +30,10 @@ def without_inputs(
     """Return the output without the inputs that hardly influence it, or unchanged if all inputs matter.
 
     Args:
+        learner: fitter of the model's outputs.
         output: the learned output.
         target: targets of the output, (n,).
-        inputs: features (n, d) of each candidate map.
+        inputs: features (n, d) of the samples for each candidate feature map (encoding of state and action).
         used: (n,) bool, the samples from which the output was learned.
     """
     may, posterior = _may_be_dropped(learner, output), output.posterior
@@ -41,7 +43,7 @@ def without_inputs(
     if posterior.sparse is not None:
         x = inputs_of(output, inputs)[used]
         y = output.standardised(target[used], x)
-        if posterior.points != len(x):  # the process also learned from samples that ended at limits
+        if posterior.points != len(x):  # the process has also learned from samples at limits, which ``used`` lacks
             return output
     try:
         if posterior.sparse is not None and (is_noisy(posterior.hyper) or not loses_nothing(posterior)):
@@ -60,7 +62,7 @@ def _of_many(
     learner: OutputLearner, output: OutputModel, posterior: Posterior, may: Tensor, x: Tensor, y: Tensor
 ) -> OutputModel:
     """Leave out inputs of an output whose process has inducing points and was fitted to points x (n, d), y (n,).
-    ``may`` (d,) bool are the inputs that may be left out."""
+    ``may`` (d,) is true for the inputs that may be left out."""
     selection = learner.many.fewer_inputs(x, y, learner.options(output.name), posterior, may, ODDS)
     if selection is None:
         return output
@@ -68,11 +70,11 @@ def _of_many(
 
 
 def _may_be_dropped(learner: OutputLearner, output: OutputModel) -> Tensor:
-    """Return which inputs of an output may be left out, (d,) bool.
+    """Return for each of the d inputs of an output whether it may be left out, (d,) bool.
 
-    Some inputs may not: the next value of a leading coordinate, such as a limited speed, because only samples that end
-    at its limit show its effect; and inputs with a rate. If there are too few samples, or if the process predicts well
-    already, no input may be left out.
+    Two kinds of inputs may not be left out: the next value of a leading coordinate, such as a limited speed, because
+    only samples that end at its limit show its effect; and inputs along which the output changes faster and faster
+    (rates). No input may be left out if there are too few samples, or if the process predicts well already.
     """
     read = features(learner.definition, output.feature_map)
     may = torch.tensor([feature.function not in ("lead", "grown") for feature in read])

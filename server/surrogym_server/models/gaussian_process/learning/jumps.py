@@ -1,8 +1,8 @@
-"""Search for jumps of a reward: a split of its values that makes the rewards likelier than one process does.
+"""Search for jumps of a reward: regions of states inside which the reward is higher or lower by a constant.
 
-Both explanations are compared as densities of the same rewards, in the same unit: the evidence of the plain process
-against the product of the evidence outside the region, the probability of the rewards inside given one unknown jump,
-and the probability of the labels.
+Two explanations of the rewards are compared by their densities: one process of all rewards, by its evidence; and a
+region with a jump, by the product of the evidence of a process outside the region, the density of the rewards inside
+given one unknown jump, and the probability of the labels (which samples are inside).
 """
 
 from __future__ import annotations
@@ -24,13 +24,14 @@ from surrogym_server.models.gaussian_process.prediction.regions import Jump, Reg
 
 EDGE = "reward edge"
 MAX_JUMPS = 3
-SPLITS = 3  # number of gaps of the sorted rewards at which a split is tried, the widest first
-GAP = 0.2  # least width of a gap of the sorted rewards at which a split is tried, as a share of their range
-# Log odds per sample by which jumps must be likelier; in experiments smooth bumps reached 1.5, true jumps at least 2.9.
+SPLITS = 3  # a jump is searched for at this many gaps between the sorted rewards, the widest first
+GAP = 0.2  # a jump is searched for only at gaps wider than this share of the range of the rewards
+# Log odds per sample by which jumps must be likelier than no jump. In experiments smooth bumps reached 1.5, true jumps
+# at least 2.9.
 MARGIN = 2.0
-WORTH = 5.0  # log odds by which one more jump must be likelier
-SIZE = 3.0  # prior standard deviation of a jump, in standard deviations of the reward
-FLOOR = 1e-4  # noise assumed for rewards that are all equal, in standard deviations of the reward
+WORTH = 5.0  # log odds by which one more jump must be likelier than fewer jumps
+SIZE = 3.0  # prior standard deviation of the height of a jump, in standard deviations of the reward
+FLOOR = 1e-4  # standard deviation of the noise if all rewards are equal, in standard deviations of the reward
 
 Split = tuple[float, Region, OutputModel, Tensor]
 
@@ -44,7 +45,7 @@ def with_jumps(
 
     Args:
         samples: all n samples.
-        inputs: features (n, d) of each candidate map.
+        inputs: features (n, d) of the samples for each candidate feature map (encoding of state and action).
         going: (n,) bool, the samples from which the reward is learned: the non-terminating steps.
         plain: the output that was learned from these samples without jumps.
     """
@@ -57,7 +58,7 @@ def with_jumps(
         gain, edge, process, outside = max(splits, key=lambda split: split[0])
         regions.append((edge, rest & ~outside))
         total, rest = total + gain, outside
-        # Checked for all numbers of jumps, because the first of two jumps may gain little by itself.
+        # Compared for every number of jumps, because the first of two jumps may gain little by itself.
         if total > max(MARGIN * int(going.sum()), best[0] + WORTH):
             best = (total, process, len(regions))
     _, process, count = best
@@ -68,9 +69,9 @@ def with_jumps(
 def _splits(
     learner: OutputLearner, samples: Samples, inputs: Mapping[FeatureMap, Tensor], going: Tensor, plain: OutputModel
 ) -> Iterator[Split]:
-    """Yield each candidate for a jump, which splits the samples of ``going`` (n,) by their reward into a smaller part
-    inside and the rest outside: its gain in log odds over ``plain``, the region inside, the output learned outside, and
-    the samples outside (n,) bool.
+    """Yield candidates for a jump. Each splits the samples ``going`` (n,) by a level of the reward: the smaller part
+    lies inside a region, the rest outside. A candidate consists of its log odds against ``plain``, the region, the
+    output learned from the samples outside, and the mask of these samples (n,).
 
     A single sample inside counts as a jump only if the rewards of all others are equal. Otherwise it may also lie on a
     steep slope.
@@ -108,16 +109,16 @@ def _levels(reward: Tensor) -> list[float]:
 
 
 def _evidence(process: OutputModel, points: int, unit: float) -> float:
-    """Return the log density of the ``points`` targets to which an output was fitted, if targets are measured in
-    multiples of ``unit``."""
+    """Return the log density of the rewards to which an output was fitted, if rewards are divided by ``unit``.
+    ``points`` is the number of these rewards."""
     if process.posterior is None:
         return -points * (math.log(FLOOR) + 0.5 * math.log(2 * math.pi))
     return dict(process.scores)[str(process.feature_map)] - points * math.log(process.scale / unit)
 
 
 def _paid_inside(residual: Tensor, spread: Tensor) -> float:
-    """Return the log density of residuals (i,) if each is the sum of one common jump with a normal prior and an
-    individual normal error with standard deviation ``spread`` (i,)."""
+    """Return the log density of the residuals (i,) of i samples inside a region, if each is the sum of one common jump
+    with a normal prior and an individual normal error with standard deviation ``spread`` (i,)."""
     shared = SIZE**2 * torch.ones(len(residual), len(residual), dtype=residual.dtype)
     covariance = shared + torch.diag(spread.square() + FLOOR**2)
     factor = torch.linalg.cholesky(covariance)

@@ -1,4 +1,4 @@
-"""Learning a model from samples: targets, censoring at bounds, and the choice of feature maps by evidence."""
+"""Learning a model from samples: transition outputs one by one, then the reward and the termination."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from surrogym_server.models.gaussian_process.prediction.output_model import Outp
 from surrogym_server.models.gaussian_process.settings import Settings
 from surrogym_server.models.port import Learned, Warm
 
-MIN_POINTS = 2  # least number of samples to learn from
+MIN_POINTS = 2  # a model can't be learned from fewer samples than this
 
 
 def learn(
@@ -39,7 +39,8 @@ def learn(
     warm: Warm,
     prior: GaussianProcessModel | None = None,
 ) -> Learned:
-    """Learn a model from samples; see ``Learner.learn``. A ``prior`` is a model of the same environment, or None.
+    """Learn a model from samples; see ``Learner.learn``. ``prior`` is another model of the same environment, for
+    example of a simulator, to whose predictions outputs may be added; or None.
 
     Raises:
         InvalidInput: there are fewer than two samples.
@@ -66,9 +67,9 @@ class _Among:
     """Candidate inputs of one transition output, and masks (n,) of the samples from which it may learn.
 
     Attributes:
-        inputs: features (n, d) of each candidate map.
+        inputs: features (n, d) of the samples for each candidate feature map (encoding of state and action).
         keep: samples that did not end at a bound, which would cut their increments off.
-        keep_lead: samples to learn from with maps that read the next values of leading coordinates.
+        keep_lead: samples to learn from if next values of other coordinates (leads) are inputs.
         past: samples to learn from if reaching limits of other coordinates does not change this output.
         side: (n,) 1 for a sample that ended at the output's own upper limit, -1 at the lower, otherwise 0.
     """
@@ -100,7 +101,8 @@ def _transitions(learner: OutputLearner, samples: Samples, known: Tensor | None)
     keep = ~saturated(definition, samples.q_next)
     keep = keep if int(keep.sum()) >= MIN_POINTS else everything
     sides = limit_sides(definition, samples.q_next)
-    # A sample at the limits of several coordinates is no inequality for any of them.
+    # ``sides`` marks samples at a limit, which give an inequality for the coordinate at its limit. A sample at the
+    # limits of several coordinates gives none, so it is not marked.
     sides = sides * ((sides != 0).sum(-1, keepdim=True) == 1)
     lead, drift = leading(definition), learn_drift(definition, samples)
     outputs = []
@@ -116,7 +118,7 @@ def _transitions(learner: OutputLearner, samples: Samples, known: Tensor | None)
 
 
 def _coordinate(learner: OutputLearner, among: _Among, name: str, target: Tensor) -> OutputModel:
-    """Learn the change of one coordinate from its targets (n,)."""
+    """Learn the change of the coordinate ``name`` from its values ``target`` (n,) in n samples."""
     inputs, keep, side = among.inputs, among.keep, among.side
     output = output_with_rates(learner, name, target, inputs, keep, among.keep_lead, side)
     output = past_limits(learner, output, target, inputs, keep, among.keep_lead, among.past, side)

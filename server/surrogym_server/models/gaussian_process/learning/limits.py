@@ -1,18 +1,18 @@
-"""Learning from samples that ended at a limit.
+"""Learning from samples that ended at a limit of a coordinate.
 
-At the limit of another coordinate: such a limit may change the rest of the step or not. A wall stops the speed, but a
-relief valve leaves the concentration as smooth as before. Without these samples the process extrapolates where the
-limit is reached. So a process is fitted with them and another without, and the one with the smaller error over all of
-these samples is used, each sample predicted from the others.
+Limits of other coordinates: a limit may or may not change the rest of the step. A wall stops the speed, but a relief
+valve at its pressure limit does not influence the concentration. Without samples at such limits, the process of an
+output has to extrapolate there. So one process is fitted with them and another without. The process with the smaller
+error over all these samples is used, where each sample is predicted from the others.
 
-At the output's own limit: without the limit the step would have gone at least as far, so the sample is an inequality.
-It adds nothing where the process predicts a step beyond the limit. Where the process predicts less, the sample becomes
-an observation of the limit itself. Those that become observations are the active set of the inequalities: the most
-probable function that satisfies all of them meets these with equality. The set is found greedily, and may hold a few
-that are not needed. It is discarded if it makes the misfit much worse: the squared amounts by which the process falls
-short of limits, plus the squared leave-one-out errors of the other samples. A process of inducing points keeps its
-hyperparameters, and the residuals of its samples count. References: S. Da Veiga, A. Marrel (2012), Annales de la
-Faculte des Sciences de Toulouse 21(3); H. Maatouk, X. Bay (2017), Mathematical Geosciences 49(5).
+The output's own limit: without the limit, the step would have gone at least as far, so the sample is an inequality. If
+the process predicts a step beyond the limit, the sample is not used. If the process predicts less, the sample becomes
+an observation of the limit itself. The samples that become observations are the active set of the inequalities: the
+most probable function that satisfies all inequalities has equality there. The active set is found greedily, and may
+contain a few samples too many. It is discarded if it makes the misfit much worse: the squared amounts by which the
+process falls short of limits, plus the squared leave-one-out errors of the other samples. With inducing points, a
+process keeps its hyperparameters, and residuals replace leave-one-out errors. References: S. Da Veiga, A. Marrel
+(2012), Annales de la Faculte des Sciences de Toulouse 21(3); H. Maatouk, X. Bay (2017), Mathematical Geosciences 49(5).
 """
 
 from __future__ import annotations
@@ -29,15 +29,18 @@ from surrogym_server.models.gaussian_process.learning.output_learner import Outp
 from surrogym_server.models.gaussian_process.learning.rates import inputs_of, output_with_rates
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 
-# Suffix of an output's name in the keys of warm starts, for fits that include samples at limits of other coordinates.
+# Warm starts are stored by output. For a fit that includes samples at limits of other coordinates, this is added to the
+# output's name.
 WIDER = " past limits"
-# Suffix of an output's name in the keys of warm starts, for fits that include samples at the output's own limit.
+# Warm starts are stored by output. For a fit that includes samples at the output's own limit, this is added to the
+# output's name.
 HELD = " held"
-SHORT = 0.01  # accepted shortfall of a prediction at a limit, in standard deviations of the targets
-ROUNDS = 3  # greatest number of fits, each with the inequalities that the previous process violates
-# Greatest factor by which a round may increase the misfit; it is large because few samples measure the misfit roughly.
+SHORT = 0.01  # a prediction may fall short of a reached limit by this many standard deviations of the targets
+ROUNDS = 3  # a process is fitted at most this often with further samples at limits that it contradicts
+# Samples at limits are discarded if they increase the misfit by more than this factor. The factor is large because few
+# samples measure the misfit only roughly.
 WORSE = 10.0
-MOST = 200  # greatest number of samples at limits that become observations of the limit in one round
+MOST = 200  # before each such fit, at most this many samples become observations of their limit
 
 
 def past_limits(
@@ -54,9 +57,11 @@ def past_limits(
     smaller, otherwise ``output``.
 
     Args:
-        output: the output, learned from the samples ``keep``, or from ``keep_lead`` if it reads a lead (a next value).
+        learner: fitter of the model's outputs.
+        output: the output, learned from the samples ``keep``, or from ``keep_lead`` if it reads a lead (the next value
+            of another coordinate).
         target: targets (n,) of all samples.
-        inputs: features (n, d) of each candidate map.
+        inputs: features (n, d) of the samples for each candidate feature map (encoding of state and action).
         keep, keep_lead: (n,) bool, see ``output``.
         more: (n,) bool, samples that may be used if limits of other coordinates don't affect the output.
         side: (n,) 1 for a sample that ended at the output's own upper limit, -1 at the lower, otherwise 0.
@@ -84,15 +89,16 @@ def within_limits(
     keep: Tensor,
     side: Tensor,
 ) -> OutputModel:
-    """Return the output, learned from further samples if it contradicts them. A sample that ended at the output's own
-    limit says that without the limit the step would have gone at least as far. If the output predicts less, the sample
-    is added as an observation of the limit.
+    """Return the output, learned also from samples at its own limit that it contradicts. At such a sample, without the
+    limit the step would have gone at least as far. If the output predicts less, the sample is added as an observation
+    of the limit.
 
     Args:
+        learner: fitter of the model's outputs.
         output: the output, learned from the samples ``keep``.
         target: targets (n,) of all samples.
-        inputs: features (n, d) of each candidate map.
-        keep: (n,) bool, samples that did not end at a limit.
+        inputs: features (n, d) of the samples for each candidate feature map (encoding of state and action).
+        keep: (n,) bool, the samples from which ``output`` was learned.
         side: (n,) 1 for a sample that ended at the output's own upper limit, -1 at the lower, otherwise 0.
     """
     if output.feature_map.lead:
@@ -129,11 +135,11 @@ def _sides(output: OutputModel, side: Tensor) -> tuple[int, ...]:
 def _misfit(
     output: OutputModel, target: Tensor, inputs: Mapping[FeatureMap, Tensor], rows: Tensor, side: Tensor
 ) -> float:
-    """Return a sum of squared errors of an output's targets (n,).
+    """Return the misfit of an output: a sum of squared errors of its targets (n,).
 
-    ``side`` (n,) is not 0 at samples that ended at the output's own limit. These contribute the amount by which the
-    prediction falls short of the limit. Other samples contribute only if they are among ``rows`` (n,), from which the
-    output was learned: with their leave-one-out errors.
+    ``side`` (n,) is not 0 at samples that ended at the output's own limit. Their error is the amount by which the
+    prediction falls short of the limit. Of the other samples, only those in ``rows`` (n,), from which the output was
+    learned, contribute: with their leave-one-out errors, or with their residuals if there are inducing points.
     """
     if output.posterior is None:
         return float("inf")
@@ -161,10 +167,10 @@ def _with_samples(
 
 
 def _violated(posterior: Posterior, x: Tensor, y: Tensor, side: Tensor) -> list[int]:
-    """Select points that must be observed at their limits, so that the process predicts at least the limit at all k
-    points. Return their indices.
+    """Select some of k points that ended at a limit, so that the process predicts at least the limit at all of them if
+    it observes the limit at the selected points. Return the indices of these points.
 
-    The selection is greedy: next is always the point at which the prediction falls short of the limit by most.
+    The selection is greedy: the next point is always the one at which the prediction falls short of the limit by most.
 
     Args:
         posterior: the process.

@@ -1,4 +1,4 @@
-"""How a process is fitted if there are more samples than structures are compared on."""
+"""Strategies for fitting a process to more samples than are used to choose its inputs and its kernel."""
 
 from __future__ import annotations
 
@@ -28,7 +28,8 @@ from surrogym_server.gp import (
 )
 from surrogym_server.gp.subsets import SOME
 
-# If the leave-one-out error is below this, in standard deviations of the targets, no other structure is searched.
+# If the leave-one-out error is at most this, in standard deviations of the targets, the process predicts well enough,
+# so that no other inputs or hyperparameters are searched for.
 EXPLAINED = 0.01
 
 
@@ -49,7 +50,7 @@ class ManySamples(ABC):
 
         Args:
             options: options of the fit.
-            theta: free parameters that were fitted to a subset of the points.
+            theta: logarithms of hyperparameters that were fitted to a subset of the points.
             mirror: symmetry of the process, or None.
             at_limit: points at which only a bound of the function is known, or None; they may help to choose
                 hyperparameters.
@@ -75,8 +76,8 @@ class ManySamples(ABC):
             x, y: all of the process's points, (n, d) and (n,).
             options: options of the fit.
             posterior: the process with all inputs.
-            may: (d,) bool, the inputs that may be left out.
-            odds: prior log odds of leaving out one input.
+            may: (d,) bool, true for each input that may be left out.
+            odds: by how much the log prior increases with each input that is left out.
 
         Returns:
             The process with fewer inputs, or None if all are kept.
@@ -86,12 +87,11 @@ class ManySamples(ABC):
 
 
 class BySubsets(ManySamples):
-    """Strategy that fits hyperparameters to subsets of the samples. Up to ``gp.sparse.MAX_EXACT`` points the process is
-    exact.
+    """Strategy that fits hyperparameters to subsets of the samples.
 
-    With more points it has inducing points. If then the leave-one-out errors are large, hyperparameters fitted to the
-    worst points are tried too. A process with fewer points also has inducing points if these lose no accuracy, see
-    ``gp.bound.loses_nothing``.
+    With more than ``gp.sparse.MAX_EXACT`` (2,000) points the process has inducing points. If its leave-one-out errors
+    are large, hyperparameters fitted to the points with the largest errors are tried too. With fewer points the process
+    is exact, unless inducing points lose no accuracy, see ``gp.bound.loses_nothing``.
     """
 
     def fitted(
@@ -136,7 +136,7 @@ class ByBound(ManySamples):
         mirror: Reflection | None,
         at_limit: Censored | None,
     ) -> Posterior:
-        del at_limit  # it helps to choose between candidate hyperparameters, and this strategy has only one
+        del at_limit  # these points help to choose between candidate hyperparameters, but here is only one candidate
         return fit_bound(x, y, options, theta, self.inducing, mirror)
 
     def conditioned(self, hyper: Hyperparameters, x: Tensor, y: Tensor) -> Posterior:

@@ -19,32 +19,32 @@ from surrogym_server.models.gaussian_process.prediction.warp import PEAK_NOISE
 from surrogym_server.models.gaussian_process.settings import Settings
 from surrogym_server.models.port import Warm
 
-# Prior log odds of feature maps, in this order. A map that reads the lead (next value of a leading coordinate) is
-# likelier, because it is also right where a limit cuts a step off. One that reads nothing but the lead is less likely,
-# because few samples can look like noise of such a map. One with a parity (mirror symmetry) is less likely, because
-# samples on one side are no evidence for symmetry. One without the action is likelier, because a reward that is paid in
-# one place seldom depends on the action.
+# Prior log odds of four kinds of feature maps (encodings of state and action). A map that reads the lead (next value of
+# a leading coordinate) is likelier, because it is also right where a limit cuts a step off. A map that reads nothing
+# but the lead is less likely, because it can explain few samples by noise alone. A map with a parity (mirror symmetry)
+# is less likely, because samples on one side are no evidence for symmetry. A map without the action is likelier,
+# because a reward that is 0 except in one place seldom depends on the action.
 LEAD_ODDS, ALONE_ODDS, PARITY_ODDS, PLACE_ODDS = 3.0, -6.0, -3.0, 3.0
-CONSTANT = 1e-9  # an output whose standard deviation is below this share of its mean's size counts as constant
+CONSTANT = 1e-9  # an output whose standard deviation is at most this share of its absolute mean counts as constant
 SMALLEST = 1e-100  # an output with a smaller standard deviation counts as constant, because its square would underflow
-PEAK = "reward peak"  # name of the output that learns the logarithm of a reward
+PEAK = "reward peak"  # name of the reward's output while the logarithm of the reward is learned
 
 
 @dataclass
 class OutputLearner:
-    """Fitter of the outputs of one model. It stores the hyperparameters of all fits, at which the next fits can start
-    (warm start)."""
+    """Fitter of the outputs of one model. It stores the hyperparameters of all its fits, at which fits to further
+    samples can start (warm start)."""
 
     definition: EnvironmentDefinition
     settings: Settings
-    warm: Warm  # free parameters of the previous fits, by "output|feature map"
-    thetas: dict[str, NDArray[np.float64]]  # free parameters of the present fits, by "output|feature map"
+    warm: Warm  # logarithms of hyperparameters from the previous model's fits, by "output|feature map"
+    thetas: dict[str, NDArray[np.float64]]  # logarithms of hyperparameters from this model's fits, by the same keys
     many: ManySamples = field(default_factory=BySubsets)  # strategy for fits to more than ``subsets.FEW`` samples
-    # For each output name, the inputs that have the greatest evidence.
+    # For the name of each output of which inputs were left out as a trial: the best remaining inputs, and their fit.
     selections: dict[str, Selection] = field(default_factory=dict)
 
     def allowed(self, maps: tuple[FeatureMap, ...]) -> tuple[FeatureMap, ...]:
-        """Return those of the maps that the settings allow."""
+        """Return those feature maps (encodings of state and action) that the settings allow."""
         return tuple(m for m in maps if self.settings.symmetry == "auto" or not m.parity)
 
     def output(
@@ -56,15 +56,15 @@ class OutputLearner:
         keep_lead: Tensor,
         side: Tensor | None = None,
     ) -> OutputModel:
-        """Fit one output with each candidate feature map, and return the best.
+        """Fit one output with each candidate feature map, and return the fit with the greatest evidence.
 
         All maps are compared on the same samples. First the maps that read all lags (coordinates that repeat past
-        values) are fitted, then the best of them with shorter histories of lags.
+        values) are fitted, then the best of them with fewer past values.
 
         Args:
             name: name of the output.
             target: targets (n,).
-            inputs: features (n, d) of each candidate map.
+            inputs: features (n, d) of the samples for each candidate feature map (encoding of state and action).
             keep: (n,) bool, the samples to learn from.
             keep_lead: (n,) bool, the samples to learn from if the best map reads a lead (next value of another
                 coordinate).
@@ -78,7 +78,7 @@ class OutputLearner:
         fits: dict[FeatureMap, Fitted] = {}
 
         def better(*maps: FeatureMap) -> FeatureMap:
-            """Fit the maps, and return the best of all maps fitted so far."""
+            """Fit the output with each of the maps. Return the map with the greatest evidence of all fitted so far."""
             fits.update({m: self._fit(name, m, inputs[m][keep], (target[keep] - around[m]) / scale) for m in maps})
             return max(fits, key=lambda m: fits[m].score + _odds(m))
 
@@ -118,8 +118,9 @@ class OutputLearner:
         theta: NDArray[np.float64],
         at_limit: Censored | None = None,
     ) -> Posterior:
-        """Fit the process of an output to all points x (n, d), y (n,), starting at a ``theta`` that was fitted to a
-        subset. ``at_limit`` are points at which only a bound is known, or None."""
+        """Fit the process of an output to all points x (n, d), y (n,), starting at ``theta``, logarithms of
+        hyperparameters that were fitted to a subset. ``at_limit`` are points at which only a bound is known, or
+        None."""
         mirror = reflection(self.definition, feature_map)
         return self.many.fitted(x, y, self.options(name), theta, mirror, at_limit)
 
@@ -133,15 +134,16 @@ class OutputLearner:
 
 
 def is_unexplained(posterior: Posterior) -> bool:
-    """Return whether a search for a better structure (other inputs, for example) is worthwhile.
+    """Return whether a search for a better structure, for example other inputs, is worthwhile.
 
-    It is not if the process predicts each sample well from the others, or if its inducing points lose accuracy.
+    A search is not worthwhile if the process predicts each sample well from the others, or if its inducing points lose
+    accuracy.
     """
     return loses_nothing(posterior) and posterior.left_out.error > EXPLAINED
 
 
 def _with_whole_history(inputs: Mapping[FeatureMap, Tensor]) -> list[FeatureMap]:
-    """Return the maps that read all lags; if there is none, all maps."""
+    """Return the feature maps that read all lags (coordinates that repeat past values); if there are none, all maps."""
     return [m for m in inputs if m.history is None] or list(inputs)
 
 

@@ -1,11 +1,12 @@
 """Learning of a reward that is nearly zero almost everywhere, with a peak that few samples reach.
 
-The logarithms of its values are learned instead, if they explain the samples better. A process of the values only sees
-the few samples with a reward, and predicts a flat reward elsewhere.
+The logarithms of the rewards are learned instead, if they explain the samples better. A process of the rewards
+themselves learns only from the few samples with a reward, and predicts a flat reward elsewhere.
 
-For samples with a reward of exactly zero, the logarithm is below that of the others. Their targets are the predictions
-of the process of the others, or the smallest of the others if that is smaller (regression imputation of censored
-values). They influence the hyperparameters only if they contradict the process of the others.
+For samples with a reward of exactly zero, the logarithm is below those of all other samples. A process is fitted to the
+other samples. Its prediction is the target of a sample with reward zero, but at most the smallest logarithm of the
+others (regression imputation of censored values). Samples with reward zero influence the hyperparameters only if this
+process predicts more than the smallest logarithm there.
 """
 
 from __future__ import annotations
@@ -24,20 +25,25 @@ from surrogym_server.models.gaussian_process.learning.output_learner import PEAK
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 from surrogym_server.models.gaussian_process.prediction.warp import Warp
 
-FAINT = 0.1  # the greatest height above the base is compared with this quantile of the heights above 0
-# A peak is considered if the greatest height is this many decades above the FAINT quantile. A quadratic reward of one
-# input is no such peak: its 10 % quantile is two decades below the greatest height.
+# The height of a reward is its distance from the base, the reward far from the peak. The greatest height is compared
+# with this quantile of the heights above 0.
+FAINT = 0.1
+# A peak is considered if the greatest height is this many decades (powers of ten) above the ``FAINT`` quantile. A
+# quadratic reward of one input is no such peak: its 10 % quantile is two decades below the greatest height.
 SPREAD = 3.0
 # Heights that spread over this many decades are always a peak, because neither noise nor rounding gives such a spread.
 DECADES = 10.0
-REFITS = 3  # greatest number of further fits, each with samples that contradict the previous one
-# If few samples have a height above 0, the logarithms of the others are assumed this many nats below the lowest of
-# these.
+REFITS = 3  # greatest number of further fits, each with samples of height 0 that contradict the previous fit
+# If fewer than ``FEWEST`` samples have a height above 0, the logarithms of the other heights are assumed to be this
+# much below the lowest logarithm of those samples.
 BELOW = 10.0
-FEWEST = 3  # least number of samples with a height above 0 from which a process of the logarithms is fitted
+FEWEST = 3
 EPS = 4 * torch.finfo(torch.float64).eps  # a reward within this share of the base counts as equal to the base
-RESOLUTION = 1e-3  # resolution at which explanations of the samples are compared, as a share of the largest reward
-# Least log odds of a process of the logarithms compared with no dependence on inputs, unless the spread alone decides.
+# Explanations are compared by the probability of an interval around each reward, whose half width is this share of the
+# largest distance of a reward from the base.
+RESOLUTION = 1e-3
+# The process of the logarithms is used only if its log odds against targets that don't depend on the inputs are at
+# least this, unless the spread of the heights alone decides.
 GAIN = 3.0
 
 
@@ -54,8 +60,9 @@ def with_peak(
     otherwise ``plain``.
 
     Args:
+        learner: fitter of the model's outputs.
         reward: rewards (n,).
-        inputs: features (n, d) of each candidate map.
+        inputs: features (n, d) of the samples for each candidate feature map (encoding of state and action).
         going: (n,) bool, the samples to learn from.
         plain: the output that was learned from the rewards themselves.
     """
@@ -65,8 +72,8 @@ def with_peak(
 
 
 def _bases(reward: Tensor) -> Iterator[tuple[float, float]]:
-    """Yield candidates for a peak of the rewards (n,), as pairs of a base (0 or the median reward) and a sign (1 for a
-    peak above the base, -1 below)."""
+    """Yield candidates for a peak of the rewards (n,), as pairs of a base and a sign. The base, 0 or the median reward,
+    is the reward far from the peak. The sign is 1 for a peak above the base, -1 for a peak below it."""
     middle = float(reward.median())
     for base in dict.fromkeys((0.0, middle)):
         for sign in (1.0, -1.0):
@@ -76,22 +83,22 @@ def _bases(reward: Tensor) -> Iterator[tuple[float, float]]:
 
 
 def _heights(reward: Tensor, base: float, sign: float) -> Tensor:
-    """Return the heights of rewards (n,): their distance above the base, or below the base for sign -1. A difference
+    """Return the heights of rewards (n,): how far they are above ``base``, or below it if ``sign`` is -1. A difference
     that may be a rounding error counts as 0."""
     height = sign * (reward - base)
     return torch.where(height.abs() <= EPS * abs(base), 0.0, height)
 
 
 def _trace(height: Tensor, base: float) -> bool:
-    """Return whether heights (n,) above the reward ``base`` are an isolated peak that is too small for float32, in
-    which trainers compute."""
+    """Return whether the heights (n,) of rewards above the reward ``base`` form an isolated peak that float32, in which
+    trainers compute, can't represent."""
     float32, highest = torch.finfo(torch.float32), float(height.max())
     return 0 < highest < max(float32.eps * abs(base), float32.tiny) and float(height.median()) == 0
 
 
 def _spread(height: Tensor) -> float:
-    """Return the spread of the heights (n,) that are above 0: the number of decades (powers of ten) between the lowest
-    decile and the greatest. 0 if fewer than two are above 0."""
+    """Return the spread of the heights (n,) that are above 0: the number of decades (powers of ten) from their lowest
+    decile to the greatest height. The result is 0 if fewer than two are above 0."""
     heights = height[height > 0]
     if len(heights) < 2:
         return 0.0
@@ -107,8 +114,8 @@ def _account_of(
     base: float,
     sign: float,
 ) -> tuple[OutputModel, float]:
-    """Learn the logarithms of the rewards' heights above a base, or below it for sign -1. Return the output, and the
-    log odds of its process compared with targets that don't depend on the inputs.
+    """Learn the logarithms of the heights of the rewards above ``base``, or below it if ``sign`` is -1. Return the
+    output, and the log odds of its process against targets that don't depend on the inputs.
 
     The process is fitted to the samples whose height is above 0, and to samples of height 0 at which it would predict
     too much. Then it is conditioned on all samples ``going`` (n,).
@@ -147,8 +154,8 @@ def _better(
     """Return whether ``account``, which learned the logarithms of the rewards, explains the samples better than
     ``plain``, which learned the rewards themselves.
 
-    ``structure`` are the log odds of the process of ``account`` compared with targets that don't depend on the inputs.
-    The other arguments are those of ``with_peak``.
+    ``structure`` are the log odds of the process of ``account`` against targets that don't depend on the inputs. The
+    other arguments are those of ``with_peak``.
     """
     if account.posterior is None:
         return False
@@ -162,7 +169,7 @@ def _better(
 
 
 def _structure(output: OutputModel) -> float:
-    """Return the log odds of a fitted process compared with targets that don't depend on the inputs."""
+    """Return the log odds of an output's process against targets that don't depend on the inputs."""
     if output.posterior is None:
         return 0.0
     count = output.posterior.points
@@ -170,13 +177,13 @@ def _structure(output: OutputModel) -> float:
 
 
 def _agreement(output: OutputModel, reward: Tensor, inputs: Mapping[FeatureMap, Tensor], going: Tensor) -> float:
-    """Return the sum of the log probabilities of the rewards, each predicted from the others. A probability is that of
-    an interval around the reward, as wide as ``RESOLUTION`` of the largest reward on either side."""
+    """Return the sum of the log probabilities of the rewards of the samples ``going`` (n,), each predicted from the
+    others. Each is the probability of a narrow interval around the reward, see ``RESOLUTION``."""
     posterior, warp = output.posterior, output.warp
     assert posterior is not None
     if posterior.sparse is None:
         mean, variance = posterior.leave_one_out()
-    else:  # with thousands of points, each hardly influences its own prediction, so it need not be left out
+    else:  # a process with inducing points has so many points that each hardly influences its own prediction
         mean, latent = posterior.mean_and_variance(inputs[output.feature_map][going])
         variance = latent + posterior.hyper.noise_variance
     centre, spread = output.centre + output.scale * mean, output.scale * variance.sqrt()

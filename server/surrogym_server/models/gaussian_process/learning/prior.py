@@ -1,7 +1,7 @@
-"""Choice by left-out samples whether an output learns the residual of a prior, or learns without the prior.
+"""Decide by left-out samples whether an output is learned as the difference from a prior model, or without it.
 
-A prior is another model of the same environment, such as one of a simulator. An output that uses it is the prior's mean
-plus a process: the discrepancy of Kennedy and O'Hagan (2001), Journal of the Royal Statistical Society B 63(3).
+A prior model is another model of the same environment, for example of a simulator. An output that uses it is its mean
+plus a process, the discrepancy of Kennedy and O'Hagan (2001), Journal of the Royal Statistical Society B 63(3).
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from surrogym_server.gp import LeftOut
 from surrogym_server.models.gaussian_process.model import GaussianProcessModel
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 
-# Differences from the prior's mean below this share of an output's standard deviation are rounding errors.
+# Differences from the prior model's mean up to this share of an output's standard deviation are rounding errors.
 NOTHING = 1e-9
 BY_PRIOR = "with the prior, mean log density of a left-out sample"
-# Suffix of an output's name in the keys of warm starts, for fits of the difference from a prior.
+# For a fit of the difference from a prior model, this is added to the output's name in the key of its warm start.
 BESIDE = " beside prior"
-Learn = Callable[[str, Tensor], OutputModel]  # function of an output's name and its targets (n,)
+Learn = Callable[[str, Tensor], OutputModel]  # function that fits an output, from its name and its targets (n,)
 ALONE = "without the prior, mean log density of a left-out sample"
 
 
@@ -32,9 +32,9 @@ ALONE = "without the prior, mean log density of a left-out sample"
 class Known:
     """Predictions of a prior model at n samples."""
 
-    change: Tensor  # (n, M) change of each transition output
-    reward: Tensor  # (n,) reward without the terminal reward
-    terminal: float  # terminal reward
+    change: Tensor  # (n, M) predicted value of each transition output
+    reward: Tensor  # (n,) predicted reward, without the terminal reward
+    terminal: float  # terminal reward of the prior model: what steps that end an episode give in addition
 
     @classmethod
     def of(cls, prior: GaussianProcessModel, samples: Samples) -> Self:
@@ -44,9 +44,8 @@ class Known:
 
 
 def better_of(learn: Learn, name: str, target: Tensor, known: Tensor | None, keep: Tensor) -> OutputModel:
-    """Learn an output from its targets (n,), with and without the prior, and return the better one.
-
-    The better one gives left-out samples a greater density. If they are equal, it is the one with the prior.
+    """Learn an output from its targets (n,) with and without the prior model. Return the result that gives left-out
+    samples the greater density; if both are equal, the result with the prior model.
 
     Args:
         learn: function that fits an output.
@@ -75,8 +74,8 @@ def beside(learn: Learn, name: str, target: Tensor, known: Tensor, keep: Tensor)
 
 
 def log_density(output: OutputModel) -> float:
-    """Return the mean log density of a left-out sample, in the output's unit; infinite for an output without a
-    process."""
+    """Return the mean log density of a target that is predicted from all other samples, in the output's unit; infinite
+    for an output without a process."""
     if (posterior := output.posterior) is None:
         return math.inf
     if posterior.sparse is not None:

@@ -1,4 +1,4 @@
-"""Choice by evidence whether an output changes faster further along its inputs, by rates; see ``gp.growth``."""
+"""Decide by evidence whether an output changes faster the larger its inputs are; see ``gp.growth``."""
 
 from __future__ import annotations
 
@@ -15,8 +15,10 @@ from surrogym_server.models.gaussian_process.learning.output_learner import Outp
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 from surrogym_server.tensors import EDGE, amplitude, bend
 
-ODDS = -3.0  # prior log odds of each rate
-FEWEST = 8  # least number of samples for each rate; with fewer, rates are uncertain and predictions overconfident
+ODDS = -3.0  # prior log odds that an input has a rate (the output changes faster the larger the input is)
+# Inputs may have rates only if there are at least this many samples per rate. With fewer samples, rates are uncertain
+# and predictions overconfident.
+FEWEST = 8
 
 
 def output_with_rates(
@@ -28,13 +30,14 @@ def output_with_rates(
     keep_lead: Tensor,
     side: Tensor,
 ) -> OutputModel:
-    """Fit one output as ``OutputLearner.output`` does. Then fit its best feature map with rates, with which the output
-    changes faster the larger an input is, and return this fit if it is likelier.
+    """Fit one output as ``OutputLearner.output`` does. Then fit the output with the same inputs and rates, with which
+    it changes faster the larger an input is. Return the likelier fit.
 
     Args:
+        learner: fitter of the model's outputs.
         name: name of the output.
         target: targets (n,).
-        inputs: features (n, d) of each candidate map.
+        inputs: features (n, d) of the samples for each candidate feature map (encoding of state and action).
         keep: (n,) bool, the samples to learn from.
         keep_lead: (n,) bool, the samples to learn from if the best map reads a lead (next value of another coordinate).
         side: (n,) 1 for a sample that ended at the output's own upper limit, -1 at the lower, otherwise 0.
@@ -56,8 +59,8 @@ def output_with_rates(
 
 
 def inputs_of(output: OutputModel, inputs: Mapping[FeatureMap, Tensor]) -> Tensor:
-    """Return the inputs of an output's process, (n, d). ``inputs`` are the features of the maps without rates; if the
-    output has rates, its features are transformed."""
+    """Return the inputs of an output's process, (n, d). ``inputs`` contains the features of n samples for each feature
+    map without rates. If the output has rates, its features are transformed by ``bend``."""
     x, rates = inputs[replace(output.feature_map, rates=())], output.feature_map.rates
     return bend(x, torch.tensor(rates, dtype=x.dtype)) if rates else x
 
@@ -65,9 +68,9 @@ def inputs_of(output: OutputModel, inputs: Mapping[FeatureMap, Tensor]) -> Tenso
 def _may_have_rates(
     learner: OutputLearner, output: OutputModel, inputs: Mapping[FeatureMap, Tensor], keep: Tensor
 ) -> Tensor:
-    """Return which inputs of an output may have a rate, (d,) bool.
+    """Return for each of the d inputs of an output whether it may have a rate, (d,) bool.
 
-    No input may if there are too few samples to determine the rates, or if the process predicts well without rates.
+    No input may have a rate if there are too few samples to determine rates, or if the process predicts well already.
     """
     plain, posterior = output.feature_map, output.posterior
     kinds = torch.tensor([feature.function == "affine" for feature in features(learner.definition, plain)])
@@ -87,11 +90,11 @@ def _growing(
     keep: Tensor,
     may: Tensor,
 ) -> OutputModel:
-    """Fit the output with rates for the inputs ``may`` (d,), from the samples ``keep`` (n,)."""
+    """Fit the output with rates of those inputs for which ``may`` (d,) is true, from the samples ``keep`` (n,)."""
     plain = output.feature_map
     z, t = inputs[plain][keep], (target[keep] - output.centre) / output.scale
     rows, among = spread(len(t), subsets.FEW), ",".join(map(str, may.nonzero().ravel().tolist()))
-    # Warm starts are stored by the inputs that may have a rate, because they contain one rate for each.
+    # The key of a warm start names the inputs that may have a rate, because the warm start has one rate for each.
     key = f"{output.name}|{plain}|rates of {among}"
     starts = [learner.thetas[f"{output.name}|{plain}"], *([learner.warm[key]] if key in learner.warm else [])]
     growth = fit_growing(z[rows], t[rows], may, learner.options(output.name), starts)
@@ -107,11 +110,11 @@ def _growing(
 
 
 def _evidence(outputs: Sequence[OutputModel], inputs: Mapping[FeatureMap, Tensor], keep: Tensor) -> list[float]:
-    """Return the log density of the targets of the samples ``keep`` (n,) under each of the outputs, with targets
-    divided by the output's scale.
+    """Return the log density of the targets of the samples ``keep`` (n,), divided by the output's scale, under each of
+    several fits ``outputs`` of one output.
 
     If a process has inducing points, its evidence of all samples is unknown. Then the sum of the log densities of each
-    target given all others is used for all outputs.
+    target given all others is used instead, for all fits.
     """
     pairs = [(output, posterior) for output in outputs if (posterior := output.posterior) is not None]
     exact = all(posterior.sparse is None for _, posterior in pairs)

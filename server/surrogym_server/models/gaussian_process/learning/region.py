@@ -1,4 +1,4 @@
-"""Learning of a region from labelled states, such as the region in which episodes end."""
+"""Learning of a region of states, such as that in which episodes end, from states labelled as inside or outside."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from surrogym_server.models.gaussian_process.learning.thresholds import log_prob
 from surrogym_server.models.gaussian_process.model import GaussianProcessModel
 from surrogym_server.models.gaussian_process.prediction.regions import TERMINATION, Classifier, Form, Region, likely
 
-# Subtracted from the log probability of the classifier, because its hyperparameters were also fitted to the left-out
-# labels.
+# This is subtracted from the leave-one-out log probability of the classifier, because its hyperparameters were also
+# fitted to the left-out labels.
 HANDICAP = 3.0
-# A form of the region (classifier or thresholds) is discarded if its weight is below this share of the best form's
-# weight.
+# A region is a weighted mean of thresholds and a classifier. One of them is discarded if its weight is at most this
+# share of the greatest weight.
 FAINT = 0.05
 
 
 def learn_termination(learner: OutputLearner, samples: Samples, prior: GaussianProcessModel | None = None) -> Region:
-    """Learn the region in which episodes end. It is empty while no sample has ended an episode.
+    """Learn the region of states in which episodes end. It is empty while no sample has ended an episode.
 
-    If a ``prior`` model has learned such a region and all samples agree with it, that region is returned.
+    If a ``prior`` model has learned this region and all samples agree with it, the prior model's region is returned.
     """
     if prior is not None and prior.ending is not None:
         agrees = (prior.ending.probability(samples.q_next) > 0.5) == samples.terminated
@@ -36,10 +36,10 @@ def learn_termination(learner: OutputLearner, samples: Samples, prior: GaussianP
 
 
 def learn_region(learner: OutputLearner, name: str, q: Tensor, inside: Tensor) -> Region:
-    """Learn the region of those states q (n, C) for which ``inside`` (n,) is true.
+    """Learn the region that contains those of the states q (n, C) for which ``inside`` (n,) is true.
 
-    The region is a weighted mean of thresholds and a classifier. The better one of them predicts left-out labels, the
-    larger is its weight.
+    The region is a weighted mean of thresholds and a classifier. Each has a weight proportional to the probability with
+    which it predicts left-out labels.
     """
     scored: list[tuple[Form, float]] = [_classifier(learner, name, q, inside)]
     scored += thresholds(learner.definition, q, inside)
@@ -60,7 +60,7 @@ def _classifier(learner: OutputLearner, name: str, q: Tensor, inside: Tensor) ->
         return Classifier(definition, process), 0.0
     if process.posterior.sparse is None:
         mean, variance = process.posterior.leave_one_out()
-    else:  # with thousands of points, each hardly influences its own prediction, so it need not be left out
+    else:  # a process with inducing points has so many points that each hardly influences its own prediction
         mean, latent = process.posterior.mean_and_variance(inputs[process.feature_map])
         variance = latent + process.posterior.hyper.noise_variance
     probability = likely(process.centre + process.scale * mean, process.scale * variance.sqrt())

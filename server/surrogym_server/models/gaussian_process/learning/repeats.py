@@ -1,4 +1,4 @@
-"""Choice by evidence which outputs are the same function of different inputs and share samples, see ``gp.pooling``."""
+"""Decide by evidence which outputs are the same function of different inputs and share samples; see ``gp.pooling``."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from surrogym_server.models.gaussian_process.learning.dropping import WIN, map_w
 from surrogym_server.models.gaussian_process.learning.output_learner import OutputLearner, is_unexplained
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 
-ROLES = 4  # greatest number of inputs of a function that several outputs have in common
-# Greatest number of samples from which an output learns if it shares; samples of other outputs beyond it are left out.
+ROLES = 4  # outputs are pooled only if the function that they have in common reads at most this many inputs
+# An output that shares samples learns from at most this many; if there are more, samples of other outputs are left out.
 MOST = subsets.FEW
 
 
 @dataclass(frozen=True)
 class _Candidate:
-    """Output that may share its samples with other outputs, and its data in the form that ``gp.pooling`` needs."""
+    """Output that may share its samples with other outputs, and its samples in the form that ``gp.pooling`` needs."""
 
     place: int  # index of the output in the model
     output: OutputModel
     part: Part
-    every: tuple[int, ...]  # indices of the inputs of ``part`` among all features of the map, dropped ones included
+    every: tuple[int, ...]  # for each input of ``part``, its index among all features of the map, also ignored ones
 
 
 def with_samples_of_others(learner: OutputLearner, outputs: Sequence[OutputModel]) -> tuple[OutputModel, ...]:
-    """Return the outputs in the same order. Outputs that are the same function of different inputs have also learned
-    from each other's samples."""
+    """Return the outputs in the same order, after those that are the same function of different inputs have also
+    learned from each other's samples."""
     shared = list(outputs)
     if not learner.settings.repeated_parts or not any(_is_to_learn(learner, output) for output in outputs):
         return tuple(shared)
@@ -53,15 +53,15 @@ def with_samples_of_others(learner: OutputLearner, outputs: Sequence[OutputModel
 
 
 def _is_to_learn(learner: OutputLearner, output: OutputModel) -> bool:
-    """Return whether a search for outputs that are the same function as this one is worthwhile: its process does not
-    predict well yet, and its inputs were selected by evidence."""
+    """Return whether a search for outputs that are the same function as this output is worthwhile: its process does not
+    predict well yet, and it is known which inputs it needs."""
     unexplained = output.posterior is not None and is_unexplained(output.posterior)
     return unexplained and output.name in learner.selections
 
 
 def _candidate(learner: OutputLearner, place: int, output: OutputModel) -> _Candidate | None:
-    """Return the output as a candidate for a pool; None if it can't share samples. ``place`` is its index in the
-    model."""
+    """Return the output as a candidate for sharing samples with other outputs; None if it can't share. ``place`` is its
+    index in the model."""
     posterior, selection, feature_map = output.posterior, learner.selections.get(output.name), output.feature_map
     if posterior is None or posterior.sparse is not None or feature_map.rates or output.at_limit:
         return None
@@ -90,8 +90,8 @@ def _candidate(learner: OutputLearner, place: int, output: OutputModel) -> _Cand
 
 
 def _sharing(members: Sequence[_Candidate], pool: Pool, member: int) -> OutputModel:
-    """Return a member of a pool, learned from the samples of all members, or unchanged if it then predicts its own
-    samples worse. ``member`` is its index in ``members``."""
+    """Return the output of the pool's member with index ``member``, learned from the samples of all members, or
+    unchanged if it then predicts its own samples worse."""
     candidate, output = members[member], members[member].output
     assert output.posterior is not None
     x, y, hyper = pool.samples_of(member, MOST)

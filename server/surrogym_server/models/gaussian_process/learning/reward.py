@@ -1,4 +1,4 @@
-"""The reward: declared, or a process for non-terminating steps with an additional terminal reward."""
+"""Learning of the reward: a process for non-terminating steps, jumps, and the terminal reward of steps that end one."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from surrogym_server.models.gaussian_process.learning.prior import Known, beside
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 from surrogym_server.models.gaussian_process.prediction.regions import Jump, jumped
 
-FEW = 2  # with fewer non-terminating steps than this, the reward is learned from terminating steps too
+FEW = 2  # if there are fewer non-terminating steps than this, the reward is learned from terminating steps too
 
 
 def learn_reward(
     learner: OutputLearner, samples: Samples, prior: Known | None = None
 ) -> tuple[OutputModel, float, tuple[Jump, ...]]:
     """Learn the reward. Return the output for the reward of non-terminating steps, the reward that terminating steps
-    pay in addition, and the jumps of the reward.
+    give in addition, and the jumps of the reward.
 
-    With a ``prior``, the output is instead learned as the difference from the prior's prediction, if its leave-one-out
-    errors are then not larger.
+    ``prior`` contains predictions of a prior model, or is None. The output is instead learned as the difference from
+    these predictions, if the leave-one-out error is then not larger.
     """
     definition = learner.definition
     if (declared := definition.declared_reward) is not None:
@@ -66,8 +66,8 @@ def _plain(
 
 
 def _without_action(definition: EnvironmentDefinition, samples: Samples) -> dict[FeatureMap, Tensor]:
-    """Return features of the samples for feature maps without the action. They are candidates because a reward that is
-    paid in one place seldom depends on the action."""
+    """Return features of the samples for feature maps (encodings of state and action) that ignore the action. These are
+    candidates because a reward that is 0 except in one place seldom depends on the action."""
     maps = {replace(m, action="none") for m in reward_candidates(definition) if not m.parity}
     return {
         m: encode(definition, m, samples.q_next if m.after else samples.q, samples.u) for m in sorted(maps, key=str)
@@ -75,8 +75,8 @@ def _without_action(definition: EnvironmentDefinition, samples: Samples) -> dict
 
 
 def _declared(reward: DeclaredRewardDefinition, samples: Samples) -> OutputModel:
-    """Return an output without a process for a declared reward. Its score is the largest difference between declared
-    and sampled rewards."""
+    """Return the reward's output for a declared reward. It has no process. Its score is the largest difference between
+    declared rewards and rewards of samples."""
     rewards = reward(samples.q_next if reward.after else samples.q, samples.u) + reward.terminal * samples.terminated
     off = float((samples.reward - rewards).abs().max())
     scores = (("declared, largest error over the samples", off),)

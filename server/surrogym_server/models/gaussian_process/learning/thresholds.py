@@ -1,7 +1,8 @@
-"""Search for thresholds from labelled states: the fewest axes that explain which states lie inside, and alternatives.
+"""Search for thresholds that explain which of several labelled states lie inside a region, and for alternatives.
 
-If the level has a uniform prior over an axis's range, the probability of labels that it separates is gap / range. This
-is the weight of a cut among those that explain the same samples.
+As few axes as possible have a threshold. If a threshold has a uniform prior over the range of its axis, the probability
+of labels that it separates is gap / range: the gap between the nearest states inside and outside, divided by the range.
+This is the weight of a threshold (cut) among the alternatives that explain the same samples.
 """
 
 from __future__ import annotations
@@ -17,19 +18,19 @@ from surrogym_server.models.gaussian_process.prediction.regions import Axes, Cut
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 Rules = tuple[tuple[Cut, ...], ...]
-SLACK = 1e-9  # values closer than this share of an axis's range are equal
-RIVALS = 4  # greatest number of alternative cuts (thresholds on different axes) that explain the same samples
-FAINT = 0.05  # alternative cuts with a smaller weight than this are discarded
-LEFT_OUT = 100  # greatest number of samples that are left out, one by one, to test how well thresholds predict labels
+SLACK = 1e-9  # two values on an axis count as equal if they differ by at most this share of the axis's range
+RIVALS = 4  # at most this many alternative thresholds on different axes are kept that explain the same samples
+FAINT = 0.05  # an alternative threshold is discarded if its probability is below this
+LEFT_OUT = 100  # to test thresholds, at most this many samples are left out and predicted, one by one
 
 
 def thresholds(definition: EnvironmentDefinition, q: Tensor, inside: Tensor) -> list[tuple[Thresholds, float]]:
-    """Find thresholds that explain which of the states q (n, C) lie inside, (n,) bool.
+    """Find thresholds that explain for which of the states q (n, C) ``inside`` (n,) is true.
 
     Returns:
         At most two pairs (thresholds, leave-one-out log probability). In the first, a state is inside if it exceeds any
-        of the thresholds. In the second, it is inside if it exceeds none of at least two thresholds. With only one, the
-        second would be the same kind as the first.
+        of the thresholds. In the second, a state is inside if it exceeds none of at least two thresholds. With a single
+        threshold, the second would be the same region as the first.
     """
     values, labels = Axes.of(definition)(q).numpy(), inside.numpy()
     forms = []
@@ -43,12 +44,12 @@ def thresholds(definition: EnvironmentDefinition, q: Tensor, inside: Tensor) -> 
 
 def explain(values: Floats, inside: Bools) -> Rules:
     """Return rules that explain the labels ``inside`` (n,) of n states by their values on A axes (n, A): a state is
-    inside if it exceeds the threshold of any rule. Return () if no such rules fit."""
+    inside if it exceeds the threshold of any rule. Return () if no rules explain all labels."""
     if inside.all() or not inside.any():
         return ()
     width = np.maximum(values.max(0) - values.min(0), 1e-300)
     outside = values[~inside].max(0)
-    # (i, A) whether each state inside exceeds all states outside on each axis.
+    # (i, A) for each of i states inside and each of A axes, whether the state exceeds all states outside on the axis.
     reached = values[inside] > outside + SLACK * width
     share = np.where(reached, (values[inside] - outside) / width, np.inf)
     axes = _cover(reached, share)
@@ -64,20 +65,20 @@ def explain(values: Floats, inside: Bools) -> Rules:
 
 
 def log_probability(probability: Tensor, inside: Tensor) -> float:
-    """Return the log probability of labels ``inside`` (n,) that are predicted with ``probability`` (n,). The
-    probability of each label counts as at least 1 / (n + 2), as in the rule of succession."""
+    """Return the log probability of labels ``inside`` (n,), if each is predicted to be true with ``probability`` (n,).
+    The probability of each label counts as at least 1 / (n + 2), as in the rule of succession."""
     right = torch.where(inside, probability, 1 - probability)
     return float(right.clamp(1 / (len(right) + 2), 1).log().sum())
 
 
 def _cover(reached: Bools, share: Floats) -> list[int]:
-    """Choose few axes, greedily, so that each of the i samples inside is separated from all samples outside by a
-    threshold on at least one of them. Return their indices; [] if this is impossible.
+    """Choose few of A axes, greedily, so that each of i samples inside is separated from all samples outside by a
+    threshold on at least one chosen axis. Return the indices of these axes; [] if this is impossible.
 
     Args:
         reached: (i, A) whether a sample inside exceeds all samples outside on an axis.
         share: (i, A) gap between the sample and those outside, as a share of the axis's range. Of axes that separate
-            equally many further samples, the one with the widest gap is chosen.
+            equally many further samples, the axis with the widest gap is chosen.
     """
     axes: list[int] = []
     left = np.ones(len(reached), dtype=bool)
@@ -92,11 +93,11 @@ def _cover(reached: Bools, share: Floats) -> list[int]:
 
 
 def _assign(reached: Bools, share: Floats, axes: list[int]) -> NDArray[np.int64]:
-    """Return for each of the i samples inside the position in ``axes`` of the axis whose threshold explains it, (i,).
+    """Return for each of i samples inside the position in ``axes`` of the axis whose threshold explains the sample,
+    (i,). ``reached`` and ``share`` are as in ``_cover``.
 
-    If several axes are possible, it is the one on which the sample lies farthest beyond the samples outside. On each
-    axis this distance is divided by the smallest distance of the samples that only this axis explains. ``reached`` and
-    ``share`` are as in ``_cover``.
+    If several axes are possible, it is the axis on which the sample lies farthest beyond the samples outside. On each
+    axis this distance is divided by the smallest distance of the samples that only this axis explains.
     """
     able, distance = reached[:, axes], share[:, axes]
     sole = able.sum(1) == 1
@@ -106,8 +107,8 @@ def _assign(reached: Bools, share: Floats, axes: list[int]) -> NDArray[np.int64]
 
 
 def _rivals(inner: Floats, outside: Floats, width: Floats, own: Bools, axes: list[int]) -> tuple[Cut, ...]:
-    """Return alternative cuts (thresholds on one axis) that all separate the samples of one rule from those outside, by
-    descending weight.
+    """Return alternative cuts (thresholds on one axis each), by descending weight. Each separates the samples of one
+    rule from those outside.
 
     Args:
         inner: axis values (i, A) of the samples inside.
@@ -127,10 +128,11 @@ def _rivals(inner: Floats, outside: Floats, width: Floats, own: Bools, axes: lis
 
 
 def _left_out(definition: EnvironmentDefinition, values: Floats, inside: Bools) -> float:
-    """Return the leave-one-out log probability of the labels ``inside`` (n,), given axis values (n, A).
+    """Return the leave-one-out log probability of the labels ``inside`` (n,) under rules that are learned from the
+    values (n, A) of n samples on A axes.
 
-    If there are more than ``LEFT_OUT`` samples, only so many evenly spaced ones are left out, and the result is scaled
-    up to all samples.
+    If there are more than ``LEFT_OUT`` (100) samples, only this number of evenly spaced samples is left out, and the
+    result is scaled up to all samples.
     """
     count, rows = len(inside), torch.from_numpy(values)
     picked = np.unique(np.linspace(0, count - 1, min(count, LEFT_OUT)).astype(int))

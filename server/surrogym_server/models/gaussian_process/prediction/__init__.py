@@ -1,1 +1,1 @@
-"""Prediction with a fitted model."""
+"""Prediction with a fitted model of Gaussian processes."""

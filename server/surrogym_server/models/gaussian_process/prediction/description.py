@@ -1,4 +1,4 @@
-"""Description of one output of a model, for display."""
+"""Description of one output of a model (its inputs, kernel and hyperparameters), for display."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from surrogym_server.models.gaussian_process.prediction.output_model import Outp
 
 
 def describe(definition: EnvironmentDefinition, output: OutputModel) -> dict[str, Any]:
-    """Return the structure and hyperparameters of an output, as values for JSON. The lists ``features`` and
-    ``lengthscale`` have the same order."""
+    """Return the structure and hyperparameters of an output, as values for JSON. In the result, the lists ``features``
+    and ``lengthscale`` have the same order."""
     described: dict[str, Any] = {
         "name": output.name,
         "inputs": str(output.feature_map),
@@ -52,7 +52,8 @@ def describe(definition: EnvironmentDefinition, output: OutputModel) -> dict[str
 
 
 def _inputs(definition: EnvironmentDefinition, feature_map: FeatureMap) -> dict[str, Any]:
-    """Return the names of the features that a map contains, the names of those left out, and the rates, for display."""
+    """Return, for display, the names of the features that an output reads, the names of those that it ignores, and the
+    rates (see ``gp.growth``) other than 0."""
     names = feature_names(definition, feature_map)
     every = feature_names(definition, replace(feature_map, rates=(), dropped=()))
     rates = {name: rate for name, rate in zip(names, feature_map.rates, strict=False) if rate}

@@ -1,16 +1,16 @@
-"""Effect of further real steps on the standard deviations of processes, before they are taken.
+"""Forecast of the standard deviations of processes after further real steps, before these steps are taken.
 
-The standard deviations of a process depend on where it is observed, not on the observed values. So the outlook after a
-query needs no guess of its answer. Only processes that read a predicted value (the lead, the next state of a reward)
-use the present model's prediction.
+The standard deviations of a process depend on where it is observed, not on the observed values. So the forecast needs
+no guess of a step's result. Only processes that read a predicted value (the next value of another coordinate, or the
+next state) use the model's prediction of it.
 
 The first t points of a predicted path give the following information about an output:
 
     I(t) = 1/2 log det(1 + W S W / tau^2),
 
 S (t, t) is the posterior covariance of the process at these points, tau the output's tolerance, W a diagonal matrix of
-weights. The determinant evaluates each point given those before it, so a repeated point adds nothing. Reference: A.
-Krause, A. Singh, C. Guestrin (2008), JMLR 9, section 2 (information of a set of observations).
+weights. The determinant counts each point given those before it, so a repeated point adds little. Reference: A. Krause,
+A. Singh, C. Guestrin (2008), JMLR 9, section 2 (information of a set of observations).
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ from surrogym_server.models.gaussian_process.prediction.output_model import Outp
 
 BLOCK = 4_000_000  # greatest number of covariances computed at once
 ROUNDING = 1e-12
-SMALLEST = 1e-300  # lower limit of the largest slope, to avoid a division by 0 if all slopes are 0
+SMALLEST = 1e-300  # slopes are divided by the largest slope, or by this if all are 0
 
 
 @dataclass(frozen=True)
 class ProcessOutlook(OutputOutlook):
-    """Forecast of one output's standard deviations at candidates for queries, in the output's unit, as if certain
-    queries had been answered."""
+    """Forecast of one output's standard deviations at m candidates for real steps, in the output's unit, as if certain
+    other real steps had been taken."""
 
-    joint: Joint  # process at m candidates, r reference points and the assumed queries, in this order
-    learns: Tensor  # (m,) bool: whether the output would learn from a sample at the candidate
-    shared: Tensor  # (r, m) standardised covariance of reference points and candidates
+    joint: Joint  # process at m candidates, r reference points and the steps that are assumed taken, in this order
+    learns: Tensor  # (m,) bool, true for each candidate at which a real step would teach the output something
+    shared: Tensor  # (r, m) posterior covariance of the standardised process at reference points and candidates
     scale: float
     # (m + r,) derivative of the output with respect to its process, divided by ``scale``; None if it is 1 everywhere.
     slope: Tensor | None = None
@@ -49,8 +49,8 @@ class ProcessOutlook(OutputOutlook):
 
         Args:
             output: an output with a process.
-            x: inputs (m + r + p, d) of m candidates, r reference points and p queries that are assumed answered.
-            learns: (m + r + p,) bool: whether the output would learn from a sample at the point.
+            x: inputs (m + r + p, d) of m candidates, r reference points and p real steps that are assumed taken.
+            learns: (m + r + p,) bool, true for each point at which a real step would teach the output something.
             spans: (m, m + r), the rows of x at which the candidates and the reference points end.
         """
         assert output.posterior is not None
@@ -67,13 +67,13 @@ class ProcessOutlook(OutputOutlook):
         return std if self.slope is None else std * self.slope[:count]
 
     def reduction(self, weights: Tensor) -> Tensor:
-        """Return by how much a sample at each candidate x would lower the weighted sum of the variances at the
+        """Return by how much a real step at each of m candidates x would lower the weighted sum of the variances at the
         reference points x_r: sum_r w_r k(x_r, x)^2 / (k(x, x) + sigma_n^2), (m,), with the posterior covariance k and
         weights w (r,).
 
         This is Cohn's criterion (NIPS 1993) in closed form for a Gaussian process. If the output is a nonlinear
         function of its process, each reference point is also weighted by the squared derivative of this function,
-        relative to the largest. Only the order of the values matters.
+        divided by the largest. Only the order of the results matters.
         """
         if self.slope is not None:
             steep = self.slope[len(self.learns) :]
@@ -91,13 +91,13 @@ class ProcessOutlook(OutputOutlook):
 
 @dataclass(frozen=True)
 class ProcessAlongPaths(PathOutlook):
-    """Forecast of one output's standard deviations, and of the information from real steps, along paths of predicted
-    steps."""
+    """Forecast of one output's standard deviations along b predicted paths of T steps, and of the information that real
+    steps along them would give."""
 
     definition: EnvironmentDefinition
     output: OutputModel
     x: Tensor  # (b, T, d) inputs of the output's process
-    learns: Tensor  # (b, T) bool: whether the output would learn from a real step at that point
+    learns: Tensor  # (b, T) bool, true for each step of a path that would teach the output something
 
     @property
     def std(self) -> Tensor:
@@ -110,8 +110,8 @@ class ProcessAlongPaths(PathOutlook):
         if (slope := slope_at(output, self.x.flatten(0, 1))) is not None:
             weight = weight * slope.reshape(weight.shape)
         blocks = zip(torch.split(self.x, room), torch.split(weight, room), strict=True)
-        # Covariances below the noise floor are rounding errors. With a very small tolerance they would be scaled up to
-        # more than 1, so the ratio is limited.
+        # Covariances below the noise floor are rounding errors. A very small tolerance would scale them up to more than
+        # 1, so the ratio that scales covariances is limited.
         ratio = min((output.scale / tolerance) ** 2, 1 / output.noise_floor)
         return torch.cat([_log_determinants(ratio * output.posterior.joint_covariance(b), w) for b, w in blocks])
 
@@ -131,8 +131,8 @@ def slope_at(output: OutputModel, x: Tensor) -> Tensor | None:
 
 
 def as_if_answered(output: OutputModel, x: Tensor) -> OutputModel:
-    """Condition an output on k assumed observations at inputs x (k, d), each equal to the output's mean there: the
-    variance decreases, the mean stays."""
+    """Condition an output on k assumed observations at inputs x (k, d), each equal to the mean there: variances
+    decrease, means stay."""
     if (posterior := output.posterior) is not None:
         for point in x:
             posterior = posterior.extend(point, posterior.mean(point[None])[0])
@@ -140,7 +140,7 @@ def as_if_answered(output: OutputModel, x: Tensor) -> OutputModel:
 
 
 def _log_determinants(covariance: Tensor, weight: Tensor) -> Tensor:
-    """Return 1/2 log det(I + W S W), computed from the first t points of each path, for t = 1 to T, (b, T).
+    """Return 1/2 log det(I + W S W) of the first t points of each of b paths, for t = 1 to T, (b, T).
 
     Args:
         covariance: covariance S of the points of each path, (b, T, T).

@@ -1,4 +1,4 @@
-"""Outputs that are predicted together from one set of features."""
+"""Prediction of several outputs of a model together, from the same features of state and action."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ class Drawn:
     function of all outputs."""
 
     column: int
-    span: slice  # where the weights of this output are
-    inputs: Tensor  # columns of x that the output reads
+    span: slice  # columns of this output's weights among the W weights of a sampled function
+    inputs: Tensor  # indices of the features that the output reads
     scale: float
     pathwise: Pathwise
 
 
 @dataclass(frozen=True)
 class Grown:
-    """Output with rates: its distance from ``centre`` is multiplied by an amplitude that grows along its inputs, see
-    ``gp.growth``."""
+    """Output that changes faster the larger its inputs are: its distance from ``centre`` is multiplied by an amplitude
+    that grows along its inputs, see ``gp.growth``."""
 
     column: int
-    inputs: Tensor  # columns of x that the output reads
-    rates: Tensor  # rate of each of these inputs
+    inputs: Tensor  # indices of the features that the output reads
+    rates: Tensor  # for each feature that the output reads, the rate with which the amplitude grows along it
     centre: float
 
 
@@ -45,8 +45,8 @@ class OutputGroup:
     encoder: Encoder
     serving: Serving
     noise_std: Tensor  # (O,) standard deviation of the learned noise, in each output's unit
-    drawn: tuple[Drawn, ...]  # samplers of the outputs' functions; constant outputs have none
-    end: int  # end of this group's weights among the W weights of a sampled function
+    drawn: tuple[Drawn, ...]  # sampler of functions of each output; outputs that never varied have none
+    end: int  # index after this group's last weight among the W weights of a sampled function
     grown: tuple[Grown, ...] = ()
 
     @classmethod
@@ -60,13 +60,13 @@ class OutputGroup:
         begin: int,
         grown: tuple[Grown, ...] = (),
     ) -> OutputGroup:
-        """Compile some outputs of a model for prediction.
+        """Arrange some outputs of a model for prediction.
 
         Args:
-            encoder: encoder of the features x.
+            encoder: encoder of state and action as the features that the outputs read.
             outputs: the outputs, each with its column.
             columns: number O of columns of a prediction.
-            lead: whether the outputs read the next values of leading coordinates.
+            lead: whether outputs also read the next values of leading coordinates, see ``features.leading``.
             begin: index of the group's first weight in a sampled function.
             grown: rates of those outputs that have rates, see ``Grown``.
         """
@@ -87,12 +87,13 @@ class OutputGroup:
     def predict(
         self, x: Tensor, columns: tuple[int, ...], kick: Tensor | None, process: Tensor | None, paths: Tensor | None
     ) -> tuple[Tensor, Tensor]:
-        """Return predicted values at features x (m, d), (m, O), and standard deviations without noise, (m, O).
+        """Return predicted values of O outputs at features x (m, d), (m, O), and standard deviations without noise, (m,
+        O).
 
         Args:
             x: features.
-            columns: indices of the outputs whose standard deviations are needed; if there are none, the second result
-                is (m, 0).
+            columns: indices of the outputs whose standard deviations are needed; without any, the second result is (m,
+                0).
             kick: (m, O) numbers of standard deviations to add to the mean, or None.
             process: (m, O) standard normal numbers, by which the learned noise moves the values, or None for no noise.
             paths: (m, W) weights of a sampled function for each row, whose value replaces the mean, or None.

@@ -1,4 +1,4 @@
-"""Model of one output: its process, and the scaling of its targets."""
+"""Model of one output: its Gaussian process, its inputs, and the scaling of its targets."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from surrogym_server.tensors import amplitude
 class OutputModel:
     """Model of one output: a process, and the scaling of its targets: y = (target - centre) / (scale * amplitude).
 
-    The amplitude is 1, unless the feature map has rates; it then grows along the inputs. ``posterior`` is None for an
-    output that never varied; its mean is ``centre`` and its standard deviation 0. With a ``warp`` the targets are
-    logarithms of the output; means, standard deviations and errors are still in the output's unit.
+    The amplitude is 1, unless the feature map has rates (see ``gp.growth``), with which it grows along the inputs. An
+    output that never varied has no ``posterior``; its mean is ``centre`` and its standard deviation 0. With a ``warp``
+    the targets are logarithms of the output; means, standard deviations and errors are still in the output's unit.
     """
 
     name: str
@@ -29,16 +29,18 @@ class OutputModel:
     posterior: Posterior | None
     centre: float
     scale: float
-    left_out: int = 0  # number of samples that were not used, because they ended at a bound
-    scores: tuple[tuple[str, float], ...] = ()  # log evidence of every candidate feature map
+    left_out: int = 0  # number of samples that were not used, because they ended at a bound or ended the episode
+    # Name and score of every candidate that was compared, usually the log evidence of a feature map.
+    scores: tuple[tuple[str, float], ...] = ()
     warp: Warp | None = None
     past_limits: bool = False  # whether the output learned from samples that ended at a limit of another coordinate
-    # For each point: 1 if it ended at the upper limit, -1 at the lower, otherwise 0; () if none did.
+    # For each point of the process, 1 if it ended at the output's upper limit, -1 at the lower, otherwise 0. The tuple
+    # is empty if no point ended at a limit.
     at_limit: tuple[int, ...] = ()
     # Names of other outputs from whose samples this output learned too, see ``gp.pooling``.
     shared: tuple[str, ...] = ()
-    # Standard deviation of the output over the samples if its process is added to the prior model's prediction,
-    # otherwise None.
+    # If the output adds to a prior model's prediction, its standard deviation over the samples, this prediction
+    # included; otherwise None.
     size_with_prior: float | None = None
 
     def mean(self, x: Tensor) -> Tensor:
@@ -63,13 +65,13 @@ class OutputModel:
         return self.centre + scale * mean, scale * variance.sqrt()
 
     def amplitude(self, x: Tensor) -> Tensor:
-        """Return the amplitude by which the output's distance from ``centre`` is scaled at inputs x (m, d), (m,); 1 if
-        the feature map has no rates."""
+        """Return the amplitude by which the output's distance from ``centre`` is scaled at inputs x (m, d), (m,). It is
+        1 if the feature map has no rates (see ``gp.growth``)."""
         rates = self.feature_map.rates
         return amplitude(x, x.new_tensor(rates)) if rates else x.new_ones(x.shape[:-1])
 
     def standardised(self, target: Tensor, x: Tensor) -> Tensor:
-        """Return the standardised values, in the unit of the process, of targets (m,) at inputs x (m, d), (m,)."""
+        """Return the targets (m,) at inputs x (m, d) in the standardised unit of the process, (m,)."""
         return (target - self.centre) / (self.scale * self.amplitude(x))
 
     @property
@@ -81,23 +83,23 @@ class OutputModel:
 
     @property
     def noise_floor(self) -> float:
-        """Smallest noise variance that a fit may choose, as a share of the targets' variance."""
+        """Smallest noise variance that a fit of this output may choose, as a share of the variance of its targets."""
         return NOISE_FLOOR if self.warp is None else PEAK_NOISE
 
     @property
     def noise_std(self) -> float:
         """Standard deviation of the learned noise, in the output's unit.
 
-        If the output is learned by its logarithm (``warp``), it is the noise at a reward that is ``size`` away from the
-        base. With rates, whose amplitude depends on the inputs, it is a root mean square over the points.
+        If a reward is learned by its logarithm (``warp``), this is the noise at a reward that is ``size`` away from the
+        base, the reward far from a peak. If the feature map has rates, the noise depends on the inputs, and this is its
+        root mean square over the points.
         """
         return 0.0 if self.posterior is None else self._of_noise(self.posterior.hyper.noise_variance)
 
     @property
     def possible_noise(self) -> float:
-        """Greatest plausible standard deviation of the noise, in the output's unit. If a search finds hyperparameters
-        with more noise under which the points are at least as likely as under those of the process, it is their noise,
-        otherwise ``noise_std``."""
+        """Greatest plausible standard deviation of the noise, in the output's unit: ``noise_std``, or the noise of
+        other hyperparameters with more noise, if the points are at least as likely under them."""
         if self.posterior is None:
             return 0.0
         hyper = self.posterior.hyper
@@ -109,9 +111,9 @@ class OutputModel:
         return noise if self.warp is None else noise * self.warp.size
 
     def leave_one_out(self) -> LeaveOneOutErrors:
-        """Return the leave-one-out errors of the process; 0 for an output that never varied.
+        """Return the leave-one-out errors of the output; 0 for an output that never varied.
 
-        At a point that ended at a limit, a prediction beyond the limit counts as error 0.
+        If a point ended at a limit, a prediction beyond the limit counts as error 0.
         """
         if self.posterior is None:
             return LeaveOneOutErrors(0.0, 1.0, 1.0)
@@ -130,8 +132,8 @@ class OutputModel:
         return LeftOut.of(predictions - posterior.y, variance)
 
     def _predictions_left_out(self, posterior: Posterior) -> tuple[Tensor, Tensor]:
-        """Return the mean and variance with which each target y is predicted from the others, (n,) each. A prediction
-        beyond the limit at which a point ended is replaced by the limit."""
+        """Return the mean and variance with which each of n targets is predicted from the others, (n,) each. If a point
+        ended at a limit, a prediction beyond the limit is replaced by the limit."""
         mean, variance = posterior.leave_one_out()
         side = mean.new_tensor(self.at_limit or [0] * len(mean))
         beyond = side * (mean - posterior.y) > 0
@@ -139,14 +141,14 @@ class OutputModel:
 
     @property
     def _typical_amplitude(self) -> float:
-        """Root mean square over the points of the amplitude (1 if the feature map has no rates)."""
+        """Root mean square of the amplitude over the points of the process; 1 if the feature map has no rates."""
         if self.posterior is None or not self.feature_map.rates:
             return 1.0
         return float(self.amplitude(self.posterior.x).square().mean().sqrt())
 
     def _left_out_grown(self, error: float) -> float:
-        """Return the root mean square leave-one-out error of an output with rates, in its unit. ``error`` is that of
-        the standardised targets, used if the process has inducing points."""
+        """Return the root mean square leave-one-out error of an output with rates, in its unit. If the process has
+        inducing points, it is computed from ``error``, the leave-one-out error of the standardised targets."""
         assert self.posterior is not None
         if self.posterior.sparse is not None:
             return self.scale * self._typical_amplitude * error
@@ -155,8 +157,8 @@ class OutputModel:
         return float(off.square().mean().sqrt())
 
     def _left_out_warped(self, warp: Warp, error: float) -> float:
-        """Return the root mean square leave-one-out error of rewards that are learned by their logarithms. ``error`` is
-        that of the logarithms, used if the process has inducing points."""
+        """Return the root mean square leave-one-out error of rewards that are learned by their logarithms. If the
+        process has inducing points, it is computed from ``error``, the leave-one-out error of the logarithms."""
         assert self.posterior is not None
         if self.posterior.sparse is not None:
             return error * warp.size
@@ -166,6 +168,6 @@ class OutputModel:
 
 
 def paid(warp: Warp | None, mean: Tensor, std: Tensor) -> tuple[Tensor, Tensor]:
-    """Return mean and standard deviation (m,) in the output's unit, given those of its targets. With a ``warp`` the
-    targets are logarithms, otherwise they are returned unchanged."""
+    """Convert mean and standard deviation (m,) of an output's targets to the output's unit. With a ``warp`` the targets
+    are logarithms of rewards; without it, mean and standard deviation are returned unchanged."""
     return (mean, std) if warp is None else (warp.value(mean), warp.std(mean, std))

@@ -1,7 +1,8 @@
-"""All processes of one model, compiled for prediction: outputs in groups, and next states from predicted changes.
+"""Prediction of steps with all processes of one model: outputs in groups, and next states from predicted changes.
 
-The state moves in coordinates: q' = q + f(q, u), angles wrapped, saturated coordinates clipped (eq. 1 with zero mean).
-If the outputs move the observation instead, o' = o + f(o, u), the coordinates are read back from it.
+Usually the outputs are changes of coordinates: q' = q + f(q, u), with angles wrapped and coordinates clipped at their
+bounds (eq. 1 with zero mean). If the outputs are changes of the observation instead, o' = o + f(o, u), the coordinates
+are computed from the observation.
 """
 
 from __future__ import annotations
@@ -32,8 +33,8 @@ class Predictor:
     definition: EnvironmentDefinition
     transitions: tuple[OutputModel, ...]  # the M transition outputs, in the order of definition.outputs
     reward: OutputModel
-    jumps: tuple[Jump, ...]  # jumps of the reward, which are added to the prediction of its process
-    # Prior model; its predictions are added to those outputs that have a ``size_with_prior``.
+    jumps: tuple[Jump, ...]  # regions of states with the constants that are added to the reward inside them
+    # Predictor of the prior model. Its predictions are added to outputs with a ``size_with_prior``.
     prior: Predictor | None = None
 
     def transition(
@@ -89,11 +90,12 @@ class Predictor:
         process: Tensor | None,
         paths: Tensor | None,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return next coordinates (m, C), predicted values of all columns, and standard deviations, which are computed
-        for ``columns`` only. There is a column for each coordinate or observation entry, and one for the reward.
+        """Return next coordinates (m, C), predicted values (m, columns), and standard deviations (m, columns), which
+        are computed for ``columns`` only; they are (m, 0) if ``columns`` is empty. There is a column for each
+        coordinate or observation entry (its change), and one for the reward.
 
-        Outputs are predicted in up to three stages. The result of a stage is 0 in the columns of other stages, so that
-        the results can be added.
+        Outputs are predicted in up to three stages, because some read the predictions of others. The result of a stage
+        is 0 in the columns of other stages, so that the results can be added.
         """
         first, second, after = self._groups
         kick, shake = self._in_columns(noise), self._in_columns(process)
@@ -112,8 +114,8 @@ class Predictor:
         return q_next, mean, spread
 
     def _by_prior(self, prior: Predictor, q: Tensor, u: Tensor) -> Tensor:
-        """Return the prior model's predictions at q (m, C) and u (m, F) for the columns to which they are added, 0 in
-        the others."""
+        """Return the prior model's predictions at q (m, C) and u (m, F), (m, columns): a column for each coordinate or
+        observation entry, and one for the reward. Columns to which they are not added are 0."""
         change, _, reward = prior.means(q, u)
         added = change.new_zeros(len(q), self._reward_column + 1)
         added[:, [*self._columns, self._reward_column]] = torch.cat([change, reward[:, None]], 1)
@@ -121,8 +123,8 @@ class Predictor:
 
     @cached
     def uses_prior(self) -> Tensor:
-        """Mask of the columns to which the prior model's predictions are added, (columns,): 1 for these, 0 for the
-        others."""
+        """Mask of the columns to which the prior model's predictions are added, (columns,), with a column for each
+        coordinate or observation entry, and one for the reward: 1 if they are added, otherwise 0."""
         uses = torch.zeros(self._reward_column + 1, dtype=torch.float64, device=self.definition.device)
         outputs = (*self.transitions, self.reward)
         for column, output in zip((*self._columns, self._reward_column), outputs, strict=True):
@@ -162,7 +164,7 @@ class Predictor:
 
     @cached_property
     def _columns(self) -> tuple[int, ...]:
-        """Column of each transition output: the index of its coordinate, or of its observation entry."""
+        """Column of each transition output in predictions: the index of its coordinate, or of its observation entry."""
         return tuple(range(len(self.transitions))) if self.definition.moves_observation else self.definition.moving
 
     @cached_property

@@ -1,8 +1,8 @@
-"""Sets of states learned from labelled states: where episodes end, and where a reward jumps.
+"""Regions of states, learned from states labelled as inside or outside: where episodes end, and where a reward jumps.
 
-A region is a mixture of forms of two kinds. ``Thresholds``: levels of single axes found from data, joined by *or*
-(their complement by *and*), each known up to a gap between the last state seen outside and the first seen inside.
-``Classifier``: a process on labels +-1.
+A region is a weighted mean of forms of two kinds. ``Thresholds``: a state is inside if it exceeds any of several
+thresholds on single axes, or, in the complement, none of them. A threshold is known up to the gap between the nearest
+samples outside and inside. ``Classifier``: a Gaussian process fitted to labels 1 (inside) and -1 (outside).
 """
 
 from __future__ import annotations
@@ -20,24 +20,22 @@ from surrogym_server.environment.terms import PartDefinition, TermDefinition, Te
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 from surrogym_server.tensors import cached, to_device
 
-TERMINATION = "termination"  # name of the region where episodes end
-Side = Literal["above", "below", "beyond"]  # side of a threshold on a term t: t > level, -t > level, or |t| > level
+TERMINATION = "termination"  # name of the region where episodes end, in keys of warm starts and of stored arrays
+Side = Literal["above", "below", "beyond"]  # side of a threshold on a value t: t > level, -t > level, or |t| > level
 SIDES: tuple[Side, ...] = ("above", "below", "beyond")
 
 
 @dataclass(frozen=True)
 class Axes:
-    """Axes on which a learned threshold can lie: x, -x and |x| for each x among T coordinates and observation entries.
+    """Axes on which a learned threshold can lie: x, -x and |x| for each x among T coordinates and observation entries,
+    A = 3 T axes in total."""
 
-    There are A = 3 T axes.
-    """
-
-    names: tuple[str, ...]  # (T,) names of the coordinates and observation entries
+    names: tuple[str, ...]  # (T,) names of the T coordinates and observation entries to which the axes belong
     terms: TermSet
 
     @classmethod
     def of(cls, definition: EnvironmentDefinition) -> Axes:
-        """Build the axes for the moving coordinates, and for those observation entries that are not simply one of these
+        """Build the axes for the moving coordinates, and for those observation entries that differ from all of these
         coordinates."""
         size, names = len(definition.coordinates), {}
         for index in definition.moving:
@@ -65,19 +63,19 @@ class Axes:
 
 @dataclass(frozen=True)
 class Cut:
-    """Threshold on one axis. A state is inside if its value on the axis exceeds the threshold, which is only known to
-    lie between ``outside`` and ``inside``."""
+    """Threshold on one axis of the state space. A state lies inside a region if its value on the axis exceeds the
+    threshold, which is only known to lie between ``outside`` and ``inside``."""
 
     axis: int
-    outside: float  # greatest value on the axis of all samples outside
-    inside: float  # least value on the axis of the samples inside that this cut explains
-    weight: float  # probability of this cut among the alternative cuts of its rule
+    outside: float  # greatest value on the axis of all samples outside the region
+    inside: float  # least value on the axis of those samples inside the region that this threshold explains
+    weight: float  # probability of this threshold among the alternatives of its rule
 
 
 @dataclass(frozen=True)
 class Thresholds:
-    """Region of the states for which any rule holds. A rule consists of alternative thresholds (cuts) that explain the
-    same samples, each with the probability that it is the right one."""
+    """Region of the states for which any rule holds. A rule consists of alternative thresholds (cuts), each with its
+    probability. Only one of them is right, but all explain the same samples."""
 
     definition: EnvironmentDefinition
     rules: tuple[tuple[Cut, ...], ...]
@@ -119,8 +117,8 @@ class Thresholds:
 
     @cached
     def _compiled(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Tensors of all K cuts: axis, value outside the gap and width of the gap, (K,) each; and the weight of each
-        cut in each of the R rules, (K, R), 0 in the rules of other cuts."""
+        """Tensors of all K cuts (thresholds): axis, lower end of the gap in which the threshold lies, and width of the
+        gap, (K,) each; and the weight of each cut in each of the R rules, (K, R), 0 in rules without it."""
         cuts = [(row, cut) for row, rule in enumerate(self.rules) for cut in rule]
         outside = torch.tensor([cut.outside for _, cut in cuts], dtype=torch.float64)
         inside = torch.tensor([cut.inside for _, cut in cuts], dtype=torch.float64)
@@ -133,14 +131,14 @@ class Thresholds:
 
 @dataclass(frozen=True)
 class Classifier:
-    """Region learned by a process that is fitted to labels, 1 inside and -1 outside (least-squares classification,
-    Rasmussen and Williams (2006), section 6.5)."""
+    """Region learned by a Gaussian process that is fitted to labels, 1 inside and -1 outside (least-squares
+    classification, Rasmussen and Williams (2006), section 6.5)."""
 
     definition: EnvironmentDefinition
     process: OutputModel
 
     def probability(self, q: Tensor) -> Tensor:
-        """Return the probability that q (m, C) lies inside, (m,): that the process is above 0 there."""
+        """Return the probability that states q (m, C) lie inside, (m,): that the process is above 0 there."""
         u = q.new_zeros(len(q), self.definition.action.size)
         mean, std = self.process.mean_and_std(encode(self.definition, self.process.feature_map, q, u))
         return likely(mean, std)
@@ -156,14 +154,14 @@ Form = Thresholds | Classifier
 
 @dataclass(frozen=True)
 class Region:
-    """Learned region of states: a weighted mean of forms (thresholds or a classifier) that each explain the labels of
-    the samples. Where the forms disagree, the probability lies between 0 and 1."""
+    """Learned region of states: a weighted mean of forms (thresholds or a classifier) that each explain which samples
+    lie inside. Where the forms disagree, the probability of being inside lies between 0 and 1."""
 
-    forms: tuple[tuple[float, Form], ...]  # forms with their weights, which add up to 1
-    scores: tuple[tuple[str, float], ...]  # leave-one-out log probability of every form that was compared
+    forms: tuple[tuple[float, Form], ...]  # pairs of a weight and a form; the weights add up to 1
+    scores: tuple[tuple[str, float], ...]  # name of every form that was compared, and its leave-one-out log probability
 
     def probability(self, q: Tensor) -> Tensor:
-        """Return the probability that q (m, C) lies inside, (m,)."""
+        """Return the probability that states q (m, C) lie inside the region, (m,)."""
         mixed = torch.stack([weight * form.probability(q) for weight, form in self.forms]).sum(0)
         return mixed.clamp(0, 1)  # because of rounding, the weighted sum may exceed 1
 
@@ -184,10 +182,10 @@ class Jump:
 
 
 def jumped(jumps: Sequence[Jump], q: Tensor) -> tuple[Tensor, Tensor]:
-    """Return what jumps add to the reward of states q (m, C), (m,), and the variance of this amount where it is
-    uncertain whether a state lies inside, (m,).
+    """Return the amounts (m,) that jumps add to the reward of states q (m, C), and the variances (m,) of these amounts,
+    which are above 0 where it is uncertain whether a state lies inside.
 
-    If a state lies inside several regions, only the first of these jumps counts.
+    If a state lies inside the regions of several jumps, only the first of these jumps counts.
     """
     added, variance, free = q.new_zeros(len(q)), q.new_zeros(len(q)), q.new_ones(len(q), dtype=torch.bool)
     for jump in jumps:

@@ -1,13 +1,13 @@
 """Functions sampled with uncertain hyperparameters: from several models of the same samples.
 
-A single optimum treats a length scale as certain, which five samples can't determine. So a function is sampled in two
-steps: choose one of the models, with equal probability, then sample a function of its processes. A sampled function
-consists of the index of its model and the weights for this model.
+Few samples can't determine a length scale, but a model with the optimal hyperparameters treats it as certain. So a
+function is sampled in two steps: choose one of several models with equal probability, then sample a function of its
+processes. A sampled function consists of the index of its model and the weights for this model.
 
-A sampled function has no noise. So if a process explains its samples by noise that repeated steps don't show, no
-function would contain its misfit. The hyperparameters of such a process are sampled without this noise: the functions
-pass through the samples, and vary as much as the samples require. Where no step can be repeated, nothing distinguishes
-noise from misfit, and the noise is kept.
+A sampled function contains no noise. So if a process explains its samples by noise that repeated steps don't show,
+sampled functions would lack the variation that it takes for noise. The hyperparameters of such a process are sampled
+without this noise: the functions pass through the samples, and vary as much as the samples require. If no step can be
+repeated, noise can't be distinguished from misfit, and the noise is kept.
 """
 
 from __future__ import annotations
@@ -29,20 +29,22 @@ from surrogym_server.models.port import Transition
 
 MODELS = 8  # number of models with different hyperparameters, from which functions are sampled
 MOST_POINTS = 128  # hyperparameters of a process with more points are certain enough, so they are not sampled
-# Noise variance, as a share of the output's variance, below which it does not matter whether noise is misfit.
+# If the learned noise variance, as a share of the output's variance, is at most this, it need not be tested by repeated
+# steps.
 NEGLIGIBLE = 0.01**2
-# Greatest plausible ratio of learned noise variance to that of repeated steps; it is large because repeats may be few.
+# If the learned noise variance exceeds that of repeated steps by more than this factor, the process fits badly. The
+# factor is large because repeated steps may be few.
 AT_MOST = 3.0**2
 
 Floats = NDArray[np.float64]
 
 
 def uncertain_outputs(outputs: Sequence[OutputModel], *, repeatable: bool) -> list[list[OutputModel]]:
-    """Return ``MODELS`` copies of all outputs (O,), computed on the CPU. In each copy, processes with few points have
-    other, sampled hyperparameters.
+    """Return ``MODELS`` (8) copies of all outputs (O,), computed on the CPU. In each copy, processes with few points
+    have other, sampled hyperparameters.
 
     Return [] if no process has few points. ``repeatable`` says whether the same real step can be taken again, which
-    would show noise. If it can, learned noise that repeats don't confirm is left out.
+    would show noise. If so, learned noise that repeated steps don't confirm is left out.
     """
     if not any(_uncertain(output) for output in outputs):
         return []
@@ -65,12 +67,14 @@ def _sampled(output: OutputModel, seed: int, repeatable: bool) -> list[OutputMod
 
 
 def _misfits(posterior: Posterior) -> bool:
-    """Return whether a process has learned clearly more noise than its points with equal inputs show."""
+    """Return whether a process has learned clearly more noise than its points with equal inputs (repeated steps)
+    show."""
     return posterior.hyper.noise_variance > max(NEGLIGIBLE, AT_MOST * (posterior.noise_seen or 0.0))
 
 
 def _conditioned(posterior: Posterior, hyper: Hyperparameters) -> Posterior:
-    """Return the process with other hyperparameters, or unchanged if its covariance can't be factored with these."""
+    """Return the process with the hyperparameters ``hyper``, or unchanged if its covariance can't be factored with
+    them."""
     try:
         return condition(hyper, posterior.x, posterior.y)
     except NumericalFailure:

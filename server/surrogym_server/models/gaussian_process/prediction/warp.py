@@ -1,11 +1,11 @@
-"""Rewards learned by the logarithm of their distance from a base: r = base + sign exp(y).
+"""Rewards r that are learned by the logarithm y of their distance from a base: r = base + sign exp(y).
 
-A reward that differs from its base in one place only is flat almost everywhere, so a Gaussian process of its values
-learns that it is flat. Its logarithm is not flat: the logarithm of a bump is a parabola, which a few samples determine.
+A reward that differs from the base in one place only is flat almost everywhere, so a Gaussian process of such rewards
+learns that they are flat. The logarithm is not flat: that of a Gaussian bump is a parabola, determined by few samples.
 
 Predictions are medians. A standard deviation is half the distance between the two quantiles that lie one standard
-deviation of y away from the median. Both stay meaningful if y is uncertain by several units; the moments of a
-log-normal distribution do not.
+deviation of y away from the median. Median and quantiles stay meaningful if y is uncertain by several units; the
+moments of a log-normal distribution do not.
 """
 
 from __future__ import annotations
@@ -16,8 +16,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-LARGEST = 300.0  # greatest logarithm y whose exponential is computed; a larger one is replaced by it to avoid overflow
-# Least noise variance, as a share of that of y; y may span hundreds of units, but rewards need a resolution of 1 %.
+LARGEST = 300.0  # a larger logarithm y is replaced by this before its exponential is computed, to avoid overflow
+# Least noise variance of a fit to the logarithms y, as a share of the variance of y. It is small because y may span
+# hundreds of units, but rewards need a resolution of 1 %.
 PEAK_NOISE = 1e-10
 
 
@@ -36,16 +37,17 @@ class Warp:
     size: float
 
     def value(self, y: Tensor) -> Tensor:
-        """Return the rewards with logarithms y (m,), (m,)."""
+        """Return the rewards (m,) that belong to the logarithms y (m,)."""
         return self.base + self.sign * y.clamp_max(LARGEST).exp()
 
     def std(self, y: Tensor, spread: Tensor) -> Tensor:
-        """Return the standard deviation of the reward if y (m,) has the standard deviation ``spread`` (m,)."""
+        """Return the standard deviation (m,) of the reward, if its logarithm has the mean y (m,) and the standard
+        deviation ``spread`` (m,)."""
         return 0.5 * ((y + spread).clamp_max(LARGEST).exp() - (y - spread).clamp_max(LARGEST).exp())
 
     def slope(self, y: Tensor, spread: Tensor) -> Tensor:
-        """Return the absolute derivative of the reward with respect to y, (m,), evaluated one standard deviation
-        ``spread`` (m,) above y."""
+        """Return the absolute derivative of the reward with respect to its logarithm, (m,), at the logarithm y +
+        ``spread``: the mean y (m,) plus one standard deviation ``spread`` (m,)."""
         return torch.exp((y + spread).clamp_max(LARGEST))
 
     def __str__(self) -> str:
@@ -54,5 +56,5 @@ class Warp:
 
     @property
     def finite(self) -> bool:
-        """Whether all numbers are finite and valid. This has to be checked because they may come from a file."""
+        """Whether base, sign and size are finite and valid. They may come from a file, so this has to be checked."""
         return math.isfinite(self.base) and self.sign in (1.0, -1.0) and math.isfinite(self.size) and self.size > 0

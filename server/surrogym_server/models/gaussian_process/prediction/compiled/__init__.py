@@ -1,1 +1,1 @@
-"""A step of the model in compiled code; ``prediction.predictor`` and ``prediction.regions`` are the reference."""
+"""Prediction of steps by compiled code, with the results of ``prediction.predictor`` and ``prediction.regions``."""

@@ -1,7 +1,7 @@
-"""Layout of a model's tables for the compiled functions: the entries of the first matrix."""
+"""Layout of the matrices (tables) in which compiled functions find a model: the entries of the first matrix."""
 
-HEAD = 0  # index of the first matrix: one row of indices of other matrices, sizes and flags
-NONE = -1  # index of a matrix that does not exist
+HEAD = 0  # index of the first matrix in the tables: a single row of indices of other matrices, sizes and flags
+NONE = -1  # stored in place of the index of a matrix in the tables, if the model does not have this matrix
 (
     OBSERVE,
     FEATURES,
@@ -24,5 +24,5 @@ NONE = -1  # index of a matrix that does not exist
     WARP,
     HAS_STAGE,
 ) = range(20)
-ENTRIES = HAS_STAGE + 3  # number of entries of the first matrix; the last three are flags, one for each stage
-BLOCK = 32  # number of lanes computed at once, so that their data stay in the first-level cache
+ENTRIES = HAS_STAGE + 3  # number of entries of the first matrix; the last three say which stages of a step have outputs
+BLOCK = 32  # number of lanes (parallel environments) computed at once, so that their data stay in the first-level cache

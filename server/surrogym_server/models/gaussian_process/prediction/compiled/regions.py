@@ -1,4 +1,4 @@
-"""Learned regions and jumps of the reward in compiled code."""
+"""Compiled code for learned regions of states: where episodes end, and where the reward jumps."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
-# Columns of a region's matrix, one row for each form (thresholds or classifier): weight of the form, whether it is a
-# classifier, and three more numbers.
+# A region is stored as a matrix with a row for each of its forms (thresholds or a classifier). The columns are the
+# weight of the form, whether it is a classifier, and three more numbers, most of them indices of other matrices.
 # For thresholds: index of the axes, index of the cuts and rules, and whether the form is a complement.
 # For a classifier: index of the features, index of the process, and number of features. If the process is constant, its
 # index is -i - 1, with i the index of the constant.
@@ -40,13 +40,13 @@ LEAST_STD = 1e-9  # lower limit of a standard deviation, to avoid a division by 
 
 
 def add_region(tables: TablesBuilder, region: Region) -> int:
-    """Add a learned region of states to the tables, and return the index of its matrix."""
+    """Add a learned region of states to the tables that compiled code reads. Return the index of its matrix."""
     return tables.add([(weight, *_add_form(tables, form)) for weight, form in region.forms])
 
 
 def add_jumps(tables: TablesBuilder, jumps: Sequence[Jump]) -> int:
-    """Add the jumps of a reward to the tables. Return the index of a matrix with a row (size, index of the region) for
-    each jump."""
+    """Add the jumps of a reward to the tables that compiled code reads. Return the index of a matrix with a row (size,
+    index of the region) for each jump."""
     return tables.add(np.array([(jump.size, add_region(tables, jump.region)) for jump in jumps]).reshape(-1, 2))
 
 
@@ -112,13 +112,13 @@ def _classified(
 
 @compiled
 def probability(numbers: Floats, places: Ints, at: int, observe: int, q: Floats, actions: int) -> Floats:
-    """Return the probability that states q (C, B) lie inside a region, (B,).
+    """Return the probability that each of B states lies inside a region, (B,).
 
     Args:
         numbers, places: tables of the model, see ``compiled.tables``.
         at: index of the region's matrix in the tables.
         observe: index, in the tables, of the terms that compute the observation.
-        q: coordinates, one state a column.
+        q: coordinates (C, B), each column a state.
         actions: number of action entries, F.
     """
     forms = matrix(numbers, places, at)
@@ -145,9 +145,9 @@ def probability(numbers: Floats, places: Ints, at: int, observe: int, q: Floats,
 def add_jumped(
     numbers: Floats, places: Ints, at: int, observe: int, q: Floats, actions: int, reward: Floats, variance: Floats
 ) -> None:
-    """Add the jumps of the reward with index ``at`` in the tables: their sizes to the rewards ``reward`` (B,) of those
-    states q (C, B) that lie inside, and to ``variance`` (B,) the variance that results from the uncertain edges of
-    their regions."""
+    """Add the jumps of the reward, which have the index ``at`` in the tables, to ``reward`` (B,), the rewards at the
+    states q (C, B). Add to ``variance`` (B,) the variance of the reward where it is uncertain whether a state lies
+    inside a jump's region."""
     jumps = matrix(numbers, places, at)
     free = np.ones(q.shape[1], dtype=np.bool_)
     for j in range(len(jumps)):
@@ -183,8 +183,8 @@ def judge(
     std: Floats,
     terminated: Bools,
 ) -> None:
-    """Add the learned jumps of the reward to the results of N steps, and apply the learned termination. The results
-    change in place.
+    """Add the learned jumps of the reward to the results of N steps, and decide by the learned region which steps end
+    the episode. The results change in place.
 
     Args:
         numbers, places: tables of the model, see ``compiled.tables``.

@@ -19,17 +19,17 @@ from surrogym_server.tensors import EDGE
 
 Floats = NDArray[np.float64]
 FIXED = ("step.c", "step.h")
-PER_LINE = 8  # numbers in a line of the source
-PROCESS = 3  # column of the matrix of processes that contains the index of a process's first matrix
+PER_LINE = 8  # a line of the C source contains this many numbers
+PROCESS = 3  # in the matrix of all processes, the column with the index of each process's first matrix
 
 
 def step_source(definition: EnvironmentDefinition, tables: Tables) -> StepSource:
-    """Return C source of the functions that compute a step of a model. ``tables`` are its tables from ``tables_of`` in
-    ``compiled.step``."""
+    """Return C source of the functions that compute a step of a model. ``tables`` are the model's tables, the result of
+    ``compiled.step.tables_of``."""
     matrices = _matrices(tables)
     processes = {int(place) for place in _processes(matrices)}
     for process in processes:
-        for drawn in (KEPT, TURNED):  # these matrices are left out, because only sampled functions read them
+        for drawn in (KEPT, TURNED):  # the C source omits these matrices, because only sampled functions need them
             matrices[process + drawn] = np.zeros((1, 0))
     inner = {process + place for process in processes for place in range(HEAD, TURNED + 1)}
     sizes = {

@@ -1,4 +1,4 @@
-"""Compiled step of a block of lanes: from coordinates and actions to next coordinates, rewards and terminations."""
+"""Compiled code that predicts a step of many lanes (parallel environments): next coordinates, rewards, terminations."""
 
 from __future__ import annotations
 
@@ -56,16 +56,17 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
-# Columns of the matrix of outputs: value of an output that never varied, standard deviation of the noise, and stage.
+# The matrix of outputs has a row for each output. Its columns: value of an output that never varied, standard deviation
+# of the learned noise, and stage of the prediction.
 CENTRE, NOISE, STAGE = range(3)
-# Stages of a prediction: outputs that read (q, u), those that also read next values of leading coordinates, and a
-# reward that reads the next state.
+# A prediction has three stages: first outputs that read only coordinates and action, then outputs that also read the
+# predicted next values of leading coordinates, last a reward that reads the predicted next state.
 FIRST, LED, AFTER = range(3)
 STAGES = 3
 
 
 def tables_of(predictor: Predictor, ending: Region | None) -> Tables:
-    """Build the tables of a model and its environment, which ``step`` reads.
+    """Build the tables of numbers in which the compiled function ``step`` finds a model and its environment.
 
     ``ending`` is the region in which episodes end, or None if termination is declared.
     """
@@ -105,8 +106,8 @@ def tables_of(predictor: Predictor, ending: Region | None) -> Tables:
 
 
 def _add_outputs(tables: TablesBuilder, predictor: Predictor) -> tuple[int, int]:
-    """Add a matrix of outputs and a matrix of processes to the tables, and return their two indices. The processes are
-    those of outputs that vary."""
+    """Add to the tables a matrix with a row for each output, and a matrix with a row for the process of each output
+    that varies. Return the indices of the two matrices."""
     rows, processes = np.zeros((predictor._reward_column + 1, 3)), []
     begins = {one.column: one.span.start for group in predictor._groups if group for one in group.drawn}
     places = (*predictor._columns, predictor._reward_column)
@@ -131,11 +132,12 @@ def _add_outputs(tables: TablesBuilder, predictor: Predictor) -> tuple[int, int]
 def _encode_stage(
     numbers: Floats, places: Ints, head: Floats, stage: int, raw: Floats, arrived: Floats, mean: Floats, x: Floats
 ) -> None:
-    """Write those features to x (d, B) that outputs of a stage read and that no earlier stage has written.
+    """Compute the features of B lanes (parallel environments) that outputs of a stage read and that no earlier stage
+    has computed, and write them to x (d, B).
 
-    Features are computed from ``raw`` (C + F + L, B). Its first rows are coordinates and actions, which the first stage
-    reads. The second stage writes the next values of the L leading coordinates to the last rows, and reads them too.
-    The third stage replaces the coordinates by the next coordinates ``arrived`` (C, B).
+    They are computed from ``raw`` (C + F + L, B): C coordinates and F action entries, which the first stage reads, and
+    the predicted next values of L leading coordinates, which the second stage first writes and then reads. The third
+    stage replaces the coordinates by the next coordinates ``arrived`` (C, B).
     """
     size, lanes, observe = len(arrived), raw.shape[1], int(head[0, OBSERVE])
     width, begin, end = int(head[0, WIDTH]), 0, int(head[0, WIDTH])
@@ -158,8 +160,8 @@ def _encode_stage(
 @inlined
 def _grow(numbers: Floats, places: Ints, at: int, x: Floats, mean: Floats, spread: Floats) -> None:
     """Multiply the distance of an output's ``mean`` (B,) from its centre, and its standard deviation ``spread`` (B,),
-    by the output's amplitude at inputs x (d, B). ``at`` is the index of the output's rates, from which the amplitude is
-    computed."""
+    by the output's amplitude at inputs x (d, B). ``at`` is the index, in the tables, of the output's rates (see
+    ``gp.growth``), which give the amplitude."""
     rates, centre = matrix(numbers, places, at), matrix(numbers, places, at + 1)[0, 0]
     for b in range(len(mean)):
         amplitude = 1.0
@@ -191,12 +193,13 @@ def _predict_stage(
     Args:
         numbers, places: tables of the model, see ``tables_of``.
         head: first matrix of the tables.
-        stage: FIRST, LED or AFTER, for outputs that read coordinates and action, also the next values of leading
-            coordinates, or the next state.
+        stage: FIRST for outputs that read only coordinates and action, LED for outputs that also read the next values
+            of leading coordinates, AFTER for a reward that reads the next state.
         x: features (d, B).
         noise, process, paths, known: as in ``step``, for these lanes.
         stds, reward_std: whether standard deviations of transition outputs and of the reward are needed.
-        mean: (columns, B) predicted values. The rows of this stage's outputs are written.
+        mean: (columns, B) predicted values, with a row for each coordinate or observation entry and one for the reward.
+            The rows of this stage's outputs are written.
         spread: (O, B) standard deviations. The rows of this stage's outputs are written.
     """
     columns = matrix(numbers, places, int(head[0, OUTPUTS]))
@@ -229,8 +232,9 @@ def _predict_stage(
 
 @inlined
 def _arrive(numbers: Floats, places: Ints, head: Floats, raw: Floats, mean: Floats, arrived: Floats) -> None:
-    """Write the next coordinates to ``arrived`` (C, B): the coordinates in the first rows of ``raw`` (C + F + L, B),
-    changed by ``mean`` (columns, B), with the environment's rules applied."""
+    """Compute the next coordinates, and write them to ``arrived`` (C, B): the coordinates in the first C rows of
+    ``raw``, changed by the predicted changes ``mean`` (columns, B) of coordinates or observation entries, with the
+    environment's rules (such as limits) applied."""
     size, lanes = arrived.shape
     for c in range(size):
         for b in range(lanes):
@@ -316,7 +320,8 @@ def step(
         process: (N, M) standard normal numbers, by which the learned noise moves each transition output, or (0, 0) for
             no noise.
         paths: (N, W) weights of the sampled function that each row follows, or (0, 0) for the mean.
-        known: (N, columns) predictions of a prior model to add to the outputs, or (0, 0).
+        known: (N, columns) predictions of a prior model to add to the outputs, or (0, 0). There is a column for each
+            coordinate or observation entry, and one for the reward.
         stds, reward_std: whether standard deviations of transition outputs and of the reward are needed.
         q_next: next coordinates (N, C).
         reward: (N,) rewards, without the terminal reward.
@@ -377,25 +382,27 @@ def step(
 
 
 NO_ROWS = np.zeros((0, 0))
-# A call that computes more covariances than this, which takes some milliseconds, uses several threads.
+# A call that computes at least this many covariances takes some milliseconds, so it uses several threads.
 SPLIT = 4_000_000
 
 
 @dataclass(frozen=True, eq=False)
 class StepsOfModel(ArraySteps):
-    """Compiled steps of one model."""
+    """Callable object that predicts steps of one model by compiled code."""
 
     definition: EnvironmentDefinition
     tables: Tables
     outputs: int
     has_regions: bool  # whether the model has a learned termination or learned jumps of the reward
-    points: int  # training points of all Gaussian processes, with the mirrored copies that a symmetry adds
-    prior: StepsOfModel | None  # steps of the prior model, whose mean is added to the columns that ``uses`` marks
-    uses: Floats  # (columns,) 1 for a column to which the prior is added, 0 for the others
+    points: int  # number of training points of all Gaussian processes, with the mirrored copies that a symmetry adds
+    prior: StepsOfModel | None  # the same for the prior model, whose predictions are added where ``uses`` is 1
+    # (columns,) for each coordinate or observation entry, and last the reward: 1 if the prior model's prediction is
+    # added to it, otherwise 0.
+    uses: Floats
 
     @classmethod
     def of(cls, predictor: Predictor, ending: Region | None, prior: StepsOfModel | None) -> Self:
-        """Compile a model.
+        """Prepare a model for compiled code.
 
         Args:
             predictor: predictor of the model's outputs.
@@ -421,13 +428,13 @@ class StepsOfModel(ArraySteps):
         return self._steps(q, u, noise, process, paths, stds, reward_std, NO_ROWS)
 
     def _by_prior(self, prior: StepsOfModel, q: Floats, u: Floats) -> Floats:
-        """Return the prior model's predictions at q (N, C) and u (N, F) for the columns to which they are added, 0 in
-        the others."""
+        """Return the prior model's predictions at q (N, C) and u (N, F), (N, columns): a column for each coordinate or
+        observation entry, and one for the reward. Columns to which they are not added are 0."""
         added = np.empty((len(q), len(self.uses)))
         added[:, -1] = prior._steps(q, u, None, None, None, False, False, added).reward
         return added * self.uses
 
-    def _steps(  # many parameters, because the compiled function takes arrays one by one
+    def _steps(  # it has many parameters, because the compiled function ``step`` takes arrays one by one
         self,
         q: Floats,
         u: Floats,
@@ -438,8 +445,8 @@ class StepsOfModel(ArraySteps):
         reward_std: bool,
         change: Floats,
     ) -> ArrayTransition:
-        """Predict as ``__call__`` does. If ``change`` has rows, write the predicted changes before limits are applied
-        to it, (N, columns)."""
+        """Predict as ``__call__`` does. If ``change`` (N, columns) has rows, also write the predicted changes to it, as
+        they are before limits are applied."""
         count = len(q)
         moved = ArrayTransition(
             np.empty_like(q), np.empty(count), np.empty((count, self.outputs)), np.empty(count, dtype=np.bool_)
