@@ -7,7 +7,7 @@ from typing import Annotated, Self
 from pydantic import Discriminator, Field, Tag, model_validator
 
 from surrogym_shared.checks import Number, require
-from surrogym_shared.patterns import VISIBLE
+from surrogym_shared.patterns import NAME, VISIBLE
 from surrogym_shared.spec.base import MAX_DIMENSIONS, MAX_INEQUALITIES, Frozen, Name
 from surrogym_shared.spec.terms import Term
 
@@ -44,7 +44,7 @@ class Limit(Frozen):
 class NamedFallback(Frozen):
     """Fallback that is a program at the machine. The command line of the sampler gives the program for the name."""
 
-    name: Name
+    name: str = Field(pattern=NAME)
 
 
 def _fallback_kind(value: object) -> str:
