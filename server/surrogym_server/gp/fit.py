@@ -135,11 +135,11 @@ def noisy_explanation(posterior: Posterior, options: FitOptions) -> float:
 
 
 def _starts(default: Array, warm: Array | None, points: int) -> Sequence[Array]:
-    """Return the thetas (logarithms of hyperparameters) at which a fit to ``points`` points starts to search.
+    """Return the thetas (logarithms of hyperparameters) at which a fit to a number of points starts to search.
 
-    Without ``warm``, the result of an earlier fit, this is ``default``. With at most ``MANY_POINTS`` points there are
-    many optima and a fit is fast, so both are used. With more, ``default`` is used beside ``warm`` only if ``points``
-    is a multiple of 4.
+    If there is no ``warm``, the result of an earlier fit, the search starts at ``default``. With at most
+    ``MANY_POINTS`` (24) points there are many optima and a fit is fast, so both are used. With more points, ``default``
+    is used in addition to ``warm`` only if ``points`` is a multiple of 4.
     """
     if warm is None:
         return (default,)

@@ -78,7 +78,7 @@ class _Chain:
         self._mean, self._std = evidence.prior.T
 
     def log_likelihood(self, theta: Array) -> float:
-        """Return the log evidence without the priors; -inf outside the bounds of a fit."""
+        """Return the log evidence at theta, without the priors of hyperparameters; -inf outside the bounds of a fit."""
         if (theta < self._evidence.lower).any() or (theta > self._evidence.upper).any():
             return -math.inf
         negative, _ = self._evidence(theta)

@@ -26,7 +26,9 @@ class Joint:
     hyper: Hyperparameters
     x: Tensor  # (m, d) inputs of the m points
     whitened: Tensor  # (n, m) L^-1 k(X, x), with L the Cholesky factor of the process
-    observed: Tensor  # (p, m) the vector r (see the module) of each of p points that are assumed observed
+    # (p, m) for each of p points that are assumed observed, its covariances with the m points divided by the standard
+    # deviation of the observation.
+    observed: Tensor
     variance: Tensor  # (m,) variance at the points, without noise
     noise: float
 

@@ -27,7 +27,7 @@ from surrogym_server.gp.kernel import covariance
 from surrogym_server.gp.posterior import Posterior
 from surrogym_server.tensors import cached
 
-FREQUENCIES = 256  # number S of frequencies of the random Fourier features
+FREQUENCIES = 256  # number S of frequencies; each gives two random Fourier features, a cosine and a sine
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ BLOCK = 16_384  # number of rows predicted at once, which bounds the memory
 class LeftOut:
     """Accuracy of leave-one-out predictions: each point of a process is predicted from all other points."""
 
-    error: float  # root mean square error, in units of y
+    error: float  # root mean square leave-one-out error, in units of y
     within_one: float  # share of the points whose error is at most one predictive standard deviation
     within_two: float  # share of the points whose error is at most two predictive standard deviations
     log_density: float  # mean over the points of the log predictive density of the target
@@ -60,7 +60,7 @@ class Posterior:
     y: Tensor  # (n,) standardised targets
     factor: Tensor  # (n, n) lower Cholesky factor of K + (sigma_n^2 + jitter) I
     weights: Tensor  # (n,) beta, the weights of the points in the mean
-    jitter: float  # added to the diagonal before factoring, usually 0
+    jitter: float  # number that had to be added to the diagonal of the covariance matrix to factor it, usually 0
     sparse: Sparse | None = None  # None if the n points are all samples; otherwise they are inducing points
 
     def mean(self, x: Tensor) -> Tensor:

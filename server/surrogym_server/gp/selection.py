@@ -25,9 +25,9 @@ class Selection:
     """Result of eliminating inputs of a process: a process that reads only some of the inputs."""
 
     mask: Tensor  # (d,) bool, true for the inputs that the process reads
-    theta: Array  # free parameters of the process
-    score: float  # log evidence, priors included
-    gain: float  # score less the score of the process with all inputs
+    theta: Array  # logarithms of the hyperparameters of the process
+    score: float  # log evidence of the process, priors of hyperparameters included
+    gain: float  # log evidence of the process less that of the process with all inputs
     hyper: Hyperparameters
 
 

@@ -29,8 +29,12 @@ from surrogym_server.tensors import CPU, in_blocks
 
 BLOCK = 262_144  # greatest number of covariances computed at once, so that they fit into the processor's cache
 MIN_ROWS = 64  # inputs are predicted in blocks of at least this many rows, even if their covariances exceed ``BLOCK``
-MEAN_TOLERANCE = 1e-8  # accepted rounding error of the mean, in prior standard deviations
-VARIANCE_TOLERANCE = 5e-10  # accepted rounding error of the variance, in prior variances
+# Exponents are computed from differences, not by matrix products, if products could cause a rounding error of the mean
+# above this share of the prior standard deviation.
+MEAN_TOLERANCE = 1e-8
+# Exponents are also computed from differences if products could cause a rounding error of the variance above this share
+# of the prior variance.
+VARIANCE_TOLERANCE = 5e-10
 
 
 @dataclass(frozen=True)
@@ -145,7 +149,8 @@ class Serving:
         return max(MIN_ROWS, BLOCK // max(1, self.exponents.shape[1]))
 
     def mean(self, x: Tensor) -> Tensor:
-        """Return the means at x (m, width), shape (m, O)."""
+        """Return the predicted means of O outputs at m points x (m, width) with the ``width`` inputs of the model, (m,
+        O)."""
         return in_blocks(self.rows, lambda rows: (self._means(*self._covariances(rows)),), x)[0]
 
     def mean_and_std(self, x: Tensor, columns: Sequence[int]) -> tuple[Tensor, Tensor]:

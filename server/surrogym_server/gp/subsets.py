@@ -1,4 +1,4 @@
-"""Subsets of many points to fit hyperparameters to, so that no fit takes time in the third power of n.
+"""Subsets of n points to which hyperparameters are fitted, because a fit to all would take time proportional to n^3.
 
 A fit evaluates the evidence some hundred times, each time in O(n^3). So with more than ``FEW`` points, alternatives are
 compared on ``FEW`` of them. The chosen one is fitted to ``SOME`` points, then refined on more, near the optimum and in
@@ -17,7 +17,7 @@ SEED = 0
 
 
 def spread(points: int, most: int) -> Tensor:
-    """Select at most ``most`` of the points, as ascending indices (m,).
+    """Select at most ``most`` of ``points`` points. Return the ascending indices (m,) of the m selected points.
 
     If there are no more than ``most`` points, all are selected. Otherwise the sequence of points is cut into ``most``
     equal parts, and one random point of each part is selected, always with the same seed. They are random, because

@@ -100,7 +100,7 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
 
     # The confidence index (CI) needs a tolerance for each output, (O,): the declared one, or a default, which is 1 in
     # preset "paper" and otherwise 5 % of the output's standard deviation in the first round. Later rounds compute a
-    # default again only if the range of the samples has grown a thousandfold, or larger with snapshots.
+    # default again if the range of the samples has grown a thousandfold. With snapshots, defaults may also increase.
     defaults = frozen_tolerances(definition, samples, state.defaults)
     tolerances = definition.tolerances_or(defaults.values)
 

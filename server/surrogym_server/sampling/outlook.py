@@ -87,7 +87,7 @@ class NearbyAnswers(OutputOutlook):
         return self.answered(self.candidates[index : index + 1])
 
     def answered(self, query: Points) -> NearbyAnswers:
-        """Return the forecast as if one more query had been answered."""
+        """Return the forecast as if the real step ``query`` had been taken too."""
         own, there = (
             _removed_share(self.definition, points, query)[:, 0] for points in (self.candidates, self.reference)
         )

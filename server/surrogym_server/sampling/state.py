@@ -89,9 +89,10 @@ class Request:
     refused: tuple[Query, ...] = ()  # queries that the original environment refused
     extra: int = 0  # if the design has ended, this many further real steps are requested
     states: Tensor | None = None  # (v, C) states that policies visited
-    snapshots: Mapping[str, Vector] = field(default_factory=dict)  # coordinates (C,) of each snapshot, by its name
-    logged: int = 0  # number of the samples that come from a log
-    audited: int = 0  # number of the samples that come from audits
+    # Coordinates (C,) of each state to which the environment can return (snapshot), by the snapshot's name.
+    snapshots: Mapping[str, Vector] = field(default_factory=dict)
+    logged: int = 0  # number of samples that come from a log of earlier steps
+    audited: int = 0  # number of samples that come from audits of policies
     unlearned: int = 0  # number of real steps that are not among the samples, because lags (past values) were not known
     open: int = 0  # number of real steps of the pending queries that may still be answered, without those set aside
     prior: DynamicsModel | None = None  # model of what is known beforehand, such as a model of a simulator

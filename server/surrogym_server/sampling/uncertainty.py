@@ -24,9 +24,9 @@ class UncertaintyResult:
 
     mean: Array  # predicted change of each moving coordinate or observation entry; in the last column the reward
     std: Array  # standard deviation without noise, in the output's unit
-    model_uncertainty: Array  # model uncertainty U_m (eq. 10)
-    input_probability: Array  # input probability P_i (eq. 11)
-    log_uncertainty_index: Array  # logarithm of the uncertainty index U (eq. 12)
+    model_uncertainty: Array  # U_m = Phi(-tolerance / std), between 0 and 0.5 (eq. 10)
+    input_probability: Array  # density P_i of the states that policies visited over the uniform density (eq. 11)
+    log_uncertainty_index: Array  # log U = log U_m + log P_i, the logarithm of the paper's uncertainty index (eq. 12)
 
 
 def query_uncertainty(
