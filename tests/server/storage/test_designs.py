@@ -268,7 +268,7 @@ def test_an_improve_request_without_budget_rights_gets_at_most_the_remaining_ste
     assert storage.designs.left(due) == 10 - 3 - 2
     storage.designs.improve(due, 4)
     assert storage.designs.left(due) == 1
-    with pytest.raises(BeyondBudget, match=r"at most 1 more real steps.* 10 real steps.*got 2.*--budget 11"):
+    with pytest.raises(BeyondBudget, match=r"at most 1 more real steps.*10 real steps.*got 2.*--budget 11"):
         storage.designs.improve(due, 2)
     assert (storage.designs.left(due), storage.surrogates.get(due).extra_queries) == (1, 4), "nothing was changed"
     storage.designs.improve(due, 1)
