@@ -109,7 +109,7 @@ class _Process:
 @dataclass(frozen=True)
 class Serving:
     """Outputs of a model, arranged so that few matrix products predict all of them at inputs x (m, width), each of the
-    m points with the ``width`` inputs of the model. A prediction (m, O) has a column for each of the O outputs."""
+    m points with the ``width`` inputs of the model. A prediction (m, O) has O columns, 0 where there is no output."""
 
     exponents: Tensor  # A (D, S), coefficients of the exponents for the S points of all processes
     weights: Tensor  # W (S, O), weights of the points in the means, multiplied by the outputs' scales
@@ -149,7 +149,7 @@ class Serving:
         return max(MIN_ROWS, BLOCK // max(1, self.exponents.shape[1]))
 
     def mean(self, x: Tensor) -> Tensor:
-        """Return the predicted means of O outputs at m points x (m, width) with the ``width`` inputs of the model, (m,
+        """Return the predicted means at m points x (m, width) with the ``width`` inputs of the model, in O columns, (m,
         O)."""
         return in_blocks(self.rows, lambda rows: (self._means(*self._covariances(rows)),), x)[0]
 

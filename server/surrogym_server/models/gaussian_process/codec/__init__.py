@@ -1,1 +1,1 @@
-"""Conversion of Gaussian process models to data and back."""
+"""Conversion of Gaussian process models to a header and named arrays, and back."""

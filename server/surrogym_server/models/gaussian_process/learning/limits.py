@@ -126,8 +126,8 @@ def within_limits(
 
 
 def _sides(output: OutputModel, side: Tensor) -> tuple[int, ...]:
-    """Return ``side`` (n,) as integers if the process is exact, otherwise (), because inducing points are not
-    samples."""
+    """Return ``side`` (n,), the sign of the limit at which each sample ended or 0, as integers if the process is exact.
+    Otherwise return (), because inducing points are not samples."""
     exact = output.posterior is not None and output.posterior.sparse is None
     return tuple(side.int().tolist()) if exact else ()
 

@@ -39,12 +39,12 @@ class Grown:
 
 @dataclass(frozen=True)
 class OutputGroup:
-    """Outputs of a model that read the same features. Predictions have a column for each of the model's O outputs;
-    columns of outputs outside the group are 0."""
+    """Outputs of a model that read the same features. Predictions have a column for each coordinate or observation
+    entry (its change), and one for the reward. Columns without an output of the group are 0."""
 
     encoder: Encoder
     serving: Serving
-    noise_std: Tensor  # (O,) standard deviation of the learned noise, in each output's unit
+    noise_std: Tensor  # (columns,) standard deviation of the learned noise of the output in each column, in its unit
     drawn: tuple[Drawn, ...]  # sampler of functions of each output; outputs that never varied have none
     end: int  # index after this group's last weight among the W weights of a sampled function
     grown: tuple[Grown, ...] = ()
@@ -65,7 +65,7 @@ class OutputGroup:
         Args:
             encoder: encoder of state and action as the features that the outputs read.
             outputs: the outputs, each with its column.
-            columns: number O of columns of a prediction.
+            columns: number of columns of a prediction.
             lead: whether outputs also read the next values of leading coordinates, see ``features.leading``.
             begin: index of the group's first weight in a sampled function.
             grown: rates of those outputs that have rates, see ``Grown``.
@@ -87,15 +87,15 @@ class OutputGroup:
     def predict(
         self, x: Tensor, columns: tuple[int, ...], kick: Tensor | None, process: Tensor | None, paths: Tensor | None
     ) -> tuple[Tensor, Tensor]:
-        """Return predicted values of O outputs at features x (m, d), (m, O), and standard deviations without noise, (m,
-        O).
+        """Return predicted values at features x (m, d), and their standard deviations without noise, each with a row
+        for each point and all columns of a prediction.
 
         Args:
             x: features.
-            columns: indices of the outputs whose standard deviations are needed; without any, the second result is (m,
+            columns: indices of the columns whose standard deviations are needed; without any, the second result is (m,
                 0).
-            kick: (m, O) numbers of standard deviations to add to the mean, or None.
-            process: (m, O) standard normal numbers, by which the learned noise moves the values, or None for no noise.
+            kick: numbers of standard deviations to add to the mean, in all columns, or None.
+            process: standard normal numbers, by which the learned noise moves the values, in all columns, or None.
             paths: (m, W) weights of a sampled function for each row, whose value replaces the mean, or None.
         """
         if columns:

@@ -395,7 +395,7 @@ class StepsOfModel(ArraySteps):
     outputs: int
     has_regions: bool  # whether the model has a learned termination or learned jumps of the reward
     points: int  # number of training points of all Gaussian processes, with the mirrored copies that a symmetry adds
-    prior: StepsOfModel | None  # the same for the prior model, whose predictions are added where ``uses`` is 1
+    prior: StepsOfModel | None  # compiled steps of the prior model, whose predictions are added where ``uses`` is 1
     # (columns,) for each coordinate or observation entry, and last the reward: 1 if the prior model's prediction is
     # added to it, otherwise 0.
     uses: Floats
