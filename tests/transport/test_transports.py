@@ -149,7 +149,7 @@ def test_with_transport_stream_only_the_stream_is_retried_and_then_fails():
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"no frame", "/v1/sessions/abc/step .*: expected a frame"),
+        (b"no frame", "/v1/sessions/abc/step .*: expected a binary frame"),
         (
             frames.encode(frames.ResetReply(1, memoryview(b""), memoryview(b""))),
             "expected a reply of the type StepReply, got ResetReply",
