@@ -111,9 +111,9 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
     # adaptive steps must have been taken.
     judgement = judge_model(fit.model, samples, tolerances, request, state)
 
-    # A ready design stays ready until a person changes budget, target or tolerances, or new samples contradict the
-    # model. A design that ended without being ready takes no further steps until its conditions change, and becomes
-    # ready if its model satisfies the stopping rule. ``request.cost`` leaves out real steps of logs and audits.
+    # A ready design stays ready until a person changes budget or target or reduces a tolerance, or new samples
+    # contradict the model. A design that ended without being ready takes no further steps until its conditions change,
+    # and becomes ready if its model satisfies the stopping rule. ``request.cost`` leaves out steps of logs and audits.
     conditions = Conditions(request.cost(len(samples)), request.budget, request.target, tolerances)
     verdict = verdict_with_history(judgement, state, request, conditions)
 

@@ -166,10 +166,10 @@ def verdict_with_history(judgement: Judgement, state: DesignState, request: Requ
     """Return the verdict on a design, given the verdict on its present model and how the design ended in an earlier
     round, if it did.
 
-    A design that was ready stays ready, unless a person has changed its budget, target or tolerances, or later steps
-    contradict the model. Without this rule, a design could lose its readiness because a fit to further steps lowers the
-    confidence index a little, although the model had predicted these steps well. A design that has ended does not
-    continue only because audits or logs have added samples.
+    A design that was ready stays ready, unless a person has changed its budget or target or reduced a tolerance, or
+    later steps contradict the model. Without this rule, a design could lose its readiness because a fit to further
+    steps lowers the confidence index a little, although the model had predicted these steps well. A design that has
+    ended does not continue only because audits or logs have added samples.
 
     Args:
         judgement: judgement of the present model.
