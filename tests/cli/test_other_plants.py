@@ -28,7 +28,7 @@ def promised(request, tmp_path, monkeypatch):
         yield promise
 
 
-def test_evaluating_in_another_environment_does_not_judge_the_promised_return(surrogym, promised):
+def test_returns_in_another_environment_are_not_compared_with_the_promised_return(surrogym, promised):
     said = surrogym(*EVALUATE, "--env", OTHER)
     assert said.code == 0, said.err
     assert "kept" not in said.out
@@ -38,7 +38,7 @@ def test_evaluating_in_another_environment_does_not_judge_the_promised_return(su
     assert json.loads(surrogym(*EVALUATE, "--env", OTHER, "--json").out)["promise_kept"] is None
 
 
-def test_evaluating_in_the_policys_own_environment_judges_the_promised_return(surrogym, promised):
+def test_returns_in_the_policys_own_environment_are_compared_with_the_promised_return(surrogym, promised):
     said = surrogym(*EVALUATE, "--env", OWN)
     assert said.code == 0, said.err
     assert ("kept" in said.out) == (promised.median < 0)

@@ -58,7 +58,7 @@ def test_an_episode_that_terminates_at_its_time_limit_is_not_marked_truncated():
     assert end_of(terminated_at - 1)[1]["TimeLimit.truncated"]
 
 
-def test_a_seed_set_on_the_vec_env_is_used_by_one_reset(remote: SurrogateVecEnv):
+def test_a_seed_set_on_the_vec_env_is_used_by_the_next_reset_only(remote: SurrogateVecEnv):
     remote.seed(3)
     first = remote.reset()
     assert not np.array_equal(remote.reset(), first)

@@ -90,7 +90,7 @@ def test_samples_for_learning_are_the_worst_predicted_steps_of_each_episode_in_t
     assert samples_of(found, 0) == []
 
 
-def test_real_steps_during_which_a_constant_changed_are_not_compared() -> None:
+def test_real_steps_in_which_a_coordinate_declared_constant_changed_are_not_compared_with_the_model() -> None:
     """A model keeps a setpoint. The step at which the plant changed it was shown as the model's error, and learned."""
     wanted = SPEC.coordinates[0].model_copy(update={"name": "wanted", "kind": "constant"})
     spec = SPEC.model_copy(update={"coordinates": (*SPEC.coordinates, wanted)})

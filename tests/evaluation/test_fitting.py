@@ -94,7 +94,7 @@ def test_a_policy_with_narrower_action_bounds_fits_the_environment() -> None:
     check_policy(LINE, RAIL)
 
 
-def test_the_error_for_a_policy_that_does_not_fit_does_not_repeat_its_exec_command() -> None:
+def test_the_error_for_a_policy_that_does_not_fit_does_not_show_the_command_of_its_environment_program() -> None:
     with pytest.raises(PolicyMisfit) as refused:
         check_policy(pendulum().model_copy(update={"environment": "exec:rm -rf /"}), LINE)
     assert "rm" not in str(refused.value)

@@ -54,7 +54,7 @@ def test_the_trace_of_an_evaluation_under_a_rate_has_the_actions_that_were_appli
         np.testing.assert_allclose(trace.coordinates[1:, -1], trace.action[:, 0])
 
 
-def test_an_environment_without_limits_reports_none_and_leaves_the_rail() -> None:
+def test_without_declared_limits_an_evaluation_reports_none_and_the_cart_leaves_the_rail() -> None:
     result = pushed_right(limited=False)
     assert result.limits is None
     assert "limits" not in result.summary()

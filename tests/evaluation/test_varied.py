@@ -104,7 +104,9 @@ def run(**options: Any) -> Evaluation:
 
 
 @pytest.mark.parametrize(("length", "limit"), [(100, 6), (6, 6), (4, 4)])
-def test_episodes_the_environment_truncates_early_do_not_judge_the_promised_return(length: int, limit: int) -> None:
+def test_episodes_that_the_environment_truncates_early_are_not_compared_with_the_promised_return(
+    length: int, limit: int
+) -> None:
     result = run(length=length)
     assert result.limit == limit
     assert is_promised(SETTINGS, result, SPEC) is (limit == SPEC.time_limit)

@@ -51,7 +51,7 @@ def moody(mood: str, version: int = 1, step_limit: float = 30.0):
     return original.make(f"exec:{shlex.join([sys.executable, '-c', code])}", step_limit=step_limit)
 
 
-def test_an_environment_program_in_shell_takes_exact_steps():
+def test_an_environment_program_written_in_shell_returns_the_exact_next_states():
     plant = original.make(f"exec:{shlex.quote(str(SHELL))}")
     step = plant.step_from(np.array([7.0]), np.array([1.0]))
     plant.close()

@@ -139,7 +139,7 @@ def test_an_environment_class_that_returns_lags_itself_is_refused():
         ({"actions": 20}, "looks 20 steps back: expected fewer than an episode's 20"),
     ],
 )
-def test_a_declared_history_that_does_not_fit_the_specification_is_refused(history, message):
+def test_lags_that_do_not_fit_the_specification_are_refused(history, message):
     with pytest.raises(ValueError, match=message):
         with_history(SPEC, **history)
 
@@ -186,7 +186,7 @@ def test_a_snapshot_keeps_the_lagged_coordinates():
     np.testing.assert_array_equal(two.next_coordinates, one.next_coordinates)
 
 
-def test_a_too_short_snapshot_with_lags_is_refused():
+def test_a_snapshot_too_short_to_contain_its_lagged_values_is_refused():
     environment = answering(Clock())
     with pytest.raises(StepFailed, match="at least 24 bytes"):
         environment.restore(b"3.0")

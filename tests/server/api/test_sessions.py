@@ -213,7 +213,7 @@ def test_with_start_visited_1_virtual_episodes_start_at_sampled_states(client: h
     assert {tuple(start) for start in starts} == {tuple(sample["coordinates"]) for sample in samples}
 
 
-def test_start_shares_that_sum_above_one_are_refused(client: httpx.Client, name: str):
+def test_start_box_and_start_visited_that_sum_above_one_are_refused(client: httpx.Client, name: str):
     pendulum.teach(client, name, budget=5)
     asked = {"start_box": 0.5, "start_visited": 0.6}
     refused = client.post(f"/v1/surrogates/{name}/sessions", json=asked)

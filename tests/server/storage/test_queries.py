@@ -75,7 +75,7 @@ def test_the_query_of_a_dead_sampler_goes_to_the_next_sampler(
     assert storage.ledger.read(name).unresolved == 1
 
 
-def test_a_query_with_an_expired_lease_counts_as_unresolved_at_once(
+def test_a_query_with_an_expired_lease_counts_as_an_unresolved_real_step_at_once(
     storage: Storage, make: Callable[..., str], until: Callable[[Callable[[], bool]], None]
 ) -> None:
     name = make(queries=1)

@@ -33,7 +33,7 @@ def test_a_sample_answers_its_query_and_gets_its_purpose(
     assert storage.ledger.read(name) == LedgerRecord(initial=1)
 
 
-def test_a_sample_without_a_query_is_manual(
+def test_a_sample_without_a_query_gets_the_purpose_manual(
     storage: Storage, make: Callable[..., str], by_hand: Callable[..., NewSample]
 ) -> None:
     name = make(queries=0)

@@ -224,7 +224,9 @@ def test_a_drift_report_with_invalid_values_is_refused_and_changes_nothing(
     assert api.policies.get(surrogate, 1).trusted is True
 
 
-def test_evaluations_in_another_environment_do_not_judge_the_promised_return(api: Api, surrogate: str, tmp_path: Path):
+def test_evaluations_in_another_environment_do_not_decide_whether_the_promised_return_held(
+    api: Api, surrogate: str, tmp_path: Path
+):
     api.policies.push(surrogate, card(), [], "zip", network_file(tmp_path))
     many: dict[str, Any] = {"returns": [-180.0] * 30, "lengths": [200] * 30}
     names = ("", "Pendulum-v1", "plants:Heavy")
@@ -248,7 +250,7 @@ def test_if_the_specification_names_no_environment_the_first_evaluation_defines_
         api.delete_surrogate(name)
 
 
-def test_evaluations_of_fewer_than_30_episodes_do_not_judge_the_promised_return(
+def test_evaluations_of_fewer_than_30_episodes_do_not_decide_whether_the_promised_return_held(
     api: Api, surrogate: str, tmp_path: Path
 ):
     """Their mean is too uncertain. `surrogym evaluate` says so, and the server has to agree."""

@@ -149,7 +149,7 @@ def test_a_session_is_found_by_the_idempotency_key_of_its_opening(storage: Stora
     assert storage.part(LiveSessions).holder("other") is None
 
 
-def test_a_removed_session_record_is_unknown(storage: Storage, surrogate: int, add) -> None:
+def test_a_session_record_is_no_longer_found_after_its_removal(storage: Storage, surrogate: int, add) -> None:
     lease = add("s", key="once")
     add("t")
     storage.part(LiveSessions).remove("s")

@@ -24,7 +24,7 @@ def test_each_environment_has_its_expected_candidate_feature_maps(pendulum_defin
 
 
 @pytest.mark.parametrize("task", [pendulum, cartpole, acrobot])
-def test_the_reflection_of_a_feature_map_equals_encoding_the_negated_state(task):
+def test_mirroring_the_input_features_equals_encoding_the_negated_state_and_action(task):
     definition = definition_from_spec(task())
     rng = torch.Generator().manual_seed(0)
     q = torch.randn(6, len(definition.coordinates), generator=rng, dtype=torch.float64)
@@ -42,7 +42,7 @@ def test_the_reflection_of_a_feature_map_equals_encoding_the_negated_state(task)
         torch.testing.assert_close(encode(definition, feature_map, -q, limits - u, -lead), x * found.signs)
 
 
-def test_uncentred_ranges_observations_and_one_hot_actions_have_no_reflection(
+def test_no_mirror_symmetry_is_tried_with_uncentred_ranges_observation_inputs_or_one_hot_actions(
     pendulum_definition, mountain_car_definition
 ):
     """A range that is not centred at 0 has none, nor a one-hot action, nor an observation."""

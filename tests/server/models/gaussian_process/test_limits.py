@@ -172,7 +172,7 @@ def test_a_prediction_beyond_the_limit_counts_as_zero_leave_one_out_error():
     assert pressure.leave_one_out().error < 0.1 * replace(pressure, at_limit=()).leave_one_out().error
 
 
-def test_points_at_limits_survive_storage_and_malformed_ones_are_refused():
+def test_a_stored_model_keeps_which_samples_ended_at_a_limit_and_malformed_lists_are_refused():
     model = gaussian_processes(RELIEVED, kettle(30, 0))
     loaded = from_bytes(RELIEVED, to_bytes(model))
     assert [o.at_limit for o in loaded.transitions] == [o.at_limit for o in model.transitions]
