@@ -222,9 +222,8 @@ async def _lifespan(
     fits: Fits | None,
 ) -> AsyncIterator[State]:
     torch.set_num_threads(settings.threads)
-    threadpool_limits(
-        settings.threads, user_api="blas"
-    )  # limits the threads of NumPy, which computes policies' actions
+    # Limits the threads of NumPy's matrix products, by which policies compute their actions.
+    threadpool_limits(settings.threads, user_api="blas")
     process = _build_process(settings, design, storage, app.state.metrics, engine, fits)
     app.state.notices = process.notices
     services = _build_services(settings, design, process)
@@ -323,7 +322,7 @@ def _name_lacking(definitions: Definitions) -> None:
 
 
 def _define(spec: dict[str, Any]) -> EnvironmentDefinition:
-    """Convert a new specification (JSON that the wire types have checked) to an environment definition."""
+    """Convert the specification of a new surrogate (JSON that is validated already) to an environment definition."""
     return definition_from_spec(EnvironmentSpec.model_validate(spec))
 
 

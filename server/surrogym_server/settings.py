@@ -208,7 +208,7 @@ def _read_tokens(environment: Mapping[str, str], file: str | Path | None) -> dic
     except OSError as error:
         raise InvalidInput(f"the token file {str(file)!r} can't be read: {error}; correct --token-file") from error
     except ValueError as error:
-        raise InvalidInput(f"the token file {str(file)!r}: {error}") from None
+        raise InvalidInput(f"the token file {str(file)!r} can't be used: {error}") from None
 
 
 def _one_sentence(error: ValidationError) -> str:

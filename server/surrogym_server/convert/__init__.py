@@ -1,4 +1,5 @@
-"""Conversion between wire models and objects of the core, in pairs of functions; one file for each kind of resource."""
+"""Conversion between the pydantic models of the API's requests and replies and the server's own objects. Each kind of
+resource has a file."""
 
 from surrogym_server.convert.definitions import default_budget, definition_from_spec, stored_definition
 

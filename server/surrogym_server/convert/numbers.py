@@ -20,7 +20,7 @@ def numbers(what: str, rows: Sequence[Any]) -> NDArray[np.float64]:
     try:
         return np.array(rows, dtype=np.float64)
     except (ValueError, TypeError) as error:
-        raise InvalidInput(f"{what}: expected rows of one length, got rows of different lengths") from error
+        raise InvalidInput(f"{what}: expected rows of equal length, got rows of different lengths") from error
 
 
 def as_tuple(value: Any) -> Any:

@@ -163,7 +163,8 @@ def policy_run(request: replies.RolloutSession) -> PolicyRun:
     given, dtype = request.policy, np.dtype(request.policy.precision)
 
     def array(name: str, rows: Any) -> NDArray[Any]:
-        with np.errstate(over="ignore"):  # too large values become infinite, refused later
+        # No warning of NumPy: a value too large for float32 becomes infinite here, and is refused later.
+        with np.errstate(over="ignore"):
             return numbers(name, rows).astype(dtype)
 
     try:

@@ -38,7 +38,7 @@ def write_twin(data: bytes, out: Path, period: float | None = None) -> WrittenFm
 
     Raises:
         NotASurrogateFile: ``data`` is not the content of such a file.
-        InvalidInput: the model can't be written in C, or the period is missing or not above 0.
+        InvalidInput: the model can't be written in C, the action has a rate, or the period is missing or not above 0.
         CannotCompile: the C compiler of this machine refused the sources.
         OSError: the FMU can't be written.
     """
@@ -51,13 +51,13 @@ def twin_of(file: SurrogateFile, period: float | None = None) -> Block:
     ``period`` is the duration of one step in seconds; None for the sampling period of the specification.
 
     Raises:
-        InvalidInput: the model can't be written in C, or the period is missing or not above 0.
+        InvalidInput: the model can't be written in C, the action has a rate, or the period is missing or not above 0.
     """
     definition = stored_definition(file.spec)
     if definition.rates:
         raise InvalidInput(
-            "expected an action without rate, which the FMU of a surrogate does not keep, got one with rate: register "
-            "the surrogate without it, and limit the change of the input outside of the FMU"
+            "expected an action without rate (largest change per step), because an FMU does not keep rates, got one "
+            "with rate: register the surrogate without rate, and limit the change of the input outside of the FMU"
         )
     model = from_bytes(definition, file.model)
     seconds = _period(file.spec.sampling_period if period is None else period)
@@ -98,7 +98,7 @@ def _source_of(model: DynamicsModel) -> StepSource:
         )
     source = able.step_source()
     if source is None:
-        raise InvalidInput("numba is not installed, but is needed to write a model in C: install the package numba")
+        raise InvalidInput("expected the package numba, which writes a model in C, got none: install numba")
     if source.numbers > MOST_NUMBERS:
         raise InvalidInput(
             f"model: expected at most {MOST_NUMBERS:,} numbers, got {source.numbers:,}: use the model family "

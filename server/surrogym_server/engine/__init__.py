@@ -1,1 +1,1 @@
-"""Engines that run sessions, and the processes in which fits run."""
+"""Engines that run sessions (virtual environments of clients), and child processes in which models are fitted."""

@@ -1,4 +1,5 @@
-"""Compile steps before the first session opens, in a child process, because numba blocks all threads of its process."""
+"""Compilation of steps in a child process, before the first session opens. While numba compiles, it blocks all threads
+of its process."""
 
 from __future__ import annotations
 
@@ -19,7 +20,7 @@ import surrogym_server.virtual.compiled.step
 import surrogym_server.virtual.words
 """
 PACKAGE = "surrogym_server"
-LONGEST = 120.0  # a session waits at most this many seconds for the compilation, then compiles its steps itself
+LONGEST = 120.0  # the first sessions wait at most this many seconds for the child process, then compile the code too
 
 
 class Compiling:

@@ -37,8 +37,8 @@ Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 SESSION_ID_BYTES = 16
-MAX_PARTICLES = 4_000_000  # a session of variant probabilistic may have this many particles in all lanes together
-# A session of variant pathwise may have this many lanes, because each lane needs memory for a sampled function.
+MAX_PARTICLES = 4_000_000  # a session of variant probabilistic may have at most this many particles in all its lanes
+# A session of variant pathwise may have at most this many lanes, because each lane stores a sampled function.
 MAX_PATHWISE_LANES = 4_096
 
 
@@ -103,7 +103,8 @@ def opened(
 
 
 def resolved(opening: Opening, definition: EnvironmentDefinition) -> VirtualSettings:
-    """Return the settings of a session; the time limit and the penalty default to those of the surrogate.
+    """Return the settings with which a session is opened. A time limit or penalty that ``opening`` does not give is
+    that of the surrogate's environment definition.
 
     Raises:
         InvalidInput: the sensor noise names an unknown coordinate, or the residual does not fit the environment.
@@ -149,8 +150,8 @@ def _starts(settings: VirtualSettings, definition: EnvironmentDefinition, states
         return None
     if states is None or not len(states):
         raise InvalidInput(
-            "start_visited: expected a surrogate with real steps, got one without (a file has none): set start_visited "
-            "to 0"
+            "start_visited: expected a surrogate with stored real steps, got one without, such as one from a file: set "
+            "start_visited to 0"
         )
     return torch.tensor(states, dtype=torch.float64, device=definition.device)
 

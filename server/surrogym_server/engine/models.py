@@ -62,7 +62,8 @@ class ModelCache:
             return self._load(surrogate, version)
         except Damaged:
             with self._lock:
-                self._latest.pop(surrogate, None)  # read again: the damaged version may be the one stored here
+                # Forget which version is the newest, because this may be the damaged one. The storage knows the newest.
+                self._latest.pop(surrogate, None)
             raise
 
     def latest(self, surrogate: int) -> int:

@@ -22,8 +22,10 @@ class Reservoir:
 
     seed: int
     visits: int = 0  # number of states that the session has visited so far, each visit counted
-    states: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (m, C) coordinates of the m states that are kept
-    priority: Array = field(default_factory=lambda: np.zeros(0))  # (m,) random priority of each state that is kept
+    states: Array = field(
+        default_factory=lambda: np.zeros((0, 0))
+    )  # (m, C) coordinates of m visited states: the sample
+    priority: Array = field(default_factory=lambda: np.zeros(0))  # (m,) random priority of each state in the sample
 
     def visit(self, states: Array) -> Reservoir:
         """Return a reservoir that also takes into account n further visits to ``states`` (n, C), in order."""

@@ -83,7 +83,7 @@ class Step:
 
 @dataclass(frozen=True, eq=False)
 class Rollout:
-    """Request for T steps with given actions; either all steps are taken or none."""
+    """Request for T steps of all lanes of a session with given actions. If a step fails, none counts as taken."""
 
     session: str
     seq: int | None
@@ -93,7 +93,8 @@ class Rollout:
 
 @dataclass(frozen=True, eq=False)
 class PolicySteps:
-    """Request for steps in which a policy chooses the actions of all lanes; either all steps are taken or none."""
+    """Request for steps of all lanes of a session with actions that a policy chooses. If a step fails, none counts as
+    taken."""
 
     session: str
     seq: int | None
@@ -114,7 +115,7 @@ class Reply:
 
 @dataclass(frozen=True, eq=False)
 class SessionInfo:
-    """Description of a session, for callers of the engine."""
+    """Description of a session: its surrogate, its settings, and the versions of its models."""
 
     id: str
     surrogate: str

@@ -35,9 +35,10 @@ def parts_of(run: PolicyRun) -> tuple[object, ...]:
 
 
 def roll(session: Session, actions: NDArray[np.float64], step: OneStep) -> tuple[Session, tuple[StepResult, ...]]:
-    """Take T steps with actions (T, N, F), or (T, N) if F = 1; either all steps are taken or none.
+    """Take T steps of a session of N lanes with actions (T, N, F), or (T, N) if F = 1. Return the new session and the
+    result of each step.
 
-    ``step`` takes one step. All actions are checked before the first step.
+    ``step`` takes one step. All actions are checked before the first step. If an error is raised, no step counts.
 
     Raises:
         InvalidInput: actions have a wrong shape, are not finite, or are out of bounds.

@@ -87,7 +87,9 @@ def _read(definition: EnvironmentDefinition, data: bytes, surrogate_id: int) -> 
             "of surrogym: open a new session"
         )
     if header["surrogate_id"] != surrogate_id:
-        raise UnknownSession(f"the surrogate of session {header['id']!r} was deleted: open a new session")
+        raise UnknownSession(
+            f"session {header['id']!r} can't be restored, because its surrogate was deleted: open a new session"
+        )
     opened_by = header["opened_by"]
     return Session(
         id=header["id"],

@@ -152,7 +152,7 @@ def step_session(
     model_of: ModelOf,
     latest: int,
 ) -> tuple[Session, StepResult]:
-    """Step the lanes of ``mask`` (None: all lanes) with actions (N, F) as the model encodes them.
+    """Step the lanes that ``mask`` (N,) selects (None: all lanes) with actions (N, F) in the form that the model takes.
 
     Each lane steps under the model version of its episode. A lane that begins a new episode in this step continues
     under the version ``latest``. ``model_of`` returns the model of a version. With ``stds``, the result has the

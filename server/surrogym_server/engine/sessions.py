@@ -58,9 +58,7 @@ class Threads:
 
     executor: Executor
     workers: int  # number of threads in the pool
-    queued: list[float] = field(
-        default_factory=list
-    )  # predicted duration in seconds of each running or waiting request
+    queued: list[float] = field(default_factory=list)  # predicted seconds of each running or waiting request
 
     @property
     def wait(self) -> float:
@@ -227,7 +225,7 @@ class LiveSessions:
             Unavailable: this process shuts down.
         """
         if self._stopping:
-            raise Unavailable("the server is stopping and took no step of this request: send it again")
+            raise Unavailable("the server is stopping and took no step of this request: send it again after a restart")
         if id not in self._live:
             raise UnknownSession(f"session {id!r} was closed during this request: open a new one")
 
@@ -330,9 +328,8 @@ def _with_measurement(
     """Update the session's moving average of the time per step with a request of ``steps`` steps that took ``seconds``.
     Return ``result`` unchanged."""
     outcome = result[1]
-    count = (
-        len(outcome) if isinstance(outcome, PolicyRollout) else steps
-    )  # a policy's rollout may stop after fewer steps
+    # A policy's rollout may stop after fewer steps than requested.
+    count = len(outcome) if isinstance(outcome, PolicyRollout) else steps
     each = seconds / count
     average = live.seconds_per_step if live.seconds_per_step < float("inf") else each
     live.seconds_per_step = (1 - FORGETTING) * average + FORGETTING * each

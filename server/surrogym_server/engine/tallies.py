@@ -88,9 +88,8 @@ class Tally:
         self._seq = 0
         self._pending: list[StepResult | PolicyRollout] = []
         self._unfolded = 0  # number of steps in ``_pending``, whose rewards are not summed yet
-        self._sums: NDArray[np.float64] | None = (
-            None  # (2, N) sums of reward and penalty in each lane's running episode
-        )
+        # (2, N) sums of reward and of penalty in the running episode of each lane; None before the first step.
+        self._sums: NDArray[np.float64] | None = None
         self._steps = 0
         self._episodes = 0
         self._recent: deque[Episode] = deque(maxlen=KEPT_EPISODES)

@@ -1,1 +1,1 @@
-"""Representation of one environment in the core: definition, terms, actions, features, samples, and rules of a step."""
+"""Types and functions for one environment: its definition, terms, actions, features, samples, and rules of a step."""

@@ -15,8 +15,8 @@ from surrogym_server.environment.distributions import scaling
 
 POINTS_A_WEIGHT = 3  # angles are unwrapped only if there are this many steps for each weight of the regression
 MAX_TURNS = 3  # the search for missing turns starts from slopes of up to this many full turns of an angle in one step
-STARTS_A_TURN = 8  # number of start slopes for each of these ``MAX_TURNS`` turns, on each side of zero
-ROUNDS = 10  # number of iterations of the search from each start slope
+STARTS_A_TURN = 8  # the search for missing turns has this many start slopes per full turn, on each side of zero
+ROUNDS = 10  # the search for missing turns makes this many iterations from each start slope
 # Full turns are added to an angle's increments only if the sum of squared residuals falls below this share of its value
 # without them.
 CLEARLY = 0.25

@@ -1,4 +1,5 @@
-"""Inequalities over terms, in groups. A group holds if all its inequalities hold."""
+"""Groups of inequalities between terms (functions of the coordinates) and numbers. A group holds if all of its
+inequalities hold."""
 
 from __future__ import annotations
 
@@ -16,7 +17,7 @@ from surrogym_shared.kinds import Relation
 
 @dataclass(frozen=True)
 class InequalityDefinition:
-    """Inequality ``term relation value``, such as x > 0.5."""
+    """Inequality between a term (a function of the coordinates) and a number, such as x > 0.5."""
 
     term: TermDefinition
     relation: Relation

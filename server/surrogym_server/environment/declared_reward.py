@@ -1,4 +1,5 @@
-"""A declared reward: a sum of weighted shapes of quantities of state and action. It is data and runs no user code."""
+"""A declared reward: a weighted sum of functions, such as the square, of quantities computed from state and action. It
+is data, and evaluating it runs no code of a user."""
 
 from __future__ import annotations
 
@@ -24,8 +25,8 @@ class QuantityDefinition:
 
 @dataclass(frozen=True)
 class RewardTermDefinition:
-    """Term of a declared reward: weight * shape(x_1, x_2, ...) of quantities x_1, x_2, ... if every inequality in
-    ``when`` holds, else 0; see ``spec.RewardTerm``."""
+    """Term of a declared reward: weight * shape(x_1, x_2, ...), if every inequality in ``when`` holds, else 0. The
+    shape is a function, such as the square, of the quantities x_1, x_2, ... in ``of``; see ``spec.RewardTerm``."""
 
     weight: float
     shape: RewardShape

@@ -37,7 +37,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class LagDefinition:
-    """Past value that a coordinate repeats; ``spec.Lag`` explains the kinds."""
+    """Kind and source of the past value that a coordinate (a lag) repeats; ``spec.Lag`` explains the kinds."""
 
     kind: LagKind
     source: int = 0  # index of the coordinate, or of the action entry, whose past value this coordinate repeats
@@ -45,7 +45,7 @@ class LagDefinition:
 
 @dataclass(frozen=True)
 class CoordinateDefinition:
-    """One coordinate, an entry of q: its name, distributions, limits and lag."""
+    """One coordinate of the state: its name, distributions and bounds, and the past value that it repeats, if any."""
 
     name: str
     kind: CoordinateKind
@@ -70,8 +70,8 @@ class CoordinateDefinition:
 
 @dataclass(frozen=True)
 class ActionDefinition:
-    """Action of an environment: either a box from ``low`` to ``high``, or discrete with ``nvec`` values of each entry.
-    If ``bins`` are given, a policy chooses each entry of the box among that many equally spaced values."""
+    """Action of an environment: either a box from ``low`` to ``high``, or discrete, with ``nvec[i]`` values of entry i.
+    If ``bins`` are given, a policy chooses entry i of the box among ``bins[i]`` equally spaced values."""
 
     kind: Literal["box", "discrete", "multi_discrete"]
     low: tuple[float, ...] = ()
@@ -146,9 +146,9 @@ class DesignDefinition:
 class RateDefinition:
     """Largest change of one entry of the action in one step; ``surrogym_shared.rates`` explains it."""
 
-    entry: int  # index of the entry in the action
-    last: int  # index of the coordinate that has the entry's value in the last step
-    change: float  # largest change in one step
+    entry: int  # index, in the action, of the entry whose change is limited
+    last: int  # index of the coordinate that repeats the value of this action entry in the last step
+    change: float  # largest change of the action entry from one step to the next
 
 
 @dataclass(frozen=True)
@@ -181,7 +181,7 @@ class EnvironmentDefinition:
     # None: leaving the range does not end an episode.
     outside_reward: float | None = None
     limits: LimitsDefinition | None = None  # declared limits within which the original environment has to stay
-    rates: tuple[RateDefinition, ...] = ()  # rates of the action's entries; empty if all may change at once
+    rates: tuple[RateDefinition, ...] = ()  # largest changes of action entries per step; empty: no limits
     device: torch.device = CPU  # device of the definition's tensors, and of states and actions that are passed to it
 
     def on(self, device: torch.device) -> EnvironmentDefinition:
@@ -189,8 +189,8 @@ class EnvironmentDefinition:
         return self if device == self.device else to_device(self, device)
 
     def tolerances_or(self, defaults: Sequence[float]) -> tuple[float, ...]:
-        """Return the tolerance of each output (O,): the declared one, or the one in ``defaults`` (O,) if there is
-        none."""
+        """Return the tolerances of the O outputs: the declared ones, and those in ``defaults`` (O,) for outputs without
+        a declared tolerance."""
         declared = dict(self.tolerances)
         return tuple(declared.get(name, value) for name, value in zip(self.outputs, defaults, strict=True))
 
@@ -200,7 +200,7 @@ class EnvironmentDefinition:
 
     @property
     def moves_observation(self) -> bool:
-        """Whether the transition outputs are increments of the observation instead of the coordinates."""
+        """Whether the model predicts changes of the observation instead of changes of the coordinates."""
         return self.learning.moves == "observation"
 
     @cached_property
@@ -347,8 +347,8 @@ class EnvironmentDefinition:
         return self._limits.falls_back(q, q_next)
 
     def room(self, q: Tensor) -> Tensor:
-        """Return the distance of states q (..., C) to the nearer end of the range of each limit, (..., L); negative
-        outside the range."""
+        """Return how far each of L limited terms is from the nearer end of its range in states q (..., C), (..., L).
+        The distance is negative outside the range."""
         return self._limits.room(q)
 
     @cached

@@ -86,9 +86,8 @@ class Feature(NamedTuple):
     entry: int
     centre: float = 0.0  # subtracted from the entry; for function "equal", the value with which the entry is compared
     scale: float = 1.0
-    weights: tuple[
-        float, ...
-    ] = ()  # (C,) weights of coordinates in an angle after the step: "turned_cos", "turned_sin"
+    # (C,) for functions "turned_cos" and "turned_sin", the weights of the coordinates in the angle.
+    weights: tuple[float, ...] = ()
     rate: float = 0.0  # for function "grown", the rate of the exponential transformation ``bend``
 
 

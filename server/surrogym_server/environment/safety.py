@@ -49,8 +49,8 @@ class Limits:
         return to_device(cls(terms, low, high, margin), device)
 
     def room(self, q: Tensor) -> Tensor:
-        """Return the distance of states q (..., C) to the nearer end of the range of each limit, (..., L); negative
-        outside the range."""
+        """Return how far each of L limited terms is from the nearer end of its range in states q (..., C), (..., L).
+        The distance is negative outside the range."""
         value = self.terms(q)
         return torch.minimum(value - self.low, self.high - value)
 

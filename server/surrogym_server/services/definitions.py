@@ -85,7 +85,7 @@ class Definitions:
                 self.for_design(summary.name)
             except NotInstalled as error:
                 sentences.append(str(error))
-            except SurrogymError:  # just deleted, or its specification is damaged, which requests for it report
+            except SurrogymError:  # left out: the surrogate was just deleted, or its specification can't be read
                 continue
         return sentences
 

@@ -41,7 +41,7 @@ class Lines(Generic[T]):
         notices: notices of changes of a surrogate. Code that makes work available must post a notice or append an
             event.
         has_work: returns whether an answer contains work; such an answer belongs to one claim and ends its wait.
-        ends: returns whether an answer without work ends the wait; its arguments are the earlier answer and this one.
+        ends: returns whether an answer without work ends the wait, given an earlier answer and the present one.
     """
 
     def __init__(

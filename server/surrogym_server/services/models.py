@@ -133,7 +133,7 @@ class ModelService:
         ``version`` is that of the model, None for the newest.
 
         Raises:
-            InvalidInput: a wrong shape, or an action out of bounds.
+            InvalidInput: an array has a wrong shape, or an action is out of bounds.
             NoModel, UnknownModel: there is no model, or none of this version.
             PluginFailed: the code of the model's family raised an error.
         """

@@ -215,7 +215,7 @@ def check_same(name: str, had: Any, got: Any) -> None:
     if had != got:
         where, old, new = difference(had, got)
         raise SpecConflict(
-            f"{name!r} exists with another specification: {where} was created as {short(old)}, got "
+            f"surrogate {name!r} exists with another specification: {where} was created as {short(old)}, got "
             f"{short(new)}; register the new one under another name, or set budget and target by surrogym change"
         )
 

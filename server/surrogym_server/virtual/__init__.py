@@ -1,4 +1,5 @@
-"""The virtual environment: N lanes step at once, from a frozen state to a new one. Noise depends on its key alone."""
+"""Virtual environments that a model simulates: N lanes (parallel environments) step at once. A step is a pure function
+of the model, the lanes' state and the actions."""
 
 from surrogym_server.virtual.environment import LaneTransition, VirtualSettings, create, expected_bytes, reset
 from surrogym_server.virtual.lanes import LaneState

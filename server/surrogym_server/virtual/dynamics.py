@@ -1,4 +1,5 @@
-"""One step of the state: AUR-D moves the mean, AUR-P moves particles (section 4 of the paper)."""
+"""Prediction of one step: to the mean next state (AUR-D in the paper), along a sampled function, or by particles (AUR-P
+in the paper, section 4)."""
 
 from __future__ import annotations
 
@@ -19,9 +20,8 @@ from surrogym_shared.kinds import Weighting
 # Particles are weighted by 1 / (variance of the particle's reward). This share of the reward's variance over the
 # samples is added to each variance, so that no weight is infinite.
 WEIGHT_FLOOR = 1e-12
-LEAST_VARIANCE = (
-    1e-290  # a particle's reward variance is raised to this value if it is below, since weights divide by it
-)
+# Smaller variances of a particle's reward, such as 0, are raised to this one, because the weights divide by them.
+LEAST_VARIANCE = 1e-290
 
 
 @dataclass(frozen=True)
@@ -158,8 +158,8 @@ def penalised(reward: Tensor, penalty: float, std: Tensor) -> Tensor:
 
 
 def mean_state(definition: EnvironmentDefinition, particles: Tensor) -> Tensor:
-    """Return the mean (N, C) of particles (N, P, C). The mean of an angle is the direction of the mean of its cosines
-    and sines."""
+    """Return the mean state (N, C) of the P particles (N, P, C) of each of N lanes. The mean of an angle is the
+    direction of the mean of its cosines and sines."""
     mean = particles.mean(1)
     for index in definition.angles:
         angle = particles[..., index]

@@ -335,9 +335,8 @@ def _advanced(
     elapsed = before.elapsed + 1
     cut = torch.zeros_like(moved.terminated) if settings.time_limit is None else elapsed >= settings.time_limit
     cut = cut if untrusted is None else cut | untrusted
-    phase = (
-        (moved.terminated | cut).to(torch.int8).add_(RUNNING)
-    )  # where the episode ended: RUNNING + 1, equal to ENDED
+    # The flag is 1 where the episode ended, and ENDED is RUNNING + 1.
+    phase = (moved.terminated | cut).to(torch.int8).add_(RUNNING)
     return replace(before, elapsed=elapsed, phase=phase, q=moved.q, particles=moved.particles), cut
 
 

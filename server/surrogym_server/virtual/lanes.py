@@ -1,4 +1,4 @@
-"""LaneState: everything that the next step of N lanes depends on, as tensors."""
+"""State of N lanes (parallel environments) as tensors. With model, settings and actions it determines the next step."""
 
 from __future__ import annotations
 

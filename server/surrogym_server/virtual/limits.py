@@ -1,4 +1,4 @@
-"""Limits of virtual rewards: values far beyond all samples are errors of the model."""
+"""Limits of rewards of virtual steps. A predicted reward far beyond those of all samples is an error of the model."""
 
 from __future__ import annotations
 

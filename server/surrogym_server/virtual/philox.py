@@ -1,7 +1,7 @@
 """Philox4x32-10, a counter-based generator, on integer tensors.
 
 Reference: Salmon, Moraes, Dror, Shaw, "Parallel random numbers: as easy as 1, 2, 3", SC 2011. Words have 32 bits and
-are kept in int64. A product wraps at 64 bits, which leaves both of its halves right.
+are kept in int64. A product of two words may overflow int64, but all of its 64 bits are right.
 """
 
 from __future__ import annotations

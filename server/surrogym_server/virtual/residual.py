@@ -31,11 +31,12 @@ class Residual:
 
     centre: tuple[float, ...]  # (P,) mean of each of the P inputs, which is subtracted to standardise the input
     scale: tuple[float, ...]  # (P,) standard deviation of each of the P inputs, by which the centred input is divided
-    weights: tuple[tuple[tuple[float, ...], ...], ...]  # (K, O, 1 + P) constant and P slopes of each set and output
+    # (K, O, 1 + P) a constant and P slopes for each of O outputs, in each of K sets of functions.
+    weights: tuple[tuple[tuple[float, ...], ...], ...]
 
     @classmethod
     def from_saved(cls, saved: Mapping[str, Any]) -> Self:
-        """Build a residual from its JSON form."""
+        """Build a residual from the JSON form in which a saved session contains it."""
         weights = tuple(tuple(map(tuple, rows)) for rows in saved["weights"])
         return cls(tuple(saved["centre"]), tuple(saved["scale"]), weights)
 
@@ -44,8 +45,8 @@ class Residual:
         scales are above 0."""
         if definition.moves_observation:
             raise InvalidInput(
-                "residual: expected a surrogate that models coordinates, got one of preset 'paper', which models "
-                "observations; leave the residual out"
+                "residual: expected a surrogate whose model predicts coordinates, got one of preset 'paper', which "
+                "predicts observations: leave the residual out"
             )
         outputs = len(definition.outputs)
         size = len(definition.coordinates) + len(definition.angles) + definition.action.size
@@ -57,7 +58,7 @@ class Residual:
                 "arrays of other sizes: fit the residual to this surrogate"
             )
         if min(self.scale) <= 0:
-            raise InvalidInput(f"residual: expected each entry of scale above 0, got {min(self.scale)}")
+            raise InvalidInput(f"residual: expected each number of scale to be above 0, got {min(self.scale)}")
 
     def of(self, definition: EnvironmentDefinition, lanes: LaneState, u: Tensor) -> Tensor:
         """Return the errors of all outputs, (N, O), in the step of N lanes under actions u (N, F)."""

@@ -43,7 +43,9 @@ def check(definition: EnvironmentDefinition, noise: SensorNoise) -> None:
     moving = [definition.coordinate_names[i] for i in definition.moving]
     for name, _ in noise:
         if name not in moving:
-            raise InvalidInput(f"sensor_noise: expected coordinates among {', '.join(moving)}, got {name!r}")
+            raise InvalidInput(
+                f"sensor_noise: expected names of coordinates that change in steps ({', '.join(moving)}), got {name!r}"
+            )
 
 
 def _spread(definition: EnvironmentDefinition, noise: SensorNoise) -> Tensor:

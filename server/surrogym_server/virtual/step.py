@@ -1,4 +1,4 @@
-"""Step of N lanes, in torch or in compiled code, as the session chose when it was opened."""
+"""Step of N lanes (parallel environments), in compiled code if the settings of the session say so, else in torch."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ LOW, HALF = np.uint64(0xFFFFFFFF), np.uint64(32)
     types.int64[:, :, ::1],
 )
 def fill(seed: Ints, lane: Ints, episode: Ints, third: Ints, words: Ints) -> None:
-    """Fill ``words`` (N, counters, 4) with random 32-bit words for N lanes.
+    """Fill ``words`` (N, I, 4) with random 32-bit words, I times four for each of N lanes.
 
     The i-th four words of lane n have the counter (lane[n], episode[n], third[n], i) and the key ``seed[n]``.
     """

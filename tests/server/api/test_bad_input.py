@@ -221,7 +221,7 @@ def test_reusing_an_idempotency_key_with_another_sample_is_refused(client: httpx
         ({"coordinates": [[0, 0, 0]], "action": [[0]]}, "coordinates: expected shape (n, 2)"),
         ({"coordinates": [[0, 9]], "action": [[0]]}, "'theta_dot': expected a value in [-8, 8], got 9"),
         ({"coordinates": [[4, 0]], "action": [[0]]}, "'theta': expected a value in [-3.1416, 3.1416], got 4"),
-        ({"coordinates": [[0, 0], [0]], "action": [[0], [0]]}, "coordinates: expected rows of one length"),
+        ({"coordinates": [[0, 0], [0]], "action": [[0], [0]]}, "coordinates: expected rows of equal length"),
         (
             {"coordinates": [[0, 0]], "action": [[0], [0]]},
             "one action for each row of coordinates, got 2 actions and 1 rows of coordinates",
@@ -274,7 +274,7 @@ def test_improving_by_visited_states_of_an_unknown_checkpoint_is_refused(client:
     [
         ({"action": [[0.0]]}, "action: expected shape (2, 1), got (1, 1)"),
         ({"action": [[0.0, 0.0], [0.0, 0.0]]}, "action: expected shape (2, 1), got (2, 2)"),
-        ({"action": [[0.0], [0.0, 0.0]]}, "rows of one length"),
+        ({"action": [[0.0], [0.0, 0.0]]}, "rows of equal length"),
         ({"action": [[2.1], [0.0]]}, "expected entry 0 in [-2, 2], got 2.1 in row 0"),
         ({"action": [[float("nan")], [0.0]]}, "finite number, got nan"),
         ({"action": [[float("inf")], [0.0]]}, "finite number, got inf"),

@@ -14,5 +14,7 @@ def test_a_stored_json_document_is_read_as_its_pydantic_model():
 
 def test_the_error_for_a_damaged_document_names_document_and_field():
     broken = pendulum.spec() | {"time_limit": "long"}
-    with pytest.raises(Damaged, match=r"^a stored specification can't be read: time_limit: expected a whole number"):
+    with pytest.raises(
+        Damaged, match=r"^a stored specification in the database can't be read: time_limit: expected a whole number"
+    ):
         read_stored(EnvironmentSpec, "a stored specification", broken)

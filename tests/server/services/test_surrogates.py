@@ -78,6 +78,6 @@ def test_another_specification_under_the_same_name_is_refused_with_the_differenc
 ) -> None:
     spec = {"x": [{"low": 1}], "y": None}
     check_same("a", spec, spec)
-    with pytest.raises(SpecConflict, match=f"^'a' exists with another specification: {words}") as refused:
+    with pytest.raises(SpecConflict, match=f"^surrogate 'a' exists with another specification: {words}") as refused:
         check_same("a", spec, other)
     assert len(str(refused.value)) < 250

@@ -61,5 +61,5 @@ def test_process_noise_is_reduced_by_the_sensors_share_of_the_learned_noise(
 
 
 def test_sensor_noise_for_an_unknown_coordinate_is_refused(model: Noisy) -> None:
-    with pytest.raises(InvalidInput, match="sensor_noise: expected coordinates among"):
+    with pytest.raises(InvalidInput, match="sensor_noise: expected names of coordinates that change"):
         check(model.definition, (("height", 1.0),))

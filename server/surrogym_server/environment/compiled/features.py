@@ -1,4 +1,4 @@
-"""Features of coordinates and action in compiled code, as ``environment.features.Encoder`` computes them."""
+"""Features (inputs of models) in compiled code, with the same results as ``environment.features.Encoder``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A declared reward in compiled code."""
+"""Evaluation of a declared reward in compiled code."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Terms, and inequalities over them, in compiled code."""
+"""Evaluation of terms (functions of the coordinates) and of inequalities between terms and numbers in compiled code."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from surrogym_shared.compiled.jit import compiled
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-CONSTANT, FREQUENCIES, COEFFICIENTS, LIMITS = range(4)  # offsets of a ``TermSet``'s matrices from its first one
+# A ``TermSet`` has four matrices in the tables, at these offsets from the first.
+CONSTANT, FREQUENCIES, COEFFICIENTS, LIMITS = range(4)
 # Conditions have two matrices in the tables, at these offsets from the first. TERMS: the index of their term set, and
 # the number of groups. RULES: a row (sign, threshold, group) for each inequality.
 TERMS, RULES = range(2)

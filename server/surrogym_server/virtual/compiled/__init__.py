@@ -1,2 +1,2 @@
-"""Steps of lanes in compiled code, for models that offer ``CompiledSteps``; ``virtual.environment`` is the
-reference."""
+"""Steps of lanes (parallel environments) in compiled code, for models that offer ``CompiledSteps``. The reference
+implementation, in torch, is ``virtual.environment``."""

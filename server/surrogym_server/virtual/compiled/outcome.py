@@ -125,18 +125,20 @@ def conclude(
     Args:
         moving: (N,) mask of the lanes that move. Row k of q_next, pay, std, over and fallen belongs to the k-th of
             these.
-        q_next, pay, std, over: predicted coordinates, rewards, standard deviations and terminations of these lanes.
-        fallen: which of these lanes end because the fallback action of the limits would take over; (0,) without limits.
+        q_next, pay, std, over: predicted coordinates (K, C), rewards (K,), standard deviations (K, O) and terminations
+            (K,) of the K lanes that move.
+        fallen: (K,) lanes that end because the fallback action of the limits would take over; (0,) without limits.
         scales: (O,) standard deviation of each output over the samples.
         terminal_reward: reward that terminating steps pay in addition.
         penalty, trust, caution, time_limit: as in ``VirtualSettings``; trust is infinite and time_limit -1 for None.
         inside: lower and upper ends of the sampling range, (2, C), if an episode ends when it leaves this range,
             otherwise (0, 0).
-        outside_reward: reward, for this step and for each missing one, of a lane whose episode ended because it left
-            the sampling range or the trusted range or because it is in ``fallen``.
+        outside_reward: reward of a lane whose episode ended early: outside the sampling range, where the model is too
+            uncertain, or because it is in ``fallen``. It is paid once for each step up to the time limit.
         q, elapsed, phase: coordinates, numbers of steps and phases of all N lanes; updated.
-        rewards: (2, N) array for the penalised rewards and the mean rewards.
-        ends: (5, N) array for the flags terminated, truncated, untrusted, terminated or truncated, left.
+        rewards: (2, N) array for the rewards less penalties, and the rewards without penalties.
+        ends: (5, N) array for five flags of each lane: terminated; truncated; truncated because the model is too
+            uncertain; terminated or truncated; ended early with the outside reward.
 
     Returns:
         The number of lanes whose episode ended.

@@ -1,6 +1,6 @@
-"""Step of N lanes in compiled code; ``virtual.environment.step`` is the reference.
+"""Step of N lanes (parallel environments) in compiled code. The reference implementation is ``environment.step``.
 
-Arrays here share memory with the tensors of a lane state. A step copies whatever it changes.
+The NumPy arrays share memory with the tensors of the lanes' state. A step copies each array before it changes it.
 """
 
 from __future__ import annotations
@@ -109,8 +109,8 @@ def _divided(
     """Divide the lanes (parallel environments) into those that this step moves and those that it resets.
 
     Returns:
-        A mask (N,) of the lanes to move; the same selection as a mask or EVERY; and a mask (N,) of the lanes to reset,
-        None if there are none.
+        A mask (N,) of the lanes to move; the same lanes as a mask or, if they are all, EVERY; and a mask (N,) of the
+        lanes to reset, None if there are none.
     """
     running = phase == RUNNING
     if mask is None and running.all():
