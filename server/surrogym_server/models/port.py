@@ -1,8 +1,8 @@
 """The interface of dynamics models: the rest of the server uses a model only by these classes.
 
 A family of models consists of three classes: a ``DynamicsModel``, the ``Learner`` that fits it to samples, and the
-``ModelCodec`` that converts it to named arrays and back. Their docstrings state the rules that every family obeys;
-``surrogym_server.testing`` checks these. Abilities that only some families have are separate classes in
+``ModelCodec`` that converts it to named arrays and back. Their docstrings state the laws, the rules that every family
+obeys; ``surrogym_server.testing`` checks them. Abilities that only some families have are separate classes in
 ``models.abilities``.
 
 Letters of shapes: m points, n samples, C coordinates, F action entries, M transition outputs (changes of coordinates or
@@ -46,7 +46,7 @@ class Transition:
 class DynamicsModel(ABC):
     """Model of one environment, fitted and ready to predict.
 
-    Rules:
+    Laws (rules that every model obeys):
 
     - It is immutable, and a pure function of its samples and settings: the same call gives the same numbers.
     - Except for rounding errors, the prediction at a point does not depend on the other points of the same call.
@@ -173,7 +173,7 @@ def require_sums(terminal_reward: float, samples: int) -> None:
 class ModelCodec(ABC):
     """Conversion of a family's models to data and back, without pickles and without code.
 
-    Rules:
+    Laws (rules that every codec obeys):
 
     - ``decode(definition, encode(model))`` predicts exactly the same numbers as the model, and repeats no long
       computation.
@@ -206,7 +206,7 @@ class Learner(ABC):
     A learner is a frozen dataclass. Its fields are the settings in the specification: numbers, booleans and strings. An
     invalid setting raises a ValueError that states the allowed values.
 
-    Rules:
+    Laws (rules that every learner obeys):
 
     - ``learn`` is a pure function of its arguments and the settings: any randomness in it is seeded.
     - A warm start consists of named arrays from an earlier fit of the same definition to fewer samples; it may be
