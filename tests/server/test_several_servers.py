@@ -15,7 +15,7 @@ from support import pendulum
 from support.postgresql import Postgresql
 from support.server import ServerProcess, running_server
 from surrogym_server.convert import definition_from_spec
-from surrogym_server.services import lines
+from surrogym_server.services import claim_queues
 from surrogym_server.services.definitions import Definitions
 from surrogym_server.services.notices import Notices
 from surrogym_server.services.queries import QueryService
@@ -100,7 +100,7 @@ def test_a_sampler_waiting_at_one_server_gets_a_query_added_at_another(
     postgresql: Postgresql, monkeypatch: pytest.MonkeyPatch
 ):
     """By an announcement alone: the look from time to time is put off."""
-    monkeypatch.setattr(lines, "LOOK_SECONDS", 3_600.0)
+    monkeypatch.setattr(claim_queues, "LOOK_SECONDS", 3_600.0)
     url = postgresql.new_database()
     storages = [open_storage(url) for _ in range(2)]
     spec = EnvironmentSpec.model_validate(pendulum.spec()).model_dump(mode="json")

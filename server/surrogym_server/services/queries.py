@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 from surrogym_server.errors import InvalidInput
 from surrogym_server.services.activity import Samplers
+from surrogym_server.services.claim_queues import ClaimQueues, Present
 from surrogym_server.services.definitions import Definitions, check_rollouts, check_steps
-from surrogym_server.services.lines import Lines, Present
 from surrogym_server.services.notices import Notices
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import LeasedQuery, QueryRecord
@@ -32,7 +32,7 @@ class QueryService:
         self._definitions = definitions
         self._notices = notices
         self._samplers = samplers or Samplers()
-        self._lines = Lines[Claim](notices, has_work=lambda claim: bool(claim.queries), ends=_finished_since)
+        self._queues = ClaimQueues[Claim](notices, has_work=lambda claim: bool(claim.queries), ends=_finished_since)
 
     async def claim(
         self,
@@ -65,7 +65,7 @@ class QueryService:
             return Claim(queries, standing.phase, standing.paused)
 
         self._samplers.heard(name, sampler)
-        leases = await self._lines.claim(name, None, claim, wait_seconds, present)
+        leases = await self._queues.claim(name, None, claim, wait_seconds, present)
         self._samplers.heard(name, sampler)
         return leases
 

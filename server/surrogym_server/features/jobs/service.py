@@ -11,7 +11,7 @@ from surrogym_server.feature import Core
 from surrogym_server.features.jobs.records import JobProgress, JobRecord, JobResult, LeasedJob, NewJob
 from surrogym_server.features.jobs.store import Jobs
 from surrogym_server.features.jobs.workers import Offer, Workers
-from surrogym_server.services.lines import Lines, Present
+from surrogym_server.services.claim_queues import ClaimQueues, Present
 from surrogym_server.services.metrics import ProcessMetrics
 from surrogym_server.services.notices import Notices
 from surrogym_server.storage.port import Storage
@@ -34,7 +34,7 @@ class JobService:
         self._notices = notices
         self._metrics = metrics
         self._workers = Workers()
-        self._lines = Lines[_Claim](notices, has_work=lambda claim: claim.job is not None)
+        self._queues = ClaimQueues[_Claim](notices, has_work=lambda claim: claim.job is not None)
 
     @classmethod
     def start(cls, core: Core) -> Self:
@@ -102,7 +102,7 @@ class JobService:
 
         if self._workers.heard(name, worker, offer):
             self._notices.post(name)  # so that the dashboard shows a new worker at once
-        claimed = await self._lines.claim(name, offer, claim, wait_seconds, present)
+        claimed = await self._queues.claim(name, offer, claim, wait_seconds, present)
         self._workers.heard(name, worker)
         if claimed.job is not None:
             self._notices.post(name)

@@ -18,7 +18,7 @@ LOOK_SECONDS = 2.0  # a waiting request checks this often (in seconds) whether i
 Present = Callable[[], Awaitable[None]]  # function that raises an error if the client has closed its connection
 
 
-class _Line(Generic[T]):
+class _Queue(Generic[T]):
     """Claims (requests for work) that wait for the same kind of work.
 
     ``answer`` is the last answer that contained no work, and ``version`` the number of the last notice before that
@@ -34,7 +34,7 @@ class _Line(Generic[T]):
         self.version: int | None = None
 
 
-class Lines(Generic[T]):
+class ClaimQueues(Generic[T]):
     """Claims (requests for work) that wait for work, in one queue for each kind of work.
 
     Args:
@@ -50,7 +50,7 @@ class Lines(Generic[T]):
         self._notices = notices
         self._has_work = has_work
         self._ends = ends
-        self._lines: dict[Hashable, _Line[T]] = {}
+        self._queues: dict[Hashable, _Queue[T]] = {}
 
     async def claim(
         self, surrogate: str, kind: Hashable, ask: Callable[[], T], seconds: float, present: Present | None = None
@@ -66,49 +66,49 @@ class Lines(Generic[T]):
             present: raises if the caller has closed its connection; called before each call of ``ask``.
         """
         deadline = time.monotonic() + seconds
-        with self._place(surrogate, kind) as line:
-            before = line.answer
-            if not await _acquired(line.first, seconds):
-                return await self._answer(line, ask)
+        with self._place(surrogate, kind) as queue:
+            before = queue.answer
+            if not await _acquired(queue.first, seconds):
+                return await self._answer(queue, ask)
             try:
                 with self._notices.listen(surrogate) as listener:
                     while True:
                         if present is not None:
                             await present()
-                        answer = await self._answer(line, ask)
+                        answer = await self._answer(queue, ask)
                         before, left = before or answer, deadline - time.monotonic()
                         over = self._notices.closing or left <= 0
                         if over or self._has_work(answer) or self._ends(before, answer):
                             return answer
                         await listener.wait(min(left, LOOK_SECONDS))
             finally:
-                line.first.release()
+                queue.first.release()
 
-    async def _answer(self, line: _Line[T], ask: Callable[[], T]) -> T:
-        """Return the last answer without work that any claim in ``line`` got, if no notice has come since; otherwise
+    async def _answer(self, queue: _Queue[T], ask: Callable[[], T]) -> T:
+        """Return the last answer without work that any claim in ``queue`` got, if no notice has come since; otherwise
         ask the database by calling ``ask``."""
-        if line.answer is not None and line.version == line.heard.version:
-            return line.answer
-        version, answer = line.heard.version, await asyncio.to_thread(ask)
+        if queue.answer is not None and queue.version == queue.heard.version:
+            return queue.answer
+        version, answer = queue.heard.version, await asyncio.to_thread(ask)
         if not self._has_work(answer):
-            line.answer, line.version = answer, version
+            queue.answer, queue.version = answer, version
         return answer
 
     @contextmanager
-    def _place(self, surrogate: str, kind: Hashable) -> Iterator[_Line[T]]:
+    def _place(self, surrogate: str, kind: Hashable) -> Iterator[_Queue[T]]:
         key = (surrogate, kind)
-        if key not in self._lines:
+        if key not in self._queues:
             listening = ExitStack()
-            self._lines[key] = _Line(listening, listening.enter_context(self._notices.listen(surrogate)))
-        line = self._lines[key]
-        line.inside += 1
+            self._queues[key] = _Queue(listening, listening.enter_context(self._notices.listen(surrogate)))
+        queue = self._queues[key]
+        queue.inside += 1
         try:
-            yield line
+            yield queue
         finally:
-            line.inside -= 1
-            if not line.inside:
-                del self._lines[key]
-                line.listening.close()
+            queue.inside -= 1
+            if not queue.inside:
+                del self._queues[key]
+                queue.listening.close()
 
 
 async def _acquired(turn: asyncio.Semaphore, seconds: float) -> bool:

@@ -7,7 +7,7 @@ from collections.abc import Awaitable, Callable
 
 import pytest
 
-from surrogym_server.services.lines import FIRST, Lines
+from surrogym_server.services.claim_queues import FIRST, ClaimQueues
 from surrogym_server.services.notices import Notices
 
 PATIENCE, MANY = 60.0, 300
@@ -28,10 +28,10 @@ class Shop:
 def run(test: Callable[[Shop, Notices, Callable[..., Awaitable[int | str]]], Awaitable[None]]) -> None:
     async def prepared() -> None:
         shop, notices = Shop(), Notices()
-        lines = Lines[int | str](notices, lambda answer: isinstance(answer, int))
+        queues = ClaimQueues[int | str](notices, lambda answer: isinstance(answer, int))
 
         def claim(seconds: float = PATIENCE) -> Awaitable[int | str]:
-            return asyncio.create_task(lines.claim("a", None, shop.ask, seconds))
+            return asyncio.create_task(queues.claim("a", None, shop.ask, seconds))
 
         await asyncio.wait_for(test(shop, notices, claim), PATIENCE / 2)
 
@@ -83,10 +83,10 @@ def test_a_waiting_sampler_that_disconnected_is_given_no_query():
         async def present() -> None:
             raise ConnectionError
 
-        lines = Lines[int | str](notices, lambda answer: isinstance(answer, int))
+        queues = ClaimQueues[int | str](notices, lambda answer: isinstance(answer, int))
         shop.work = [1]
         with pytest.raises(ConnectionError):
-            await lines.claim("a", None, shop.ask, PATIENCE, present)
+            await queues.claim("a", None, shop.ask, PATIENCE, present)
         assert shop.work == [1]
 
     run(scenario)
