@@ -52,8 +52,8 @@ from surrogym_server.features.jobs import FEATURE as jobs
 from surrogym_server.features.policies import FEATURE as policies
 from surrogym_server.features.priors import FEATURE as priors
 from surrogym_server.features.ray.pool import CLUSTER as ray
+from surrogym_server.file_permissions import keep_private
 from surrogym_server.models.registry import MODELS
-from surrogym_server.private import keep_private
 from surrogym_server.sampling.acquisition import ACQUISITIONS
 from surrogym_server.sampling.design import initial_queries
 from surrogym_server.services.activity import Samplers

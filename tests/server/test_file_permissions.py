@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from support.server import running_server
-from surrogym_server.private import keep_private
+from surrogym_server.file_permissions import keep_private
 from surrogym_server.settings import read_settings
 
 
@@ -33,7 +33,7 @@ def test_a_new_database_and_its_side_files_are_readable_by_their_owner_only(tmp_
     finally:
         os.umask(before)
     (line,) = (line for line in server.log.splitlines() if "other users" in line)
-    assert line.startswith("WARNING surrogym_server.private: ")
+    assert line.startswith("WARNING surrogym_server.file_permissions: ")
     assert f"{tokens} may be read by other users of this machine (mode 644): chmod 600 {tokens} prevents this" in line
 
 
