@@ -31,12 +31,12 @@ from surrogym_server.api import (
     surrogates,
 )
 from surrogym_server.api.auth import Gate, fingerprint
+from surrogym_server.api.concurrency import ConcurrencyLimit, Waiting
 from surrogym_server.api.guards import BodyLimit, KnownHosts, OwnPages
 from surrogym_server.api.observe import Observed
 from surrogym_server.api.state import Services
 from surrogym_server.api.stepping.routes import StepDoor
 from surrogym_server.api.stepping.routes import router as stepping
-from surrogym_server.api.turns import Turns, Waiting
 from surrogym_server.convert import definition_from_spec, stored_definition
 from surrogym_server.convert.stored import read_stored
 from surrogym_server.engine.design_job import DesignJob, DesignResult, run_design_job
@@ -157,10 +157,10 @@ def create_app(settings: Settings, design: DesignPort = DesignPort(), fits: Fits
     app.state.gate = Gate(settings.tokens)
     app.state.max_body_bytes = settings.max_body_bytes
     app.state.parsing = asyncio.Lock()
-    app.state.turns = Turns("predictions", at_work=2, waiting=32)
+    app.state.turns = ConcurrencyLimit("predictions", at_work=2, waiting=32)
     app.state.streams = Waiting("open streams of events")
     app.state.query_claims = Waiting("waiting claims of queries")
-    app.state.log_turns = Turns("logs", at_work=1, waiting=8)
+    app.state.log_turns = ConcurrencyLimit("logs", at_work=1, waiting=8)
     if settings.tokens:
         known = ", ".join(f"{role} {fingerprint(token)}" for token, role in settings.tokens.items())
         logger.info("fingerprints of the tokens: %s", known)

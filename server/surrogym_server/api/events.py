@@ -10,10 +10,10 @@ from fastapi import APIRouter, Header, Query, Request
 from fastapi.responses import StreamingResponse
 
 from surrogym_server.api.auth import READ
+from surrogym_server.api.concurrency import Waiting
 from surrogym_server.api.door import DoorRoute
 from surrogym_server.api.problems import documented
 from surrogym_server.api.state import Use
-from surrogym_server.api.turns import Waiting
 from surrogym_server.convert import resources
 from surrogym_server.services.events import Page
 from surrogym_shared.codes import Code

@@ -8,11 +8,11 @@ from fastapi import APIRouter, Request
 
 from surrogym_server.api import examples
 from surrogym_server.api.auth import ADMIN, SAMPLE
+from surrogym_server.api.concurrency import ConcurrencyLimit
 from surrogym_server.api.door import DoorRoute, json_up_to
 from surrogym_server.api.json_body import example
 from surrogym_server.api.problems import documented
 from surrogym_server.api.state import Services, Use
-from surrogym_server.api.turns import Turns
 from surrogym_server.convert import logs
 from surrogym_server.services.samples import NOTHING
 from surrogym_shared.codes import Code
@@ -32,7 +32,7 @@ KIBIBYTES = 5 * 1024  # largest JSON body with a log, in KiB
 )
 async def draft(body: Annotated[DraftLog, example(examples.DRAFT_LOG)], request: Request) -> DraftedLog:
     """Check each row of a log, and draft a specification from the usable ones. Nothing is stored."""
-    turns: Turns = request.app.state.log_turns
+    turns: ConcurrencyLimit = request.app.state.log_turns
     return await turns.take(request, lambda: logs.drafted_report(logs.drafted_log(body)))
 
 
@@ -46,7 +46,7 @@ async def draft(body: Annotated[DraftLog, example(examples.DRAFT_LOG)], request:
 async def add(name: str, body: Annotated[AddLog, example(examples.ADD_LOG)], request: Request, use: Use) -> AddedLog:
     """Check each row of a log against the surrogate's specification, and store the usable rows as ``logged`` samples.
     With ``check_only`` nothing is stored. A repeat of a log adds only steps that are not stored yet."""
-    turns: Turns = request.app.state.log_turns
+    turns: ConcurrencyLimit = request.app.state.log_turns
     return await turns.take(request, lambda: _added(name, body, use))
 
 

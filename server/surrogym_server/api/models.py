@@ -11,11 +11,11 @@ from fastapi.responses import Response
 
 from surrogym_server.api import examples
 from surrogym_server.api.auth import ADMIN, READ
+from surrogym_server.api.concurrency import ConcurrencyLimit
 from surrogym_server.api.door import DoorRoute
 from surrogym_server.api.json_body import example
 from surrogym_server.api.problems import documented
 from surrogym_server.api.state import Use
-from surrogym_server.api.turns import Turns
 from surrogym_server.convert import resources
 from surrogym_server.convert.numbers import numbers
 from surrogym_shared.codes import Code
@@ -122,5 +122,5 @@ async def imagine(
 async def _in_turn(request: Request, work: Callable[[], T]) -> T:
     """Wait until few enough predictions run at the same time, then run ``work`` in a thread. Without this limit,
     read-only callers would delay samplers and trainers."""
-    turns: Turns = request.app.state.turns
+    turns: ConcurrencyLimit = request.app.state.turns
     return await turns.take(request, work)

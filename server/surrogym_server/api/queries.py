@@ -10,11 +10,11 @@ from fastapi.responses import Response
 
 from surrogym_server.api import examples
 from surrogym_server.api.auth import READ, SAMPLE, TRAIN
+from surrogym_server.api.concurrency import require_present
 from surrogym_server.api.door import DoorRoute, json_up_to
 from surrogym_server.api.json_body import example
 from surrogym_server.api.problems import documented
 from surrogym_server.api.state import Use
-from surrogym_server.api.turns import require_present
 from surrogym_server.convert import resources
 from surrogym_shared.codes import Code
 from surrogym_shared.wire import (

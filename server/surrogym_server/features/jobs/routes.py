@@ -8,10 +8,10 @@ from typing import Annotated
 from fastapi import APIRouter, Path, Request
 
 from surrogym_server.api.auth import READ, TRAIN
+from surrogym_server.api.concurrency import require_present
 from surrogym_server.api.door import DoorRoute
 from surrogym_server.api.json_body import example
 from surrogym_server.api.problems import documented
-from surrogym_server.api.turns import require_present
 from surrogym_server.feature import part
 from surrogym_server.features.jobs import forms
 from surrogym_server.features.jobs.service import JobService

@@ -19,7 +19,7 @@ T = TypeVar("T")
 MAX_WAITING = 2_000  # largest number of waiting requests of one kind with one token: an eighth of all connections
 
 
-class Turns:
+class ConcurrencyLimit:
     """Limit on the requests of one kind: at most ``at_work`` of them run at a time, each in a thread, and at most
     ``waiting`` more wait."""
 
