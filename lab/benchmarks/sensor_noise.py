@@ -29,7 +29,7 @@ from surrogym_server.models.guard import learn
 from surrogym_server.models.port import DynamicsModel
 from surrogym_server.sampling.design import advance, initial_queries
 from surrogym_server.sampling.rollouts import random_sequences
-from surrogym_server.sampling.serial import SensorNoise, sensor_noise
+from surrogym_server.sampling.sensor_noise import SensorNoise, sensor_noise
 from surrogym_server.sampling.state import DesignState, Request
 from surrogym_server.sampling.tolerances import DefaultTolerances, frozen_tolerances
 from surrogym_server.virtual import VirtualSettings, create, reset, step

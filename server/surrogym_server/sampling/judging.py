@@ -23,7 +23,7 @@ from surrogym_server.sampling.past import owed_to_past
 from surrogym_server.sampling.peaks import highest
 from surrogym_server.sampling.prequential import scores_of
 from surrogym_server.sampling.seeds import generator_for
-from surrogym_server.sampling.serial import noise_of_sensors, sensor_noise
+from surrogym_server.sampling.sensor_noise import noise_of_sensors, sensor_noise
 from surrogym_server.sampling.state import Conditions, DesignState, Request
 from surrogym_shared.states import Verdict
 

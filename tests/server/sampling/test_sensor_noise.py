@@ -11,7 +11,7 @@ from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.samples import Samples, preceding
 from surrogym_server.models.guard import learn
 from surrogym_server.sampling.judging import judge_model
-from surrogym_server.sampling.serial import CRITICAL, MAINLY, best_share, sensor_noise, sensor_pattern
+from surrogym_server.sampling.sensor_noise import CRITICAL, MAINLY, best_share, sensor_noise, sensor_pattern
 from surrogym_server.sampling.state import DesignState, Request
 from surrogym_server.sampling.tolerances import default_tolerances
 from surrogym_shared.spec import BoxAction, Coordinate, EnvironmentSpec, ObservationEntry, Term, Uniform
