@@ -15,11 +15,10 @@ beta      ``weights`` (n,)        (K + sigma_n^2 I)^-1 y
 ========  ======================  =========================================================
 """
 
-from surrogym_server.gp.bound import Fewer, fewer_inputs, fit_bound, fit_through_few, is_noisy, loses_nothing
 from surrogym_server.gp.fit import Fitted, fit, fit_some, noisy_explanation, refine, refine_where_hard
 from surrogym_server.gp.growth import fit_growing
 from surrogym_server.gp.hyperparameter_samples import hyperparameter_samples
-from surrogym_server.gp.joint import Joint
+from surrogym_server.gp.joint_posterior import Joint
 from surrogym_server.gp.kernel import Hyperparameters, Reflection, covariance
 from surrogym_server.gp.parameters import MOST_NOISE, NOISE_FLOOR, FitOptions
 from surrogym_server.gp.pathwise import Pathwise
@@ -29,6 +28,14 @@ from surrogym_server.gp.selection import Selection, select_inputs
 from surrogym_server.gp.serving import Output, Serving
 from surrogym_server.gp.sparse import Censored, condition_many, condition_sparse
 from surrogym_server.gp.subsets import spread
+from surrogym_server.gp.variational_bound import (
+    Fewer,
+    fewer_inputs,
+    fit_bound,
+    fit_through_few,
+    is_noisy,
+    loses_nothing,
+)
 
 __all__ = [
     "MOST_NOISE",

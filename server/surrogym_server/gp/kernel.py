@@ -8,9 +8,9 @@ sigma_f^2 (e(x, x') + p e(x, s x')), the covariance of (f(x) + p f(s x)) / sqrt(
 terms of parity p: for an odd function the x_j whose sign s changes; for an even one the constant, the other x_j and
 the squares.
 
-Other files that assume the squared exponential, and change with it: ``gp.search`` and ``gp.bound`` (gradients of the
-evidence), ``gp.pathwise`` (Fourier features), ``gp.serving`` and ``gp.compiled`` (fast predictions), and ``step.c`` of
-``models.gaussian_process.prediction.compiled``. All others call ``covariance`` and ``variance``.
+Other files that assume the squared exponential, and change with it: ``gp.search`` and ``gp.variational_bound``
+(gradients of the evidence), ``gp.pathwise`` (Fourier features), ``gp.serving`` and ``gp.compiled`` (fast predictions),
+and ``step.c`` of ``models.gaussian_process.prediction.compiled``. All others call ``covariance`` and ``variance``.
 
 Reference: Ginsbourger, Roustant, Durrande, "On degeneracy and invariances of random fields paths with applications in
 Gaussian process modelling", Journal of Statistical Planning and Inference (2016), section 3.

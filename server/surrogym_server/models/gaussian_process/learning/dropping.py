@@ -1,4 +1,4 @@
-"""Decide by evidence which inputs the process of an output ignores; see ``gp.selection`` and ``gp.bound``."""
+"""Decide by evidence which inputs an output's process ignores; see ``gp.selection`` and ``gp.variational_bound``."""
 
 from __future__ import annotations
 

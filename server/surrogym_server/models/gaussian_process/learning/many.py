@@ -91,7 +91,7 @@ class BySubsets(ManySamples):
 
     With more than ``gp.sparse.MAX_EXACT`` (2,000) points the process has inducing points. If its leave-one-out errors
     are large, hyperparameters fitted to the points with the largest errors are tried too. With fewer points the process
-    is exact, unless inducing points lose no accuracy, see ``gp.bound.loses_nothing``.
+    is exact, unless inducing points lose no accuracy, see ``gp.variational_bound.loses_nothing``.
     """
 
     def fitted(

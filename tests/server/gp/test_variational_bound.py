@@ -28,9 +28,9 @@ from surrogym_server.gp import (
     loses_nothing,
     spread,
 )
-from surrogym_server.gp.bound import Bound
 from surrogym_server.gp.search import Evidence
 from surrogym_server.gp.sparse import pivots
+from surrogym_server.gp.variational_bound import Bound
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore", DeprecationWarning)  # of torch.jit, at import
