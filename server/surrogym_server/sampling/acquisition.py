@@ -113,7 +113,7 @@ class IntegratedVariance(Acquisition):
     spread over the sampling range and the states that policies visited.
 
     The model computes the reduction: ``ProcessOutlook.reduction`` of ``models.gaussian_process.prediction.lookahead``,
-    or ``NearbyAnswers`` of ``sampling.outlook`` for models without lookahead. This is the default acquisition, which
+    or ``NearbyAnswers`` of ``sampling.lookahead`` for models without lookahead. This is the default acquisition, which
     ``surrogym_shared.presets`` chooses.
 
     Reference: D. Cohn (1993), NIPS 6.

@@ -15,7 +15,7 @@ from surrogym_server.models.abilities import OutputOutlook
 from surrogym_server.models.port import DynamicsModel
 from surrogym_server.sampling.acquisition import CandidateView, acquisition_of, value_of
 from surrogym_server.sampling.candidates import Candidates
-from surrogym_server.sampling.outlook import outlook_of
+from surrogym_server.sampling.lookahead import outlook_of
 
 # A candidate closer than this to an earlier query, in standard deviations of the sampling range, is not chosen.
 NEAR = 0.02

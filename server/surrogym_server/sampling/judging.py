@@ -20,8 +20,8 @@ from surrogym_server.sampling.endings import ending
 from surrogym_server.sampling.latin_hypercube import going_on, random_points
 from surrogym_server.sampling.noise import SLACK, established_noise, widened_by
 from surrogym_server.sampling.past import owed_to_past
-from surrogym_server.sampling.peaks import highest
 from surrogym_server.sampling.prequential import scores_of
+from surrogym_server.sampling.reward_peaks import highest
 from surrogym_server.sampling.seeds import generator_for
 from surrogym_server.sampling.sensor_noise import noise_of_sensors, sensor_noise
 from surrogym_server.sampling.state import Conditions, DesignState, Request

@@ -25,8 +25,8 @@ from surrogym_server.models.abilities import PathOutlook, PredictedSteps
 from surrogym_server.models.port import DynamicsModel
 from surrogym_server.sampling.acquisition import PathView, path_value_of
 from surrogym_server.sampling.endings import edge_in_doubt, in_doubt
+from surrogym_server.sampling.lookahead import as_if_answered, path_outlook
 from surrogym_server.sampling.occupancy import log_occupancy
-from surrogym_server.sampling.outlook import as_if_answered, path_outlook
 from surrogym_shared.nouns import Query, Vector
 
 STARTS = 6  # the path of an action sequence after a reset is predicted from this many random start states

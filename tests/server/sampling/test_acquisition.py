@@ -17,7 +17,7 @@ from surrogym_server.sampling.acquisition import ACQUISITIONS, PathView, Varianc
 from surrogym_server.sampling.batch import NEAR, candidate_view, choose, nearest
 from surrogym_server.sampling.candidates import Candidates
 from surrogym_server.sampling.confidence import stds
-from surrogym_server.sampling.outlook import outlook_of
+from surrogym_server.sampling.lookahead import outlook_of
 from surrogym_server.sampling.rollouts import Aim, path_values, predict_paths
 
 TOLERANCES = (0.01, 0.02, 0.1)

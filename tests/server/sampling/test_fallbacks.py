@@ -13,7 +13,7 @@ from surrogym_server.sampling.batch import choose
 from surrogym_server.sampling.candidates import Candidates
 from surrogym_server.sampling.confidence import confidences_of, stds
 from surrogym_server.sampling.endings import edge_in_doubt
-from surrogym_server.sampling.outlook import as_if_answered, outlook_of, path_outlook
+from surrogym_server.sampling.lookahead import as_if_answered, outlook_of, path_outlook
 from surrogym_server.sampling.rollouts import Aim, plan_round
 from surrogym_shared.nouns import Query
 

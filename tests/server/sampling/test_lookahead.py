@@ -16,7 +16,7 @@ from surrogym_server.models.gaussian_process.model import GaussianProcessModel
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 from surrogym_server.sampling.confidence import stds
 from surrogym_server.sampling.latin_hypercube import random_points
-from surrogym_server.sampling.outlook import outlook_of
+from surrogym_server.sampling.lookahead import outlook_of
 from surrogym_shared.spec import Reward
 
 NOTHING = slice(0)

@@ -16,7 +16,7 @@ from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.points import Points
 from surrogym_server.environment.samples import Samples
 from surrogym_server.sampling.judging import monte_carlo
-from surrogym_server.sampling.peaks import highest
+from surrogym_server.sampling.reward_peaks import highest
 from surrogym_shared.spec import Inequality, Term
 
 DEFINITION = definition_from_spec(plane())
