@@ -12,7 +12,7 @@ import pytest
 import typer
 
 from support.controllers import network
-from support.limited import SPEC, NamedCart
+from support.limited import DIARY, SPEC, NamedCart
 from support.programs import FALLS_BACK, KEEPS_LIMITS, program
 from surrogym.cli.commands import sample
 from surrogym_shared.wire import Query
@@ -145,6 +145,28 @@ def test_sampling_and_evaluating_with_a_named_fallback_need_its_program(
     deployed = on_server("deploy", policy, "--target", "c", "--out", str(tmp_path / "c"))
     assert deployed.code != 0
     assert "expected a fallback of terms, got the program 'brake'" in deployed.err
+
+
+def test_sampling_counts_the_steps_of_the_fallback_that_are_not_in_the_ledger(
+    on_server: Any, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    diary, moving = tmp_path / "diary", ("--env", "support.limited:Cart")
+    monkeypatch.setenv(DIARY, str(diary))
+    on_server("register", name, *moving)
+    report = json.loads(on_server("sample", name, *moving, "--max-queries", "2", "--json").out)
+    taken = sum(line != "close" for line in diary.read_text().splitlines())
+    assert report["fallback_steps"] == taken - report["steps"] > 0
+    answers = iter([True])
+    monkeypatch.setattr(typer, "confirm", lambda *_, **__: next(answers, None) or ended())
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True)
+    assert "steps of the fallback, which are not in the ledger" in on_server("sample", name, *moving, "--approve").err
+    waits = on_server("sample", name, *CART, "--max-queries", "1")
+    assert "answered" in waits.out
+    assert "fallback" not in waits.out
+
+
+def ended() -> None:
+    raise typer.Abort
 
 
 def test_the_status_command_shows_how_many_real_steps_were_beyond_each_limit(on_server: Any, cart: str) -> None:

@@ -56,8 +56,14 @@ class IsolatedEnvironment:
         self._number = 0  # number of the last request
         # Additional seconds for closing, in which the fallback controller brings the machine to rest.
         self._rest_seconds = 0.0
+        self._fallback_steps = self._earlier_steps = 0  # of the running process, and of those before it
         self._process: BaseProcess | None = None
         self._pipe: Connection | None = None
+
+    @property
+    def fallback_steps(self) -> int:
+        """Number of real steps of the limits' fallback that are part of no query, up to the last request."""
+        return self._earlier_steps + self._fallback_steps
 
     def spec(self) -> EnvironmentSpec:
         return EnvironmentSpec.model_validate(self._call("spec", (), self._step_limit))
@@ -121,7 +127,7 @@ class IsolatedEnvironment:
         if answer is None:
             self._kill()
             raise StepTimedOut(f"the environment's {method} took longer than {limit:g} s and was killed; {MORE_TIME}")
-        ok, value = answer
+        ok, value, self._fallback_steps = answer
         if isinstance(value, StepRefused):
             raise value
         if ok is None:
@@ -140,6 +146,7 @@ class IsolatedEnvironment:
         if self._pipe is not None and self._process is not None and self._process.is_alive():
             return self._pipe
         self._kill()
+        self._earlier_steps, self._fallback_steps = self.fallback_steps, 0
         context = multiprocessing.get_context("spawn")
         self._pipe, theirs = context.Pipe()
         arguments = (theirs, self._factory, self._step_limit, self._fallback)
@@ -182,14 +189,14 @@ class IsolatedEnvironment:
         return process.exitcode
 
 
-def _await_answer(pipe: Connection, number: int, limit: float) -> tuple[bool | None, Any] | None:
-    """Return the answer (ok, value) to request ``number``; None after ``limit`` seconds. Answers to earlier requests
-    are skipped."""
+def _await_answer(pipe: Connection, number: int, limit: float) -> tuple[bool | None, Any, int] | None:
+    """Return the answer (ok, value, number of steps of the fallback) to request ``number``; None after ``limit``
+    seconds. Answers to earlier requests are skipped."""
     deadline = time.monotonic() + limit
     while pipe.poll(max(0.0, deadline - time.monotonic())):
-        answered, ok, value = pipe.recv()
+        answered, ok, value, fallback_steps = pipe.recv()
         if answered == number:
-            return ok, value
+            return ok, value, fallback_steps
     return None
 
 
@@ -257,7 +264,7 @@ def _serve_one(pipe: Connection, environment: Environment, working: _Ending) -> 
     number, method, arguments = pipe.recv()
     with working:
         ok, value = _answer(environment, method, arguments)
-        pipe.send((number, ok, value))
+        pipe.send((number, ok, value, getattr(environment, "fallback_steps", 0)))
         if ok is None:
             sys.exit()  # ``_serve`` closes the environment
     return str(method)

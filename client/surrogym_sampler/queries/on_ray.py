@@ -259,6 +259,7 @@ class RaySamplers:
             steps=sum(report.steps for report in all_reports),
             seconds=max((report.seconds for report in all_reports), default=0.0),
             phase=phases[-1] if phases else None,
+            fallback_steps=sum(report.fallback_steps for report in all_reports),
         )
 
     def _heard(self, member: _Member) -> Sequence[Line]:

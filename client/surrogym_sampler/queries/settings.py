@@ -61,6 +61,7 @@ class SamplerReport:
         steps: number of real steps that were sent.
         seconds: duration of the run.
         phase: the design's last known phase; None if unknown.
+        fallback_steps: number of real steps of the limits' fallback while no query ran; they are not in the ledger.
     """
 
     answered: int
@@ -71,3 +72,4 @@ class SamplerReport:
     steps: int
     seconds: float
     phase: Phase | None
+    fallback_steps: int = 0

@@ -186,7 +186,10 @@ class Sampler:
     def summary(self) -> SamplerReport:
         """Return the report of the run so far."""
         seconds = time.monotonic() - self._started
-        return SamplerReport(**self._counts, steps=self._steps, seconds=seconds, phase=self._phase)
+        fallback_steps = getattr(self._environment, "fallback_steps", 0)
+        return SamplerReport(
+            **self._counts, steps=self._steps, seconds=seconds, phase=self._phase, fallback_steps=fallback_steps
+        )
 
     def _enter(self, phase: Phase) -> None:
         before, self._phase = self._phase, phase

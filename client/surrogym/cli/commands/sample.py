@@ -235,8 +235,9 @@ def _sample_here(
         sampler = Sampler(api, plan.surrogate, environment, plan.settings, report, ended, approve)
         for number in terminations():
             signal.signal(number, lambda *_: sampler.stop())
-        with on_interrupt(lambda: _words_of_interruption(sampler.summary())):
+        with on_interrupt(lambda: _words_of_interruption(sampler.summary())), closing(environment):
             result = sampler.run()
+        result = replace(result, fallback_steps=sampler.summary().fallback_steps)  # also those while it closed
     output.give(asdict(result), lambda: _words(plan.surrogate, result))
     if result.phase == "failed":
         raise typer.Exit(1)
@@ -383,7 +384,15 @@ def _words_of_interruption(report: SamplerReport) -> str:
     return (
         f"interrupted after {report.answered} queries answered with {report.steps} real steps; all of them are stored, "
         "unfinished queries, if any, went back into the queue, and the same command continues"
+        f"{_of_fallback(report.fallback_steps)}"
     )
+
+
+def _of_fallback(steps: int) -> str:
+    from surrogym_shared.words import counted
+
+    are = "is" if steps == 1 else "are"
+    return f"; {counted(steps, 'step')} of the fallback, which {are} not in the ledger" if steps else ""
 
 
 def _restarts(count: int) -> str:
@@ -396,6 +405,7 @@ def _words(surrogate: str, report: SamplerReport) -> str:
     others = {name: getattr(report, name) for name in ("failed", "dropped", "refused", "impossible")}
     apart = "".join(f", {count} {outcome}" for outcome, count in others.items() if count)
     said = f"{report.answered} queries answered with {report.steps} real steps{apart} in {report.seconds:.1f} s"
+    said += _of_fallback(report.fallback_steps)
     if report.phase in IN_WORDS:
         said += f"; {IN_WORDS[report.phase]}"
     if report.phase == "failed":

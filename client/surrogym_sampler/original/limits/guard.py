@@ -121,6 +121,7 @@ class Watchdog:
         self._wanted = self._closed = False
         self._fallen = ""  # why the watchdog ended the episode; empty if it did not
         self._steps = self._errors = 0  # steps of the fallback controller, and errors in a row during these steps
+        self.taken = 0  # number of the fallback's steps in all episodes that raised no error
         self._end = 0.0  # time at which the fallback controller stops, even if the machine still moves
         self._thread: threading.Thread | None = None
 
@@ -203,6 +204,7 @@ class Watchdog:
         try:
             moves = self._step(self._guard.fallback()) and not self._guard.at_rest
             self._errors = 0
+            self.taken += 1
         except RAISED:
             self._errors += 1
             self._due += self._period

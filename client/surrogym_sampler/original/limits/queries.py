@@ -84,6 +84,11 @@ class GuardedRollouts:
     def spec(self) -> EnvironmentSpec:
         return self._spec
 
+    @property
+    def fallback_steps(self) -> int:
+        """Number of real steps of the watchdog's fallback, which are part of no query."""
+        return self._watchdog.taken
+
     def begin(self, seed: int | None = None) -> Array:
         with self._watchdog:
             return self._started(self._environment.begin(seed))
