@@ -12,7 +12,9 @@ from functools import partial
 import torch
 
 from surrogym_server.engine.compiling import Compiling
-from surrogym_server.engine.core import (
+from surrogym_server.engine.models import ModelCache
+from surrogym_server.engine.port import SessionEngine
+from surrogym_server.engine.request_handlers import (
     carried_out,
     check_size,
     fingerprint_of,
@@ -20,8 +22,6 @@ from surrogym_server.engine.core import (
     steps_asked,
     visited_states,
 )
-from surrogym_server.engine.models import ModelCache
-from surrogym_server.engine.port import SessionEngine
 from surrogym_server.engine.requests import (
     Advance,
     Array,
