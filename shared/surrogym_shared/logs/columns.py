@@ -13,8 +13,8 @@ from typing import Annotated, Any
 
 from pydantic import ConfigDict, Field, ValidationError
 
-from surrogym_shared.bounded import FailFast
 from surrogym_shared.checks import LARGEST
+from surrogym_shared.fail_fast import FailFast
 from surrogym_shared.logs.errors import UnusableLog
 from surrogym_shared.logs.headings import TIMES, Heading, heading, timed
 from surrogym_shared.spec.base import MAX_DIMENSIONS

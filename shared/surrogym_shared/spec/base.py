@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import ConfigDict, Field
 
-from surrogym_shared.bounded import FailFast
+from surrogym_shared.fail_fast import FailFast
 from surrogym_shared.patterns import VISIBLE
 
 MAX_DIMENSIONS = 64

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from surrogym_shared.acting import MAX_ROLLOUT as MAX_ROLLOUT  # re-exported for users of the wire models
-from surrogym_shared.bounded import FailFast
+from surrogym_shared.fail_fast import FailFast
 from surrogym_shared.kinds import AutoresetMode as AutoresetMode
 from surrogym_shared.kinds import Variant as Variant
 from surrogym_shared.patterns import NAME, VISIBLE
