@@ -25,7 +25,7 @@ from surrogym_shared.wire import SurrogateView
 from surrogym_trainer.evaluation.reporting import as_reported, paired_start
 from surrogym_trainer.policies import pushing
 from surrogym_trainer.policies.card import read_card
-from surrogym_trainer.training.course import Course
+from surrogym_trainer.training.progress import ProgressEstimate
 from surrogym_trainer.training.search import ALGORITHMS
 from surrogym_trainer.training.words import words_of
 
@@ -169,15 +169,15 @@ class SurrogateRun:
 
     def _train(self, trainer: Child) -> None:
         threading.Thread(target=_warm_up, args=(later_imports(self._settings),), daemon=True).start()
-        course = Course()
+        estimate = ProgressEstimate()
         with progress("train", quiet=self._quiet) as update:
             while trainer.process.poll() is None:
                 self._children.check()
                 for line in read_curve(self._curve)[-1:]:
                     real = self._api.surrogate(self._settings.task).ledger.total
                     steps, total = line["steps"], line["total_steps"]
-                    left = course.words_of_time_left(steps, total, line["seconds"])
-                    update(course.share(steps, total), f"{words_of(line)}, {real} real steps{left}")
+                    left = estimate.words_of_time_left(steps, total, line["seconds"])
+                    update(estimate.share(steps, total), f"{words_of(line)}, {real} real steps{left}")
                 with suppress(subprocess.TimeoutExpired):
                     trainer.process.wait(LOOK_SECONDS)
             trainer.check()

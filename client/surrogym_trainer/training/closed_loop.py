@@ -13,7 +13,7 @@ from surrogym_client.transport.api import Api
 from surrogym_shared.port import SurrogatePort
 from surrogym_shared.wire import SurrogateView
 from surrogym_trainer.training.candidates import Candidates
-from surrogym_trainer.training.course import after
+from surrogym_trainer.training.progress import after
 from surrogym_trainer.training.search import is_prolonged, planned_steps, search_for, with_algorithm
 from surrogym_trainer.training.settings import (
     SUGGESTED_STEPS,

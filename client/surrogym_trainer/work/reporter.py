@@ -16,7 +16,7 @@ from surrogym_client.transport.connection import Retries
 from surrogym_shared import wire
 from surrogym_trainer.policies.pushing import thinned
 from surrogym_trainer.training import TrainProgress
-from surrogym_trainer.training.course import Course
+from surrogym_trainer.training.progress import ProgressEstimate
 
 AWAY = (ServerUnreachable, Unavailable)
 ONE_ATTEMPT = Retries(seconds=0)  # no retries, because the next report repeats a failed one
@@ -32,12 +32,12 @@ class Stand:
     now: TrainProgress | None = None
     curve: tuple[wire.CurvePoint, ...] = ()
     # share of the training that is done, which never falls; all records of a job's progress have the same object
-    course: Course = field(default_factory=Course, compare=False)
+    estimate: ProgressEstimate = field(default_factory=ProgressEstimate, compare=False)
 
     def trained(self, now: TrainProgress, seconds: float) -> Stand:
         """Return the progress after a report of the training, ``seconds`` after the job's start."""
         point = wire.CurvePoint(steps=now.steps, imagined_return=finite(now.imagined_return), seconds=seconds)
-        share = self.course.share(now.steps, now.total_steps)
+        share = self.estimate.share(now.steps, now.total_steps)
         return replace(self, stage="training", share=share, now=now, curve=(*self.curve, point))
 
     def as_sent(self) -> wire.JobState:

@@ -237,16 +237,16 @@ def _recording(path: Path | None, curve: list[CurvePoint], update: Update) -> It
     """Context that records a training's progress. Yields a function that shows the present progress, adds it as a point
     to ``curve``, and appends it as a line to the file ``path``, which other processes can watch."""
     from surrogym_shared.wire import CurvePoint
-    from surrogym_trainer.training.course import Course
+    from surrogym_trainer.training.progress import ProgressEstimate
     from surrogym_trainer.training.words import words_of
 
-    started, course = time.monotonic(), Course()
+    started, estimate = time.monotonic(), ProgressEstimate()
     with path.open("a", encoding="utf-8") if path is not None else nullcontext() as file:
 
         def record(now: TrainProgress) -> None:
             seconds = round(time.monotonic() - started, 3)
-            left = course.words_of_time_left(now.steps, now.total_steps, seconds)
-            update(course.share(now.steps, now.total_steps), f"{words_of(asdict(now))}{left}")
+            left = estimate.words_of_time_left(now.steps, now.total_steps, seconds)
+            update(estimate.share(now.steps, now.total_steps), f"{words_of(asdict(now))}{left}")
             curve.append(CurvePoint(steps=now.steps, imagined_return=now.imagined_return, seconds=seconds))
             if file is not None:
                 file.write(json.dumps({**asdict(now), "seconds": seconds}) + "\n")

@@ -7,7 +7,7 @@ from dataclasses import replace
 from surrogym_trainer.training.settings import TrainProgress
 
 
-class Course:
+class ProgressEstimate:
     """The share of a training that is done.
 
     A training may be extended: by a round, after an audit, or because it still gains. The part that is not done then

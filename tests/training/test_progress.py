@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from surrogym_trainer.training import TrainProgress
-from surrogym_trainer.training.course import Course, after
+from surrogym_trainer.training.progress import ProgressEstimate, after
 
 REPORTED = [  # of a demo, whose bar went back twice
     *((steps, 442_368) for steps in (8_192, 217_088, 434_176)),
@@ -15,16 +15,16 @@ REPORTED = [  # of a demo, whose bar went back twice
 
 
 def test_the_training_progress_never_falls_when_the_training_is_extended():
-    course = Course()
-    shares = [course.share(*reported) for reported in REPORTED]
+    estimate = ProgressEstimate()
+    shares = [estimate.share(*reported) for reported in REPORTED]
     assert shares == sorted(shares)
     assert shares[0] == pytest.approx(8_192 / 442_368)
     assert shares[-1] == pytest.approx(1.0)
 
 
 def test_the_progress_of_a_training_without_extension_is_its_share_of_steps_done():
-    course = Course()
-    assert [course.share(steps, 400) for steps in (100, 200, 400)] == [0.25, 0.5, 1.0]
+    estimate = ProgressEstimate()
+    assert [estimate.share(steps, 400) for steps in (100, 200, 400)] == [0.25, 0.5, 1.0]
 
 
 def test_the_step_count_of_a_following_training_continues_the_first():
@@ -35,14 +35,14 @@ def test_the_step_count_of_a_following_training_continues_the_first():
 
 def test_the_estimated_remaining_time_follows_the_steps_per_second():
     """The first estimate was far too long: it took the time of compiling for that of the first steps."""
-    course, compiling = Course(), 60.0
-    assert course.words_of_time_left(100, 1_000, compiling + 1.0) == "", "no pace is known yet"
-    assert course.words_of_time_left(200, 1_000, compiling + 2.0) == ", about 8 s left"
-    assert course.words_of_time_left(200, 100_000, compiling + 2.0) == ", about 17 min left"
-    assert course.words_of_time_left(1_000, 1_000, compiling + 10.0) == ""
+    estimate, compiling = ProgressEstimate(), 60.0
+    assert estimate.words_of_time_left(100, 1_000, compiling + 1.0) == "", "no pace is known yet"
+    assert estimate.words_of_time_left(200, 1_000, compiling + 2.0) == ", about 8 s left"
+    assert estimate.words_of_time_left(200, 100_000, compiling + 2.0) == ", about 17 min left"
+    assert estimate.words_of_time_left(1_000, 1_000, compiling + 10.0) == ""
 
 
 def test_no_remaining_time_is_estimated_before_the_first_step():
-    course = Course()
-    assert course.words_of_time_left(0, 400, 10.0) == course.words_of_time_left(0, 400, 20.0) == ""
-    assert course.words_of_time_left(100, 400, 30.0) == ", about 60 s left"
+    estimate = ProgressEstimate()
+    assert estimate.words_of_time_left(0, 400, 10.0) == estimate.words_of_time_left(0, 400, 20.0) == ""
+    assert estimate.words_of_time_left(100, 400, 30.0) == ", about 60 s left"
