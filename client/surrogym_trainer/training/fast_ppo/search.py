@@ -20,6 +20,7 @@ from surrogym_trainer.evaluation.imagined import observation_statistics
 from surrogym_trainer.policies.defaults import HIDDEN, LANES, LEARNING_RATE, WIDER, decaying
 from surrogym_trainer.policies.predict import Predict
 from surrogym_trainer.training.checks import Checks, Returns, checked
+from surrogym_trainer.training.derived_settings import even_batch
 from surrogym_trainer.training.fast_ppo.learner import (
     Batch,
     LearnedNetwork,
@@ -31,7 +32,6 @@ from surrogym_trainer.training.fast_ppo.learner import (
 )
 from surrogym_trainer.training.fast_ppo.rollouts import Collector
 from surrogym_trainer.training.fast_ppo.stages import Stage, learn, refine
-from surrogym_trainer.training.proportions import even_batch
 from surrogym_trainer.training.search import REFERENCE, SEARCHES, Found, PolicySearch, SearchTask
 from surrogym_trainer.training.settings import CHECKS, TrainProgress
 

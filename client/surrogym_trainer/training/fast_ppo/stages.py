@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 from surrogym_sampler.original.protocol import LONGEST_EPISODE
 from surrogym_trainer.evaluation.imagined import DECLARED
-from surrogym_trainer.training.proportions import suggested_gamma
+from surrogym_trainer.training.derived_settings import suggested_gamma
 from surrogym_trainer.training.search import SearchTask
 from surrogym_trainer.training.settings import TrainSettings
 

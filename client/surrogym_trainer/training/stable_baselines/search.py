@@ -24,7 +24,7 @@ from surrogym_trainer.policies.files import load_learner, save_policy
 from surrogym_trainer.policies.networks import Standardise
 from surrogym_trainer.policies.predict import Predict
 from surrogym_trainer.training.checks import Returns, checked
-from surrogym_trainer.training.proportions import suggested_gamma
+from surrogym_trainer.training.derived_settings import suggested_gamma
 from surrogym_trainer.training.search import Found, PolicySearch, SearchTask
 from surrogym_trainer.training.settings import TrainSettings
 from surrogym_trainer.training.stable_baselines.callback import Checking
