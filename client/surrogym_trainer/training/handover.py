@@ -38,7 +38,7 @@ from surrogym_trainer.evaluation.comparing import compared, steady, steps_of
 from surrogym_trainer.evaluation.consequences import DRAWS, changes_of
 from surrogym_trainer.evaluation.evaluator import Evaluation
 from surrogym_trainer.evaluation.imagined import WHOLE
-from surrogym_trainer.evaluation.outside import Outside, outside_of
+from surrogym_trainer.evaluation.out_of_distribution import Outside, outside_of
 from surrogym_trainer.evaluation.promise import UNNOTICED, promise_of
 from surrogym_trainer.evaluation.ranges import range_left, untestable
 from surrogym_trainer.evaluation.systematic import Inputs

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from surrogym_sampler.original.classic import pendulum
-from surrogym_trainer.evaluation.outside import LITTLE, outside_of
+from surrogym_trainer.evaluation.out_of_distribution import LITTLE, outside_of
 
 
 def steps(speeds: tuple[float, float], rows: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
