@@ -15,9 +15,9 @@ from surrogym_client.errors import ProtocolMismatch, SeqConflict, SessionLost, S
 from surrogym_client.transport import routes
 from surrogym_client.transport.connection import Connection, Retries, Timeouts
 from surrogym_client.transport.replies import check_protocol, new_key, parse
+from surrogym_client.transport.resend_buffer import ResendBuffer, Sent, digest_of
 from surrogym_client.transport.step_codecs import UNREADABLE, BinaryForm, Form, JsonForm
 from surrogym_client.transport.stream import Stream, StreamLost, StreamUnavailable
-from surrogym_client.transport.window import Sent, Window, digest_of
 from surrogym_shared import wire
 from surrogym_shared.acting import ActingPolicy, NoiseKey, PolicyRun
 from surrogym_shared.codes import Code
@@ -40,7 +40,7 @@ class _Live:
     shape: Shape
     seq: int
     stream: Stream
-    window: Window | None  # the last requests; None: the server never restores an older checkpoint of the session
+    window: ResendBuffer | None  # the last requests; None: the server never restores an older checkpoint of the session
 
 
 class HttpSurrogate:
@@ -241,7 +241,7 @@ class HttpSurrogate:
                 with suppress(SeqConflict):  # the server restored a checkpoint again; the next attempt finds the number
                     self._send_again(live, window, behind)
 
-    def _send_again(self, live: _Live, window: Window, behind: int) -> None:
+    def _send_again(self, live: _Live, window: ResendBuffer, behind: int) -> None:
         """Send the requests from number ``behind`` on again. Their answers must be the same as before, bit for bit."""
         if (missing := window.since(behind)) is None:
             raise self._given_up(
@@ -318,7 +318,7 @@ class HttpSurrogate:
     def _know(self, view: wire.SessionView) -> _Live:
         route = routes.session(view.id)
         stream = self.connection.stream_to(f"{route}/stream")
-        window = Window(view.replay) if view.replay else None
+        window = ResendBuffer(view.replay) if view.replay else None
         self._live[view.id] = _Live(route, Shape.of(view), view.seq, stream, window)
         return self._live[view.id]
 

@@ -1,4 +1,4 @@
-"""Window: the last requests of a session, which are sent again if the server restores an older checkpoint of it."""
+"""The last requests of a session, which are sent again if the server restores an older checkpoint of it."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Sent:
     digest: bytes = b""
 
 
-class Window:
+class ResendBuffer:
     """Buffer of the last answered requests of a session, in order.
 
     Args:

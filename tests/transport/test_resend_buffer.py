@@ -11,7 +11,7 @@ import pytest
 from support.scripted_server import Answer, ScriptedServer, problem, reply, scripted_server, session_view
 from surrogym_client import errors
 from surrogym_client.transport import HttpSurrogate, Retries
-from surrogym_client.transport.window import MAX_BYTES, Sent, Window
+from surrogym_client.transport.resend_buffer import MAX_BYTES, ResendBuffer, Sent
 from surrogym_shared import wire
 from surrogym_shared.codes import Code
 
@@ -115,7 +115,7 @@ def test_a_session_that_always_falls_back_to_an_earlier_step_raises_a_conflict()
 
 
 def test_requests_that_a_client_keeps_for_repetition_are_limited_in_number_and_bytes():
-    window, size = Window(3), MAX_BYTES // 2
+    window, size = ResendBuffer(3), MAX_BYTES // 2
     for seq, content in ((1, b"1"), (2, b"2"), (3, b"3"), (4, b"4")):
         window.keep(Sent(seq, "step", content, lambda *_: (0, None), 1.0))
     assert window.since(1) is None
