@@ -177,6 +177,9 @@ def _infos(step: LaneStep) -> list[dict[str, Any]]:
     if result.untrusted is not None:
         for info, untrusted in zip(infos, result.untrusted.tolist(), strict=True):
             info["untrusted"] = untrusted
+    if result.left is not None:
+        for info, left in zip(infos, result.left.tolist(), strict=True):
+            info["left"] = left
     for lane in np.flatnonzero(step.cut).tolist():
         infos[lane][LOST] = step.lost
     return infos

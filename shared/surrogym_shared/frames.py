@@ -10,6 +10,7 @@ field                                     shape        dtype
 ========================================  ===========  ==============================
 action, actions                           (N, F)       float64; actions (T, N, F)
 mask, terminated, truncated, untrusted    (N,)         bool: one byte, 0 or 1
+left                                      (N,)         bool
 seed (of each lane)                       (N,)         int64
 observation                               (N, D)       float32
 reward, reward_mean                       (N,)         float64
@@ -140,6 +141,7 @@ class Step(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_default
     final_observation: memoryview | None = None
     deviation: memoryview | None = None
     untrusted: memoryview | None = None
+    left: memoryview | None = None
 
 
 class ResetReply(Frame, frozen=True, tag="reset"):
@@ -173,6 +175,7 @@ class PolicyReply(Frame, frozen=True, tag="policy", kw_only=True):
     final_lanes: memoryview | None = None
     final_observation: memoryview | None = None
     untrusted: memoryview | None = None
+    left: memoryview | None = None
 
 
 class ProblemReply(Frame, frozen=True, tag="problem"):
@@ -356,6 +359,7 @@ def policy_reply(seq: int, result: PolicyRollout) -> PolicyReply:
         final_lanes=_flat(result.final_lanes, INT64) if has_ends else None,
         final_observation=_flat(result.final_observation, FLOAT32) if has_ends else None,
         untrusted=None if untrusted is None else _flat(untrusted, BOOL),
+        left=None if result.left is None else _flat(result.left, BOOL),
     )
 
 
@@ -379,6 +383,7 @@ def policy_rollout(reply: PolicyReply, shape: Shape) -> PolicyRollout:
         model_version=_versions(reply.model_version, each),
         reward_mean=reward.copy() if mean is None else mean,
         untrusted=None if untrusted is None else _own("untrusted", _checked("untrusted", untrusted), BOOL, each),
+        left=None if reply.left is None else _own("left", _checked("left", reply.left), BOOL, each),
     )
 
 
@@ -420,6 +425,7 @@ def step_result(step: Step, shape: Shape) -> StepResult:
         untrusted=None
         if step.untrusted is None
         else _own("untrusted", _checked("untrusted", step.untrusted), BOOL, each),
+        left=None if step.left is None else _own("left", _checked("left", step.left), BOOL, each),
     )
 
 
@@ -436,6 +442,7 @@ def _step(result: StepResult) -> Step:
         _flat(result.final_observation, FLOAT32) if has_ends else None,
         None if result.deviation is None else _flat(result.deviation, FLOAT64),
         None if result.untrusted is None else _flat(result.untrusted, BOOL),
+        None if result.left is None else _flat(result.left, BOOL),
     )
 
 

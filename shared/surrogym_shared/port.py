@@ -50,6 +50,9 @@ class StepResult:
     # (N,) whether each lane was truncated because the model is too uncertain there; None in a session without
     # ``trust``.
     untrusted: Bools | None = None
+    # (N,) whether the episode ended outside the sampling range, or where the fallback of declared limits acts; None if
+    # neither an outside reward nor limits are declared.
+    left: Bools | None = None
 
 
 @dataclass(frozen=True)
@@ -70,6 +73,7 @@ class PolicyRollout:
     reward_mean: Floats  # (T, N) reward in T steps of N lanes without the penalty for uncertainty
     # (T, N) whether a lane was truncated because the model is too uncertain there; None in a session without ``trust``.
     untrusted: Bools | None = None
+    left: Bools | None = None  # (T, N) ``left`` of each step, or None
 
     def __len__(self) -> int:
         return len(self.reward)
@@ -78,6 +82,7 @@ class PolicyRollout:
     def of(cls, steps: Sequence[StepResult], action: Floats, log_probability: Floats | None) -> Self:
         """Combine the results of one or more steps with the policy's actions (T, N, F) in these steps."""
         untrusted = [step.untrusted for step in steps if step.untrusted is not None]
+        left = [step.left for step in steps if step.left is not None]
         return cls(
             action=action,
             log_probability=log_probability,
@@ -91,6 +96,7 @@ class PolicyRollout:
             model_version=np.stack([step.model_version for step in steps]),
             reward_mean=np.stack([step.reward_mean for step in steps]),
             untrusted=np.stack(untrusted) if len(untrusted) == len(steps) else None,
+            left=np.stack(left) if len(left) == len(steps) else None,
         )
 
     def steps(self) -> list[StepResult]:
@@ -109,6 +115,7 @@ class PolicyRollout:
                 reward_mean=self.reward_mean[t],
                 deviation=None,
                 untrusted=None if self.untrusted is None else self.untrusted[t],
+                left=None if self.left is None else self.left[t],
             )
             for t in range(len(self))
         ]

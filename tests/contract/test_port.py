@@ -160,6 +160,7 @@ def test_a_large_limit_on_the_models_uncertainty_ends_no_episode(port: Surrogate
     assert ours.untrusted.dtype == np.bool_
     assert not ours.untrusted.any()
     assert theirs.untrusted is None
+    assert ours.left is theirs.left is None, "neither an outside reward nor limits are declared"
     np.testing.assert_array_equal(ours.observation, theirs.observation)
 
 

@@ -25,7 +25,7 @@ def pushed_right(*, limited: bool) -> Evaluation:
 
 
 def counted(violations: int, episodes: int) -> LimitsKept:
-    return LimitsKept(episodes, violations, 0, 40 * episodes, {"rail": 0.0}, 0.01)
+    return LimitsKept(episodes, violations, 0, 0, 40 * episodes, {"rail": 0.0}, 0.01)
 
 
 def test_a_policy_that_drives_off_the_rail_is_stopped_by_the_fallback_and_counted() -> None:
@@ -58,7 +58,7 @@ def test_without_declared_limits_an_evaluation_reports_none_and_the_cart_leaves_
     result = pushed_right(limited=False)
     assert result.limits is None
     assert "limits" not in result.summary()
-    kept = limits_kept(SPEC, [trace.coordinates for trace in result.traces], 0)
+    kept = limits_kept(SPEC, [trace.coordinates for trace in result.traces], [0, 0, 0])
     assert kept.violations == 3
     assert kept.least_room["rail"] < 0
 

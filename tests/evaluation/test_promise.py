@@ -1,10 +1,28 @@
 """The promise: an interval for the mean of 100 real starts, from episodes of several functions and starts."""
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 import pytest
 
+import surrogym
+from support.limited import SPEC, PatientCart, with_limits
 from surrogym_client.transport import HttpSurrogate
-from surrogym_trainer.evaluation.promise import EVALUATION_STARTS, FUNCTIONS, STARTS, UNNOTICED, interval, promise_of
+from surrogym_sampler.original.episodes import open_episode
+from surrogym_sampler.original.rollouts import answering, keeping_limits
+from surrogym_server.local import LocalSurrogate
+from surrogym_shared.spec import EnvironmentSpec
+from surrogym_trainer.evaluation.evaluator import EvaluationSettings, evaluate
+from surrogym_trainer.evaluation.promise import (
+    EVALUATION_STARTS,
+    FUNCTIONS,
+    STARTS,
+    UNNOTICED,
+    fallback_share,
+    interval,
+    promise_of,
+)
 
 Z = 1.6449  # of a standard normal's 95 % quantile
 
@@ -69,3 +87,54 @@ def test_a_promised_return_ignores_reward_penalties_and_is_reproducible(pendulum
     assert plain == penalised == again
     assert plain != other
     assert plain.low < plain.median < plain.high < 0
+
+
+def learned(spec: EnvironmentSpec) -> LocalSurrogate:
+    """The cart, learned by its design from resets."""
+    cart: Any = keeping_limits(answering(PatientCart(spec)))
+    design = surrogym.Design(spec, threads=1)
+    while (query := design.ask()) is not None:
+        cart.begin(query.id)
+        design.tell(query, [cart.act(np.array(action)) for action in query.actions])
+    return design.surrogate()
+
+
+PUSHES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "always to the right": lambda shown: np.ones((len(shown), 1)),
+    "towards the middle": lambda shown: np.clip(-shown[:, :1] - shown[:, 1:], -1, 1),
+    "to the right where it starts there": lambda shown: np.where(shown[:, :1] + 0.3 * shown[:, 1:] > 0, 1.0, -0.05),
+}
+
+
+def test_the_predicted_share_of_episodes_with_a_fallback_agrees_with_real_episodes():
+    model = learned(SPEC)
+    for name, policy in PUSHES.items():
+        fallback = promise_of(model, policy, 0).fallback
+        settings = EvaluationSettings(episodes=40)
+        real = evaluate(policy, lambda: open_episode("cart:Cart", SPEC, PatientCart), settings).limits
+        assert fallback is not None
+        assert real is not None
+        assert fallback.low - 0.05 <= real.fallback_episodes / 40 <= fallback.high + 0.05, name
+        assert " as often as expected" in real.expected(fallback.low, fallback.high)
+
+
+def test_without_limits_a_promise_says_nothing_about_a_fallback():
+    assert promise_of(learned(with_limits(None)), PUSHES["towards the middle"], 0).fallback is None
+
+
+def test_a_fallback_that_no_virtual_episode_shows_is_expected_in_at_most_the_share_that_could_be_missed():
+    never = fallback_share(np.zeros((STARTS, FUNCTIONS), dtype=bool))
+    assert (never.low, never.median) == (0.0, 0.0)
+    assert (1 - never.high) ** (STARTS * FUNCTIONS) == pytest.approx(0.05)
+    always = fallback_share(np.ones((STARTS, FUNCTIONS), dtype=bool))
+    assert (always.low, always.median, always.high) == (pytest.approx(1 - never.high), 1.0, 1.0)
+
+
+@pytest.mark.parametrize("share", [0.02, 0.2, 0.6])
+def test_the_interval_of_a_share_covers_90_percent_of_real_shares(share: float):
+    rng = np.random.default_rng(3)
+    inside = 0
+    for _ in range(500):
+        predicted = fallback_share(rng.random((STARTS, FUNCTIONS)) < share)
+        inside += predicted.low <= rng.binomial(EVALUATION_STARTS, share) / EVALUATION_STARTS <= predicted.high
+    assert inside / 500 >= 0.86

@@ -45,6 +45,7 @@ def step_results(draw: st.DrawFn, shape: Shape) -> StepResult:
         reward_mean=draw(floats((lanes,))),
         deviation=draw(st.none() | floats((lanes, shape.outputs))),
         untrusted=draw(st.none() | arrays.arrays(bool, lanes)),
+        left=draw(st.none() | arrays.arrays(bool, lanes)),
     )
 
 
@@ -122,7 +123,8 @@ def test_a_policy_survives_binary_encoding_bit_for_bit(policy: ActingPolicy, noi
 def test_the_actions_of_a_policy_rollout_survive_binary_encoding_bit_for_bit(data: st.DataObject, shape: Shape):
     trusted = data.draw(st.booleans())
     drawn = data.draw(st.lists(step_results(shape), min_size=1, max_size=3))
-    steps = [replace(one, deviation=None, untrusted=one.terminated if trusted else None) for one in drawn]
+    marks = [one.terminated if trusted else None for one in drawn]
+    steps = [replace(one, deviation=None, untrusted=mark, left=mark) for one, mark in zip(drawn, marks, strict=True)]
     log = data.draw(st.none() | floats((len(steps), shape.lanes)))
     result = PolicyRollout.of(steps, data.draw(floats((len(steps), shape.lanes, shape.action))), log)
     reply = frames.read_reply(frames.encode(frames.policy_reply(3, result)))
@@ -177,6 +179,7 @@ def example() -> StepResult:
         reward_mean=np.ones(2),
         deviation=np.ones((2, 2)),
         untrusted=np.array([False, True]),
+        left=np.array([True, False]),
     )
 
 

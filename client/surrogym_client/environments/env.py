@@ -27,8 +27,10 @@ class RemoteEnv(gymnasium.Env[Observation, Any]):
     ``reset(seed=s)`` starts episode 0 of seed s, and ``reset()`` starts the next episode. The server applies the time
     limit, after which an episode is ``truncated``. ``info`` has ``model_version`` and, after a step, ``reward_mean``
     (the reward before the penalty) and, if requested, ``deviation`` (O,) of the O model outputs. In a session with a
-    trust region, ``untrusted`` is whether leaving the region truncated it. If the server loses the session, the episode
-    is truncated with the reason in ``info["surrogym_session_lost"]``, and the next reset begins in a new session.
+    trust region, ``untrusted`` is whether leaving the region truncated it. With declared limits or an outside reward,
+    ``left`` is whether the episode ended at a limit or outside of the sampling range. If the server loses the
+    session, the episode is truncated with the reason in ``info["surrogym_session_lost"]``, and the next reset begins in
+    a new session.
 
     Args:
         port: the surrogate.
@@ -119,6 +121,8 @@ def step_info(step: LaneStep, lane: int) -> dict[str, Any]:
         info["deviation"] = result.deviation[lane]
     if result.untrusted is not None:
         info["untrusted"] = bool(result.untrusted[lane])
+    if result.left is not None:
+        info["left"] = bool(result.left[lane])
     if step.cut[lane]:
         info[LOST] = step.lost
     return info

@@ -180,6 +180,8 @@ def _step_infos(step: LaneStep, lanes: Bools) -> dict[str, Any]:
         infos |= _entry("deviation", step.result.deviation, lanes)
     if step.result.untrusted is not None:
         infos |= _entry("untrusted", step.result.untrusted, lanes)
+    if step.result.left is not None:
+        infos |= _entry("left", step.result.left, lanes)
     if step.lost is not None and (step.cut & lanes).any():
         infos |= _reason(step.lost, step.cut & lanes)
     return infos

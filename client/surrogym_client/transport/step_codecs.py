@@ -112,6 +112,7 @@ class _StepBody(msgspec.Struct, forbid_unknown_fields=True):
     final_observation: list[list[float]] = []
     deviation: list[list[float]] | None = None
     untrusted: list[bool] | None = None
+    left: list[bool] | None = None
 
 
 class _RolloutBody(msgspec.Struct, forbid_unknown_fields=True):
@@ -252,4 +253,5 @@ def _step_result(body: _StepBody, shape: Shape) -> StepResult:
         reward_mean=np.array(body.reward_mean, dtype=np.float64),
         deviation=None if body.deviation is None else np.array(body.deviation, dtype=np.float64),
         untrusted=None if body.untrusted is None else np.array(body.untrusted, dtype=bool),
+        left=None if body.left is None else np.array(body.left, dtype=bool),
     )

@@ -399,7 +399,7 @@ def _limit(tallies: Sequence[_Tally]) -> int | None:
 def _account(tallies: Sequence[_Tally]) -> Evaluation:
     spec = tallies[0].episode.spec
     criterion, paths = spec.success, [np.stack(tally.path) for tally in tallies]
-    fallbacks = sum(tally.fallbacks for tally in tallies)
+    fallbacks = [tally.fallbacks for tally in tallies]
     return Evaluation(
         returns=np.array([t.total for t in tallies]),
         lengths=np.array([t.length for t in tallies], dtype=np.int64),

@@ -36,6 +36,9 @@ class Imagined:
     returns: NDArray[np.float64]  # (episodes,) undiscounted returns, less any penalty
     penalty_share: float  # sum of the penalties as a share of the sum of absolute rewards
     episode_penalty: float | None  # mean penalty of an episode; None if the session has no penalty
+    # (episodes,) whether each episode ended outside the sampling range, or where the fallback of declared limits acts;
+    # None if neither an outside reward nor limits are declared
+    left: NDArray[np.bool_] | None = None
 
 
 def imagined_returns(
@@ -87,7 +90,7 @@ def imagine(
         lanes.close()
     penalised = lanes.penalised
     share = float(np.abs(sums.penalties).sum()) / sums.size if penalised and sums.size else 0.0
-    return Imagined(sums.returns, share, float(sums.penalties.mean()) if penalised else None)
+    return Imagined(sums.returns, share, float(sums.penalties.mean()) if penalised else None, sums.left)
 
 
 class _Sums:
@@ -96,6 +99,7 @@ class _Sums:
     def __init__(self, episodes: int) -> None:
         self.returns, self.penalties = np.zeros(episodes), np.zeros(episodes)
         self.running = np.ones(episodes, dtype=bool)
+        self.left: NDArray[np.bool_] | None = None
         self.size = 0.0
         self.steps = 0
 
@@ -105,22 +109,27 @@ class _Sums:
         self.returns = _added(self.returns, np.where(running, taken.reward, 0.0))
         self.penalties = _added(self.penalties, np.where(running, taken.mean - taken.reward, 0.0))
         self.size += float(np.abs(taken.mean[running]).sum())
+        if taken.left is not None:
+            left = (taken.left & running).any(0)
+            self.left = left if self.left is None else self.left | left
         self.running = self.running & ~ended[-1]
         self.steps += len(ended)
 
 
 class _Rewards(NamedTuple):
     """The results of T steps in N lanes, (T, N) each: rewards less the penalty, rewards without the penalty, and
-    whether the step ended its episode."""
+    whether the step ended its episode; and ``left`` of the result, or None."""
 
     reward: NDArray[np.floating[Any]]
     mean: NDArray[np.floating[Any]]
     ended: NDArray[np.bool_]
+    left: NDArray[np.bool_] | None
 
     @classmethod
     def of(cls, result: StepResult | PolicyRollout) -> Self:
         ended = result.terminated | result.truncated
-        return cls(np.atleast_2d(result.reward), np.atleast_2d(result.reward_mean), np.atleast_2d(ended))
+        left = None if result.left is None else np.atleast_2d(result.left)
+        return cls(np.atleast_2d(result.reward), np.atleast_2d(result.reward_mean), np.atleast_2d(ended), left)
 
 
 def _stepped(

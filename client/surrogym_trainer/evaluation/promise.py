@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from surrogym_shared.port import SurrogatePort
 from surrogym_shared.wire import OF_PARTICLES
 from surrogym_trainer.evaluation.imagined import imagine
-from surrogym_trainer.policies.evidence import Promise
+from surrogym_trainer.policies.evidence import FallbackShare, Promise
 from surrogym_trainer.policies.predict import Predict
 
 FUNCTIONS = 32  # a promise is computed along this number of functions drawn from the model's posterior
@@ -49,9 +49,29 @@ def promise_of(
     left_out = {"variant", "penalty", "caution", *OF_PARTICLES}
     options = {name: value for name, value in (session or {}).items() if name not in left_out}
     options |= {"variant": "pathwise", "functions": FUNCTIONS, "penalty": 0.0}
-    returns = imagine(port, predict, FUNCTIONS * STARTS, seed, **options).returns
+    imagined = imagine(port, predict, FUNCTIONS * STARTS, seed, **options)
     # lane i of the session follows function i modulo FUNCTIONS, so each column has the returns along one function
-    return interval(returns.reshape(STARTS, FUNCTIONS), floor)
+    promise = interval(imagined.returns.reshape(STARTS, FUNCTIONS), floor)
+    spec = port.spec()
+    if imagined.left is None or spec.limits is None or spec.outside_reward is not None:
+        return promise
+    return promise.model_copy(update={"fallback": fallback_share(imagined.left.reshape(STARTS, FUNCTIONS))})
+
+
+def fallback_share(fallen: NDArray[np.bool_]) -> FallbackShare:
+    """Predict the share of 100 real episodes in which the fallback of declared limits will act.
+
+    The share is predicted as ``interval`` predicts a return, from the share along each function.
+    If no virtual episode has a fallback, or all have one, the interval ends at the exact one-sided 95 % bound.
+
+    Args:
+        fallen: whether the fallback acts in each virtual episode, (starts, functions).
+    """
+    share = interval(fallen.astype(np.float64))
+    bound = 1 - (1 - HIGH) ** (1 / fallen.size)  # largest share that shows in none of the episodes with 5 % chance
+    high = max(share.high, bound) if not fallen.any() else share.high
+    low = min(share.low, 1 - bound) if fallen.all() else share.low
+    return FallbackShare(median=share.median, low=low, high=high)
 
 
 def interval(returns: Array, floor: float | None = None) -> Promise:

@@ -8,6 +8,26 @@ from pydantic import BaseModel, ConfigDict
 from surrogym_shared.kinds import Side
 
 
+class FallbackShare(BaseModel):
+    """The predicted share of 100 real episodes in which the fallback of declared limits acts.
+
+    Attributes:
+        median: median of the prediction.
+        low: its 5 % quantile.
+        high: its 95 % quantile.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    median: float
+    low: float
+    high: float
+
+    def words(self) -> str:
+        """Return the interval in words."""
+        return f"the fallback is expected in {100 * self.low:.2g} to {100 * self.high:.2g} % of the episodes"
+
+
 class Promise(BaseModel):
     """The interval in which the surrogate expects the mean return over 100 real starts.
 
@@ -19,6 +39,7 @@ class Promise(BaseModel):
         high: its 95 % quantile.
         functions: number of drawn functions.
         episodes: number of virtual episodes, over all functions.
+        fallback: predicted share of episodes in which the fallback acts; None if the specification has no limits.
     """
 
     model_config = ConfigDict(frozen=True, extra="ignore")
@@ -28,6 +49,7 @@ class Promise(BaseModel):
     high: float
     functions: int
     episodes: int
+    fallback: FallbackShare | None = None
 
 
 class RangeLeft(BaseModel):

@@ -62,6 +62,7 @@ def words_of_handover(handover: Handover) -> str:
         f"{'' if left is None else words_of_range(left) + chr(10)}"
         f"promise{', after learning the audit' if handover.audit else ''}: mean return {promise.median:.4g}, "
         f"between {promise.low:.4g} and {promise.high:.4g} with 90 % chance; "
+        f"{'' if promise.fallback is None else promise.fallback.words() + '; '}"
         f"{trusted}: {handover.reason}"
     )
 

@@ -154,7 +154,8 @@ def _steps(arrays: Arrays) -> tuple[StepResult, ...]:
     ends = np.cumsum(arrays.pop("final_counts"))[:-1]
     ragged = {name: np.split(arrays.pop(name), ends) for name in RAGGED}
     count = len(arrays["reward"])
-    columns: dict[str, Any] = {"deviation": [None] * count, "untrusted": [None] * count, **arrays, **ragged}
+    none = [None] * count
+    columns: dict[str, Any] = {"deviation": none, "untrusted": none, "left": none, **arrays, **ragged}
     return tuple(StepResult(**{name: column[t] for name, column in columns.items()}) for t in range(count))
 
 

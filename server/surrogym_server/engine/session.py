@@ -204,6 +204,7 @@ def _join(parts: Sequence[tuple[NDArray[np.intp], LaneTransition]]) -> LaneTrans
     final_order = np.argsort(final_lanes)
     stds = [t.std for t in transitions if t.std is not None]
     untrusted = [t.untrusted for t in transitions if t.untrusted is not None]
+    left = [t.left for t in transitions if t.left is not None]
     return LaneTransition(
         observation=lanewise([t.observation for t in transitions]),
         reward=lanewise([t.reward for t in transitions]),
@@ -215,6 +216,7 @@ def _join(parts: Sequence[tuple[NDArray[np.intp], LaneTransition]]) -> LaneTrans
         reward_mean=lanewise([t.reward_mean for t in transitions]),
         std=lanewise(stds) if stds else None,
         untrusted=lanewise(untrusted) if untrusted else None,
+        left=lanewise(left) if left else None,
     )
 
 
@@ -231,6 +233,7 @@ def _result(transition: LaneTransition, versions: Versions) -> StepResult:
         reward_mean=transition.reward_mean,
         deviation=transition.std,
         untrusted=transition.untrusted,
+        left=transition.left,
     )
 
 

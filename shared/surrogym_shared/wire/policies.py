@@ -29,6 +29,16 @@ MAX_TRACES = 16
 CARD_DEPTH = 8  # largest number of nested lists and objects in the settings of a policy's training
 
 
+class PolicyFallback(BaseModel):
+    """Prediction of the share of 100 real episodes in which the fallback of declared limits acts."""
+
+    model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
+
+    median: float = Field(description="median of the predicted share, from 0 to 1")
+    low: float = Field(description="5 % quantile of the predicted share")
+    high: float = Field(description="95 % quantile of the predicted share")
+
+
 class PolicyPromise(BaseModel):
     """Prediction of a policy's mean return over 100 real episodes: median, 5 % and 95 % quantile."""
 
@@ -39,6 +49,9 @@ class PolicyPromise(BaseModel):
     high: float = Field(description="95 % quantile of the predicted mean return")
     functions: Count = Field(default=0, description="number of functions sampled from the posterior for the prediction")
     episodes: Count = Field(default=0, description="number of virtual episodes that the prediction was computed from")
+    fallback: PolicyFallback | None = Field(
+        default=None, description="share of episodes in which the fallback of limits acts; null without limits"
+    )
 
 
 class PolicyRangeLeft(BaseModel):

@@ -339,6 +339,11 @@ class StepReply(Reply):
         description="(N,) whether the episode was truncated because the model is too uncertain there (see ``trust``); "
         "null in a session without ``trust``",
     )
+    left: list[bool] | None = Field(
+        default=None,
+        description="(N,) whether the episode ended outside of the sampling range, or where the fallback of declared "
+        "limits acts; null if neither ``outside_reward`` nor ``limits`` is declared",
+    )
 
 
 Numbers = Annotated[list[FiniteFloat], Field(min_length=1, max_length=MAX_UNITS)]

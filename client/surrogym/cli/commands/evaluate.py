@@ -183,6 +183,8 @@ def command(
     summary |= {"version": version, "disagreements": found and found.as_json()}
     summary |= {} if filmed is None else {"video": str(filmed)}
     more = [] if result.limits is None else [result.limits.words()]
+    if result.limits is not None and promise is not None and promise.fallback is not None and not elsewhere:
+        more.append(result.limits.expected(promise.fallback.low, promise.fallback.high))
     more += [*elsewhere, *(found.in_words(card.spec) if found else [])]
     more += [*_why_not_judged(card, settings, result), *_unseeded(reports), *_repeated(result)]
     give(summary, lambda: "\n".join([_words(reports, None if elsewhere else promise), *more]), as_json=output.as_json)

@@ -236,6 +236,10 @@ def _words(name: str, policy: PolicyDetail) -> str:
         promise, trusted = policy.promise, {True: "trusted", False: "not trusted", None: "not judged"}[policy.trusted]
         between = f"between {promise.low:.4g} and {promise.high:.4g} with 90 % chance"
         lines.append(f"promise: mean return {promise.median:.4g}, {between}; {trusted}: {policy.reason or '-'}")
+        if (fallback := promise.fallback) is not None:
+            lines.append(
+                f"fallback of the limits: expected in {fallback.low:.2%} to {fallback.high:.2%} of the episodes"
+            )
     if policy.differs:
         lines.append(f"made for another specification: it differs in {policy.differs}")
     files = [f"{one.form} {one.bytes} bytes" if one.stored else f"{one.form} missing" for one in policy.files]
