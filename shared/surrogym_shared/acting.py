@@ -15,13 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surrogym_shared.distributions import Bounded, Choices, Sampled, middle_and_reach
-from surrogym_shared.network import MAX_LAYERS, Activation, Layer, Network, forward, most_probable
+from surrogym_shared.kinds import Activation
+from surrogym_shared.network import Layer, Network, forward, most_probable
+from surrogym_shared.policy_sizes import MAX_LAYERS, MAX_PARAMETERS, MAX_ROLLOUT, MAX_UNITS
 
-MAX_UNITS = 1_024  # largest number of units in one layer of a policy network
-MAX_PARAMETERS = 262_144  # largest number of weights and biases of a policy network
-MAX_ROLLOUT = 100_000  # largest number of steps of a rollout in one request
-MAX_LANE_STEPS = 1_000_000  # largest number of steps in one request, summed over lanes
-MAX_ACTIVATIONS = 2**24  # largest product of lanes and units of the widest layer: 128 MiB of activations
 MAX_LOG_DEVIATION = 80  # largest log standard deviation whose exponential is finite in float32
 
 Array = NDArray[np.floating[Any]]

@@ -34,17 +34,20 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, Self, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeVar
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from surrogym_shared.acting import MAX_PARAMETERS, MAX_UNITS, ActingPolicy, NoiseKey, layers_of, parameters_of
 from surrogym_shared.codes import Code
-from surrogym_shared.network import MAX_LAYERS, Activation
+from surrogym_shared.kinds import Activation
+from surrogym_shared.policy_sizes import MAX_LAYERS, MAX_PARAMETERS, MAX_UNITS
 from surrogym_shared.port import PolicyRollout, ResetResult, StepResult, quick
 from surrogym_shared.wire import MAX_ROLLOUT, ActionSpace, BoxSpace, DiscreteSpace, MultiDiscreteSpace, SessionView
+
+if TYPE_CHECKING:
+    from surrogym_shared.acting import ActingPolicy, NoiseKey
 
 MEDIA_TYPE = "application/vnd.msgpack"
 
@@ -292,6 +295,8 @@ def actions_of(request: RolloutRequest, shape: Shape) -> NDArray[np.float64]:
 
 def policy_of(request: PolicyRequest, shape: Shape) -> ActingPolicy:
     """Return the policy of a request, as views of the frame. Raises ``FrameError``."""
+    from surrogym_shared.acting import ActingPolicy, layers_of, parameters_of  # a client loads no policies to step
+
     dtype, size = FLOAT32 if request.precision == "float32" else FLOAT64, shape.observation
     if (count := parameters_of(size, request.units)) > MAX_PARAMETERS:
         raise FrameError(f"policy: expected at most {MAX_PARAMETERS} weights and biases, got {count}")
@@ -312,6 +317,8 @@ def policy_of(request: PolicyRequest, shape: Shape) -> ActingPolicy:
 
 
 def noise_of(request: PolicyRequest) -> NoiseKey | None:
+    from surrogym_shared.acting import NoiseKey
+
     return None if request.noise is None else NoiseKey(*msgspec.structs.astuple(request.noise))
 
 

@@ -19,18 +19,18 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, Field, PositiveInt, ValidationError
 
+from surrogym_shared.kinds import Activation
+from surrogym_shared.policy_sizes import MAX_LAYERS
 from surrogym_shared.spec import BoxAction, DiscreteAction, EnvironmentSpec, MultiDiscreteAction
 
 if TYPE_CHECKING:
     from surrogym_shared.archives import Header
 
 Array = NDArray[np.float64]
-Activation = Literal["tanh", "relu"]
 HEAD = "surrogym-network.json"
 ARRAYS = "network.npz"
 MAX_BYTES = 16 * 1024 * 1024  # largest size in bytes of a policy's file after decompression
 MAX_HEAD_BYTES = 64 * 1024
-MAX_LAYERS = 8
 OUTSIDE = ("mean", "deviation", "low", "high")  # names of the arrays in a policy's file that belong to no layer
 
 

@@ -10,14 +10,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, Self, TypeVar, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, Self, TypeVar, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from surrogym_shared.acting import ActingPolicy, NoiseKey
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import OpenSession, SessionView, SubmittedOccupancy
+
+if TYPE_CHECKING:
+    from surrogym_shared.acting import ActingPolicy, NoiseKey
 
 Floats = NDArray[np.floating[Any]]
 Bools = NDArray[np.bool_]

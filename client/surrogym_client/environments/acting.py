@@ -11,8 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from surrogym_client.environments.lanes import Lanes
-from surrogym_shared.acting import MAX_ACTIVATIONS, MAX_LANE_STEPS, Acted, ActingPolicy, Actor, NoiseKey
+from surrogym_shared.acting import Acted, ActingPolicy, Actor, NoiseKey
 from surrogym_shared.network import bounds_of, counts_of
+from surrogym_shared.policy_sizes import MAX_ACTIVATIONS, MAX_LANE_STEPS
 from surrogym_shared.port import Bools, Floats, PolicyRollout, StepResult
 
 

@@ -9,14 +9,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from surrogym_client.errors import SessionLost, SurrogymClientError
-from surrogym_shared.acting import ActingPolicy, NoiseKey
 from surrogym_shared.port import (
     Bools,
     Floats,
@@ -28,6 +27,9 @@ from surrogym_shared.port import (
     SurrogatePort,
 )
 from surrogym_shared.wire import AutoresetMode, OpenSession
+
+if TYPE_CHECKING:
+    from surrogym_shared.acting import ActingPolicy, NoiseKey
 
 REOPENINGS = 3
 OPTIONS = tuple(name for name in OpenSession.model_fields if name not in ("num_envs", "autoreset_mode"))

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any, Literal, Self, TypeVar, get_args
+from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar, get_args
 
 import numpy as np
 
@@ -19,11 +19,13 @@ from surrogym_client.transport.resend_buffer import ResendBuffer, Sent, digest_o
 from surrogym_client.transport.step_codecs import UNREADABLE, BinaryForm, Form, JsonForm
 from surrogym_client.transport.stream import Stream, StreamLost, StreamUnavailable
 from surrogym_shared import wire
-from surrogym_shared.acting import ActingPolicy, NoiseKey, PolicyRun
 from surrogym_shared.codes import Code
 from surrogym_shared.frames import Shape
 from surrogym_shared.port import Bools, Floats, Ints, PolicyRollout, ResetResult, StepResult
 from surrogym_shared.spec import EnvironmentSpec
+
+if TYPE_CHECKING:
+    from surrogym_shared.acting import ActingPolicy, NoiseKey
 
 Transport = Literal["auto", "stream", "binary", "json"]
 T = TypeVar("T")
@@ -162,6 +164,8 @@ class HttpSurrogate:
         noise: NoiseKey | None = None,
         until: Bools | None = None,
     ) -> PolicyRollout:
+        from surrogym_shared.acting import PolicyRun  # which steps alone do not need
+
         try:
             run = PolicyRun(policy, steps, noise, until)
         except ValueError as error:

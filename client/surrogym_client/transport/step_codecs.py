@@ -6,7 +6,7 @@ An encoding turns arguments into the body of a request, and the body of a reply 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import msgspec
 import numpy as np
@@ -14,10 +14,12 @@ from numpy.typing import NDArray
 
 from surrogym_client.errors import error_from_problem, refused_here
 from surrogym_shared import frames
-from surrogym_shared.acting import PolicyRun
 from surrogym_shared.codes import Code, Problem
 from surrogym_shared.frames import FrameError, Shape
 from surrogym_shared.port import Bools, PolicyRollout, ResetResult, StepResult
+
+if TYPE_CHECKING:
+    from surrogym_shared.acting import PolicyRun
 
 Array = NDArray[Any]
 Seeds = int | Sequence[int] | None

@@ -17,7 +17,8 @@ from surrogym_server.environment.actions import policy_actions
 from surrogym_server.environment.definition import ActionDefinition
 from surrogym_server.errors import InvalidInput, TooLarge
 from surrogym_server.virtual.sensors import sensed
-from surrogym_shared.acting import MAX_ACTIVATIONS, MAX_LANE_STEPS, Acted, Actor, NoiseKey, PolicyRun
+from surrogym_shared.acting import Acted, Actor, NoiseKey, PolicyRun
+from surrogym_shared.policy_sizes import MAX_ACTIVATIONS, MAX_LANE_STEPS
 from surrogym_shared.port import PolicyRollout, StepResult
 
 Floats = NDArray[np.float64]

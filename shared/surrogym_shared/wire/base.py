@@ -6,11 +6,11 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from surrogym_shared.acting import MAX_ROLLOUT as MAX_ROLLOUT  # re-exported for users of the wire models
 from surrogym_shared.fail_fast import FailFast
 from surrogym_shared.kinds import AutoresetMode as AutoresetMode
 from surrogym_shared.kinds import Variant as Variant
 from surrogym_shared.patterns import NAME, VISIBLE
+from surrogym_shared.policy_sizes import MAX_ROLLOUT as MAX_ROLLOUT  # re-exported for users of the wire models
 from surrogym_shared.spec import MAX_DIMENSIONS
 from surrogym_shared.states import Phase as Phase
 from surrogym_shared.states import Purpose as Purpose

@@ -6,10 +6,9 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, FiniteFloat, model_validator
 
-from surrogym_shared.acting import MAX_UNITS
 from surrogym_shared.checks import LARGEST
-from surrogym_shared.kinds import Propagation, Weighting
-from surrogym_shared.network import MAX_LAYERS, Activation
+from surrogym_shared.kinds import Activation, Propagation, Weighting
+from surrogym_shared.policy_sizes import MAX_LAYERS, MAX_UNITS
 from surrogym_shared.spec import MAX_DIMENSIONS
 from surrogym_shared.wire.base import (
     MAX_DRAWS,

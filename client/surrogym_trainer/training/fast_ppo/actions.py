@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from surrogym_shared import distributions
 from surrogym_shared.distributions import Array, Sampled, log_softmax, middle_and_reach
-from surrogym_shared.network import Activation
+from surrogym_shared.kinds import Activation
 from surrogym_trainer.policies.defaults import EXPLORATION
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surrogym_shared.acting import layers_of
-from surrogym_shared.network import Activation
+from surrogym_shared.kinds import Activation
 
 Array = NDArray[np.floating[Any]]  # always float32
 
