@@ -352,7 +352,7 @@ def with_layers(count: int, units: int) -> dict[str, Any]:
         ({**ROLL, "policy": {**POLICY, "layers": []}}, "layers"),
         ({**ROLL, "policy": {**POLICY, "activation": "exec"}}, "activation"),
         ({**ROLL, "policy": {**POLICY, "code": "1"}}, "code"),
-        ({**ROLL, "policy": {**POLICY, "layers": [{"weights": [[1], [1, 2], [1]], "bias": [0]}]}}, "one length"),
+        ({**ROLL, "policy": {**POLICY, "layers": [{"weights": [[1], [1, 2], [1]], "bias": [0]}]}}, "equal length"),
         ({**ROLL, "policy": {**POLICY, "layers": [{"weights": [[1], [1]], "bias": [0]}]}}, "shape (3, 1), got (2, 1)"),
         (with_layers(9, 1), "at most 8"),
         (with_layers(1, 1_025), "1024"),
