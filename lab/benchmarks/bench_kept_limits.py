@@ -10,7 +10,9 @@ with limits or without:
 
 - real steps and rollouts of the design, and how many rollouts left a limit;
 - the mean real return of 50 episodes of a policy trained in the model, how many of them left a limit, and the share of
-  steps in which the fallback acted.
+  steps in which the fallback acted; how many episodes had a fallback, and the share that the promise expected;
+- the same policy in a changed machine (a ball and a quadrotor 30 % heavier, a pump 20 % stronger, 10 % more heat of
+  reaction), of which neither model nor policy nor fallback knows.
 
 Each row is judged by the physical quantity that must stay in its range, such as the position of the cart. The declared
 limit may be of another term, such as the position plus the way of 0.1 s. Rows are saved in ``--out``/limits.csv, so
@@ -47,8 +49,10 @@ from surrogym_sampler.original.rollouts import answering, keeping_limits
 from surrogym_server.local import LocalSurrogate
 from surrogym_shared.limits import past
 from surrogym_shared.spec import EnvironmentSpec, Limit, Limits, Term
-from surrogym_trainer.evaluation.evaluator import EvaluationSettings, evaluate
+from surrogym_trainer.evaluation.evaluator import Evaluation, EvaluationSettings, evaluate
+from surrogym_trainer.evaluation.promise import promise_of
 from surrogym_trainer.policies import load_policy
+from surrogym_trainer.policies.predict import Predict
 from surrogym_trainer.training import TrainSettings, train
 
 EPISODES = 50
@@ -59,14 +63,14 @@ RUNS_AWAY = Term.linear(gap=1.0, speed=22.6, current=-5.2)
 HOVERING = Term.linear(gap=1.53, speed=31.5, current=-6.38)
 
 
-def _reactor(q: Array, u: Array, _: Parameters) -> tuple[Array, Array]:
+def _reactor(q: Array, u: Array, p: Parameters) -> tuple[Array, Array]:
     """A stirred tank with an exothermic reaction: concentration in mol/l, temperature in K about 350. The action is the
     coolant's temperature, 300 K +- 20 K. A concentration of 0.42 is wanted, near to where the reaction runs away."""
     c, t, coolant = q[..., 0], q[..., 1] + 350, 300 + 20 * u[..., 0]
 
     def rates(c: Array, t: Array) -> tuple[Array, Array]:
         rate = 7.2e10 * np.exp(-8750 / t) * c
-        return 1 - c - rate, 350 - t + 209.2 * rate + 2.092 * (coolant - t)
+        return 1 - c - rate, 350 - t + 209.2 * p["heat"] * rate + 2.092 * (coolant - t)
 
     for _ in range(REACTOR_PARTS):
         first = rates(c, t)
@@ -76,12 +80,12 @@ def _reactor(q: Array, u: Array, _: Parameters) -> tuple[Array, Array]:
     return np.stack([c, t - 350], -1), np.exp(-0.5 * ((q[..., 0] - 0.42) / 0.1) ** 2)
 
 
-def _quadrotor(q: Array, u: Array, _: Parameters) -> tuple[Array, Array]:
+def _quadrotor(q: Array, u: Array, p: Parameters) -> tuple[Array, Array]:
     """The height of a quadrotor in m about the middle between floor and ceiling, its speed, and the acceleration of its
     rotors, which follow the action with 0.1 s. A height above the ceiling of 1 m is wanted: 1.1 m."""
     height, speed, push = q[..., 0], q[..., 1], q[..., 2]
     for _ in range(QUADROTOR_PARTS):
-        push = push + 0.01 / 0.1 * (6 * u[..., 0] - push)
+        push = push + 0.01 / 0.1 * (6 * u[..., 0] / p["mass"] - push)
         speed = speed + 0.01 * (push - 0.3 * speed * np.abs(speed))
         height = height + 0.01 * speed
     return np.stack([height, speed, push], -1), np.exp(-0.5 * ((q[..., 0] - 1.1) / 0.4) ** 2)
@@ -94,7 +98,7 @@ REACTOR = Machine(
     {"concentration": (0.0, 1.0), "temperature": (-40, 50)},
     {"concentration": (0.7, 0.9), "temperature": (-30, -20)},
     _reactor,
-    real={},
+    real={"heat": 1.0},
     wrong={},
     few=(8, 16),
     budget=120,
@@ -106,12 +110,20 @@ QUADROTOR = Machine(
     {"height": (-1.5, 1.5), "speed": (-3, 3), "push": (-6, 6)},
     {"height": (-0.2, 0.2), "speed": (-0.1, 0.1), "push": (-0.1, 0.1)},
     _quadrotor,
-    real={},
+    real={"mass": 1.0},
     wrong={},
     few=(8, 16),
     budget=80,
     noise=0.001,
     time_limit=100,
+)
+
+
+TANKS = replace(levitation.TANKS, start={"upper": (-5, 0), "lower": (-5, 0)})
+LEVITATION = replace(
+    levitation.LEVITATION,
+    start={"gap": (-0.5, 0.5), "speed": (-0.008, 0.008), "current": (-0.03, 0.03)},
+    ends=None,
 )
 
 
@@ -145,6 +157,11 @@ class Formula:
         pass
 
 
+def _with(machine: Machine, **parameters: float) -> Callable[[int], Any]:
+    """Return a function that makes a machine with other parameters."""
+    return partial(Formula, replace(machine, real={**machine.real, **parameters}))
+
+
 class PatientRotary(Rotary):
     """The rotary pendulum as a simulator, which waits for its actions."""
 
@@ -158,6 +175,7 @@ class Plant:
     make: Callable[[int], Any]  # makes the machine, of a seed
     limits: Limits
     physical: Limit  # by which every row is judged
+    changed: Callable[[int], Any]  # makes the machine as it is after a change of which neither model nor policy knows
     budget: int
     period: float  # seconds of a step
     changes: dict[str, Any]  # of the specification
@@ -175,52 +193,50 @@ PLANTS = {
             Limit(name="rail", term=Term.linear(x=1.0, velocity=0.1), low=-0.8, high=0.8, margin=0.2),
         ),
         Limit(name="rail", term=Term.linear(x=1.0), low=-0.8, high=0.8),
+        lambda _: original.make("surrogym/CartPoleSwingUp-v0", access="reset"),
         budget=260,
         period=0.1,
         changes={},
     ),
     "tanks": Plant(
-        partial(Formula, replace(levitation.TANKS, start={"upper": (-5, 0), "lower": (-5, 0)})),
+        _with(TANKS),
         _limits(Term.constant(-1.0), Limit(name="brim", term=Term.linear(upper=1.0), high=4.0, margin=0.7)),
         Limit(name="brim", term=Term.linear(upper=1.0), high=4.0),
+        _with(TANKS, pump=1.2),
         budget=60,
         period=0.5,
         changes={},
     ),
     "levitation": Plant(
-        partial(
-            Formula,
-            replace(
-                levitation.LEVITATION,
-                start={"gap": (-0.5, 0.5), "speed": (-0.008, 0.008), "current": (-0.03, 0.03)},
-                ends=None,
-            ),
-        ),
+        _with(LEVITATION),
         _limits(HOVERING, Limit(name="held", term=RUNS_AWAY, low=-2.1, high=2.1, margin=1.1)),
         Limit(name="held", term=RUNS_AWAY, low=-2.1, high=2.1),
+        _with(LEVITATION, mass=1.3),
         budget=100,
         period=0.005,
         changes={},
     ),
     "reactor": Plant(
-        partial(Formula, REACTOR),
+        _with(REACTOR),
         # Beyond 358 K at 0.5 mol/l, less 40 K for each mol/l, the coldest coolant no longer stops the reaction.
         _limits(
             Term.constant(-1.0),
             Limit(name="runaway", term=Term.linear(temperature=1.0, concentration=40.0), high=28.0, margin=5.0),
         ),
         Limit(name="temperature", term=Term.linear(temperature=1.0), high=20.0),
+        _with(REACTOR, heat=1.1),
         budget=120,
         period=3.0,
         changes={},
     ),
     "quadrotor": Plant(
-        partial(Formula, QUADROTOR),
+        _with(QUADROTOR),
         _limits(
             Term.linear(height=-1.5, speed=-1.2, push=-0.1),
             Limit(name="room", term=Term.linear(height=1.0, speed=0.3, push=0.03), low=-1.0, high=1.0, margin=0.15),
         ),
         Limit(name="height", term=Term.linear(height=1.0), low=-1.0, high=1.0),
+        _with(QUADROTOR, mass=1.3),
         budget=80,
         period=0.05,
         changes={},
@@ -232,6 +248,7 @@ PLANTS = {
             Limit(name="stop", term=Term.linear(**{"arm": 1.0, "arm.change1": 2.0}), low=-1.5, high=1.5, margin=0.5),
         ),
         Limit(name="stop", term=Term.linear(arm=1.0), low=-1.5, high=1.5),
+        lambda _: PatientRotary(mass=1.3),
         budget=300,
         period=0.03,
         changes={},
@@ -254,6 +271,9 @@ class Row:
     episodes: int
     violations: int  # episodes that left a limit
     fallbacks: float  # share of the policy's steps in which the fallback acted
+    fell_back: int  # episodes in which the fallback acted
+    expected: float  # predicted share of such episodes; nan without limits
+    changed: int  # of as many episodes of the policy in the changed machine, those that left a limit
 
 
 def main() -> None:
@@ -266,7 +286,7 @@ def main() -> None:
     done = {(row.machine, row.limits, row.seed) for row in rows}
     for seed in range(options.first_seed, options.first_seed + options.seeds):
         for machine in options.machines:
-            for limited in (True, False):
+            for limited in (True,) if options.with_limits_only else (True, False):
                 if (machine, limited, seed) not in done:
                     rows.append(run(machine, seed, limited=limited, policy=not options.no_policy))
                     write_records(path, Row, rows)
@@ -285,7 +305,7 @@ def specifications(plant: Plant, seed: int) -> tuple[EnvironmentSpec, Environmen
 
 def _judging(plant: Plant, spec: EnvironmentSpec) -> EnvironmentSpec:
     """Specification whose only limit is the physical one."""
-    limits = _limits(plant.limits.fallback[0], plant.physical)
+    limits = plant.limits.model_copy(update={"keep": (plant.physical,)})
     judging: EnvironmentSpec = EnvironmentSpec.model_validate({**spec.model_dump(), "limits": limits.model_dump()})
     return judging
 
@@ -314,25 +334,47 @@ def run(machine: str, seed: int, *, limited: bool, policy: bool) -> Row:
         left += bool(past(judged, np.array([step.next_coordinates for step in steps])).any())
     so_far = machine, limited, seed, design.phase, design.steps, rollouts, left
     if not policy:
-        return Row(*so_far, float("nan"), 0, 0, float("nan"))
-    result = _evaluated(design.surrogate(), spec, made, seed)
-    violations = sum(bool(past(judged, trace.coordinates).any()) for trace in result.traces)
+        return Row(*so_far, float("nan"), 0, 0, float("nan"), 0, float("nan"), 0)
+    model = design.surrogate()
+    acts = _trained(model, seed)
+    result = _evaluated(acts, spec, made)
     share = 0.0 if result.limits is None else result.limits.fallbacks / result.limits.steps
-    return Row(*so_far, float(result.returns.mean()), EPISODES, violations, share)
+    fell_back = 0 if result.limits is None else result.limits.fallback_episodes
+    fallback = promise_of(model, acts, seed).fallback
+    elsewhere = _evaluated(acts, spec, lambda: Respecified(plant.changed(seed), spec))
+    return Row(
+        *so_far,
+        float(result.returns.mean()),
+        EPISODES,
+        _left(judged, result),
+        share,
+        fell_back,
+        float("nan") if fallback is None else fallback.median,
+        _left(judged, elsewhere),
+    )
 
 
-def _evaluated(model: LocalSurrogate, spec: EnvironmentSpec, made: Callable[[], Any], seed: int) -> Any:
+def _left(judged: EnvironmentSpec, result: Evaluation) -> int:
+    """Return the number of episodes that left the physical limit."""
+    return sum(bool(past(judged, trace.coordinates).any()) for trace in result.traces)
+
+
+def _trained(model: LocalSurrogate, seed: int) -> Predict:
     with TemporaryDirectory() as folder:
         trained = train(model, Path(folder) / "policy", TrainSettings(algorithm=SEARCH, seed=seed))
-        acts = load_policy(trained.path, SEARCH)
+        return load_policy(trained.path, SEARCH)
+
+
+def _evaluated(acts: Predict, spec: EnvironmentSpec, made: Callable[[], Any]) -> Evaluation:
     return evaluate(acts, lambda: open_episode("plant:Plant", spec, made), EvaluationSettings(EPISODES, parallel=1))
 
 
 def table(rows: Sequence[Row]) -> str:
     """Pooled counts of each machine, with exact upper 95 % bounds."""
     lines = [
-        "| machine | limits | seeds | real steps | rollouts that left | return | episodes that left | fallback |",
-        "|---|---|---|---|---|---|---|---|",
+        "| machine | limits | seeds | real steps | rollouts that left | return | episodes that left | with a fallback "
+        "| expected | left in the changed machine |",
+        "|---|---|---|---|---|---|---|---|---|---|",
     ]
     for machine, limited in sorted({(row.machine, row.limits) for row in rows}):
         here = [row for row in rows if (row.machine, row.limits) == (machine, limited)]
@@ -342,7 +384,9 @@ def table(rows: Sequence[Row]) -> str:
             f"({min(steps)} to {max(steps)}) | {_share(sum(r.left for r in here), sum(r.rollouts for r in here))} | "
             f"{np.median(values):.4g} ({min(values):.4g} to {max(values):.4g}) | "
             f"{_share(sum(r.violations for r in here), sum(r.episodes for r in here))} | "
-            f"{100 * np.mean([r.fallbacks for r in here]):.2g} % |"
+            f"{100 * sum(r.fell_back for r in here) / max(1, sum(r.episodes for r in here)):.2g} % | "
+            f"{100 * np.mean([r.expected for r in here]):.2g} % | "
+            f"{_share(sum(r.changed for r in here), sum(r.episodes for r in here))} |"
         )
     return "\n".join(lines)
 
@@ -360,6 +404,7 @@ def _options() -> argparse.Namespace:
     made.add_argument("--first-seed", type=int, default=0)
     made.add_argument("--seeds", type=int, default=1)
     made.add_argument("--no-policy", action="store_true", help="designs alone")
+    made.add_argument("--with-limits-only", action="store_true", help="no rows without limits")
     made.add_argument("--out", type=Path, default=OUT)
     return made.parse_args()
 
