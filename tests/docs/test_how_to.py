@@ -18,6 +18,18 @@ PRINTED_URL = "http://127.0.0.1:8000"
 READERS_FUNCTIONS = (
     "read_sensors, send = lambda: [1.0, 0.0, 0.0], lambda action: None\n"  # that files-and-terminal.md leaves to them
 )
+READERS_CART = """
+from surrogym import BoxAction, Coordinate, EnvironmentSpec, ObservationEntry, Term, Uniform
+cart = EnvironmentSpec(
+    coordinates=(Coordinate(name="x", sampling=Uniform(low=-1, high=1)),),
+    observation=(ObservationEntry(name="x", term=Term.linear(x=1)),),
+    action=BoxAction(low=(-1,), high=(1,)),
+    start={"x": Uniform(low=-0.1, high=0.1)},
+    time_limit=100,
+    sampling_period=0.05,
+    query="rollout",
+)
+"""  # that limits.md leaves to them
 
 
 def programs(page: str) -> list[str]:
@@ -139,7 +151,8 @@ def test_the_how_to_program_for_a_policy_with_lagged_inputs_runs(tmp_path: Path)
 
 def test_the_how_to_program_for_actions_that_change_slowly_declares_their_largest_change(tmp_path: Path) -> None:
     (program,) = programs("limits.md")
-    said = run(tmp_path, "-c", f"{program}\nfrom surrogym_shared.rates import rates\nprint(rates(smooth)[0].change)")
+    told = "from surrogym_shared.rates import rates\nprint(rates(smooth)[0].change)"
+    said = run(tmp_path, "-c", f"{READERS_CART}\n{program}\n{told}")
     assert float(said) == pytest.approx(0.2)
 
 
