@@ -135,7 +135,11 @@ def test_sampling_and_evaluating_with_a_named_fallback_need_its_program(
     assert on_server("register", name, *named).code == 0
     (tmp_path / "policy").mkdir()
     policy = str(network(tmp_path / "policy", NamedCart().spec(), (4,)))
-    for command in (("sample", name, *named, "--max-queries", "1"), ("evaluate", policy, *named, "--episodes", "2")):
+    for command in (
+        ("sample", name, *named, "--max-queries", "1"),
+        ("evaluate", policy, *named, "--episodes", "2"),
+        ("work", name, *named, "--once", "--folder", str(tmp_path / "work")),
+    ):
         refused = on_server(*command)
         assert refused.code != 0
         assert "the limits name the fallback 'brake': expected --fallback brake=package.module:function" in refused.err

@@ -11,7 +11,16 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from surrogym.cli.groups import Output, Service, add
-from surrogym.cli.options import NAMES, ExitWithParent, SpecFile, Surrogate, Wait, awaited_surrogate, read_spec
+from surrogym.cli.options import (
+    NAMES,
+    ExitWithParent,
+    FallbackProgram,
+    SpecFile,
+    Surrogate,
+    Wait,
+    awaited_surrogate,
+    read_spec,
+)
 
 if TYPE_CHECKING:
     from surrogym_shared.spec import EnvironmentSpec
@@ -45,6 +54,7 @@ def command(
         ),
     ] = None,
     spec: SpecFile = None,
+    fallback: FallbackProgram = None,
     most_episodes: Annotated[
         int,
         typer.Option(min=0, max=1_000, help="Most real episodes of one evaluation. 0: the worker only trains."),
@@ -81,7 +91,7 @@ def command(
     settings = WorkerSettings(name=worker or worker_name(), folder=folder, once=once)
     with service.connect(context, wait, quiet=output.quiet) as api:
         asked = awaited_surrogate(api, surrogate, wait, quiet=output.quiet).spec
-        environment = _environment(surrogate, env, read_spec(spec), asked, most_episodes, quiet=output.quiet)
+        environment = _environment(surrogate, env, read_spec(spec), fallback, asked, most_episodes, quiet=output.quiet)
         environment = _with_reference(environment, reference)
         with progress("work", quiet=output.quiet) as update:
             tell = partial(say, quiet=output.quiet)
@@ -97,6 +107,7 @@ def _environment(
     surrogate: str,
     env: str | None,
     given: EnvironmentSpec | None,
+    fallback: str | None,
     asked: EnvironmentSpec,
     most_episodes: int,
     *,
@@ -114,7 +125,7 @@ def _environment(
     if most_episodes == 0 or (env is None and not is_known(asked.environment)):
         say("this worker only trains; to evaluate as well: --env package.module:factory", quiet=quiet)
         return None
-    opener = opener_of(env, given, PolicyCard(spec=asked), quiet=quiet)
+    opener = opener_of(env, given, PolicyCard(spec=asked), fallback, quiet=quiet)
     episode = opener()
     try:
         check_environment(surrogate, asked, episode.spec)
