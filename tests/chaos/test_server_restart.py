@@ -110,7 +110,7 @@ def test_a_server_crash_truncates_the_episodes_and_stepping_continues(restarting
     assert not reward.any()
     for lane, info in enumerate(infos):
         assert info["TimeLimit.truncated"]
-        assert "open a new one" in info[LOST]
+        assert "open a new session" in info[LOST]
         np.testing.assert_array_equal(info["terminal_observation"], last[lane])
     following, _, done, infos = envs.step(actions(1)[0])
     assert not done.any()

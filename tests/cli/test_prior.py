@@ -65,7 +65,7 @@ def test_invalid_uses_of_the_prior_command_are_refused_and_change_nothing(on_ser
         ("prior", hinge, "support.hinge:Textbook", "-p", "weight"): "friction, length, mass",
         ("prior", hinge, "support.hinge:Nothing"): "support.hinge:Nothing",
         ("prior", hinge, "nothing.surrogate"): "no file",
-        ("prior", hinge, "surrogate:other", "-p", "mass"): "no parameters",
+        ("prior", hinge, "surrogate:other", "-p", "mass"): "is a learned model: leave them out",
         ("prior", hinge, "surrogate:nobody"): "nobody",
         ("prior", hinge, f"surrogate:{hinge}"): "itself",
         ("prior", hinge, "support.hinge:Renamed"): "rate",

@@ -234,7 +234,7 @@ def test_the_instantiation_token_of_an_fmu_depends_on_surrogate_and_period(surro
 @pytest.mark.parametrize(
     ("changes", "period", "said"),
     [
-        ({"sampling_period": None}, None, "the specification has no sampling_period"),
+        ({"sampling_period": None}, None, "nor a sampling_period in the specification"),
         ({}, 0.0, "above 0, got 0.0"),
         ({}, float("nan"), "above 0, got nan"),
     ],

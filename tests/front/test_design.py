@@ -118,8 +118,8 @@ def test_asking_after_all_queries_were_given_up_raises():
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"coordinates": [0.0]}, r"coordinates: expected \(n, 2\)"),
-        ({"next_coordinates": [0.0, 0.0, 0.0]}, r"next_coordinates: expected \(n, 2\)"),
+        ({"coordinates": [0.0]}, r"coordinates: expected shape \(n, 2\)"),
+        ({"next_coordinates": [0.0, 0.0, 0.0]}, r"next_coordinates: expected shape \(n, 2\)"),
         ({"next_coordinates": [0.0, np.nan]}, "next_coordinates: expected finite numbers"),
         ({"action": [9.0]}, "got 9"),
         ({"reward": np.inf}, "reward: expected a finite number"),

@@ -86,7 +86,7 @@ def test_the_total_memory_of_all_sessions_is_limited(client: httpx.Client):
     refused(opened(client, **particles, num_envs=5), Code.TOO_LARGE, "4000000 particles")
     ids = [opened(client, **particles).raise_for_status().json()["id"] for _ in range(4)]
     full = opened(client, **particles)
-    refused(full, Code.TOO_MANY_REQUESTS, "at most 64.0 MiB, got 61.0 MiB and 15.3 MiB more")
+    refused(full, Code.TOO_MANY_REQUESTS, "at most 64.0 MiB of memory, got 61.0 MiB and 15.3 MiB more")
     assert int(full.headers["retry-after"]) > 0
     for id in ids:
         client.delete(f"/v1/sessions/{id}")

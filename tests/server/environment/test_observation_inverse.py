@@ -74,5 +74,5 @@ def test_constant_coordinates_keep_their_value_and_need_not_be_observed():
     ids=["cosine alone", "scaled", "mixed", "clipped"],
 )
 def test_an_observation_that_does_not_determine_a_coordinate_is_refused(term):
-    with pytest.raises(InvalidSpec, match="'joint' can't be read back"):
+    with pytest.raises(InvalidSpec, match="'joint' can't be computed"):
         definition_from_spec(reacher(ObservationEntry(name="o", term=term)))
