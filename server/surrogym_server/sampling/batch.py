@@ -32,6 +32,9 @@ def choose(
     """Choose real steps to request (queries) one after the other: for each entry of ``outputs`` the candidate with the
     largest value of the acquisition, as if the queries chosen before were answered.
 
+    This needs no results of queries: given its hyperparameters, the variance of a Gaussian process depends only on the
+    states and actions of its samples.
+
     Args:
         model: the model whose standard deviations the batch should lower.
         candidates: points to choose from. If some are reserved, the first query is one of them.

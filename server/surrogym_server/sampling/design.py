@@ -9,8 +9,9 @@ line       of Algorithm 1                                                where
 2, 11      run single steps in the original environment                  a sampler, ``surrogym_sampler.queries``
 3, 4, 12   fit all processes to all data                                 ``advance``
 5, 6, 13   confidence index (CI) of each process over Monte Carlo data   ``advance``
-7          repeat                                                        ``services.designer``: one ``advance`` when the
-                                                                         queries of the last round have their samples
+7          repeat                                                        ``services.designer``: one ``advance`` when no
+                                                                         query is open: each was answered, refused, or
+                                                                         set aside; or when a log has arrived
 8, 9, 10   for each process below the target, select a point by U        ``advance``
 14         until CI >= target                                            ``advance``, by its verdict
 15         step function of the virtual environment                      ``virtual``
@@ -31,7 +32,7 @@ from surrogym_server.models.guard import learn
 from surrogym_server.models.port import DynamicsModel
 from surrogym_server.sampling.acquisition import acquisition_of
 from surrogym_server.sampling.confidence import OutputConfidence
-from surrogym_server.sampling.judging import below_target, judge_model, verdict_with_history
+from surrogym_server.sampling.judging import below_target, judge_model, takes_no_more_steps, verdict_with_history
 from surrogym_server.sampling.latin_hypercube import going_on, latin_hypercube
 from surrogym_server.sampling.rollouts import first_rollouts
 from surrogym_server.sampling.round import Round
@@ -81,11 +82,15 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
     the other lines are.
 
     The paper fits models again after every real step (line 12). Here a round chooses several real steps to request
-    (queries), each as if those chosen before had been taken. The next round starts when all of them are taken.
+    (queries), each as if those chosen before had been answered (see ``batch.choose`` and ``rollouts.plan_round``). A
+    query that is refused or set aside counts as closed, so the next round needs no sample of it.
+
+    The comments name preset "paper" beside the setting by which it decides. ``tolerance`` and ``acquisition`` can also
+    be set alone, the stopping rule only by the preset.
 
     Args:
         definition: the environment, with the settings of its design.
-        samples: results of all real steps so far.
+        samples: results of all real steps so far from which a model can learn, those of logs and audits included.
         state: state that the previous round returned; ``DesignState()`` before the first round.
         request: budget and target of the design, and its queries without an answer.
 
@@ -95,56 +100,60 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
         PluginFailed: code of the model family raised another error, or its model breaks the rules of ``models.port``.
         ChoiceFailed: the acquisition returned values of a wrong shape, or values that are not finite.
     """
-    # Lines 3, 4 and 12: fit the processes of all outputs, transitions and reward, to all samples.
+    # Lines 3, 4 and 12: fit all processes to all samples: the transitions, the reward unless it is declared, and, not
+    # in the paper, the termination unless it is declared.
     fit = learn(definition, samples, state.warm, request.prior)
 
-    # The confidence index (CI) needs a tolerance for each output, (O,): the declared one, or a default, which is 1 in
-    # preset "paper" and otherwise 5 % of the output's standard deviation in the first round. Later rounds compute a
-    # default again if the range of the samples has grown a thousandfold. With snapshots, defaults may also increase.
+    # The confidence index (CI) needs a tolerance for each output, (O,): the declared one, or a default. The setting
+    # ``tolerance`` decides the default: 1 if it is "raw" (preset "paper"), or else 5 % of the output's standard
+    # deviation in the first round. Later rounds may change a default (see ``tolerances``).
     defaults = frozen_tolerances(definition, samples, state.defaults)
     tolerances = definition.tolerances_or(defaults.values)
 
-    # Lines 5, 6, 13, and the test of line 14: the CI of each output over the Monte Carlo set, whose points are also
-    # candidates for queries, and a verdict: "continue", or why the design may end, such as a spent budget. Tolerances
-    # are widened by confirmed noise here. Unless the stopping rule is "confidence", as in the paper, leave-one-out
-    # errors must be within the tolerances too, ends of episodes and peaks of the reward must be known, and some
-    # adaptive steps must have been taken.
+    # Lines 5, 6, 13, and the test of line 14: the CI of each output over the Monte Carlo set, the candidates for
+    # queries, and a verdict on this model alone: "ready", "continue", "over_budget", or "from_log" if the budget is 0.
+    # Unless the stopping rule is "confidence" (preset "paper"), ready needs more than the CI (see ``judging.judge``).
+    # Tolerances are widened by confirmed noise here, because no error of a prediction can be expected below the noise.
     judgement = judge_model(fit.model, samples, tolerances, request, state)
 
-    # A ready design stays ready until a person changes budget or target or reduces a tolerance, or new samples
-    # contradict the model. A design that ended without being ready takes no further steps until its conditions change,
-    # and becomes ready if its model satisfies the stopping rule. ``request.cost`` leaves out steps of logs and audits.
+    # The verdict on the design. A ready design stays ready until a person changes budget or target or reduces a
+    # tolerance, or errors contradict the model. A design that ended without being ready takes no further steps until
+    # its conditions change ("unsure" if budget is left), and becomes ready if its model satisfies the stopping rule.
+    # ``request.cost`` leaves out steps of logs and audits.
     conditions = Conditions(request.cost(len(samples)), request.budget, request.target, tolerances)
     verdict = verdict_with_history(judgement, state, request, conditions)
 
-    # Not in the paper: if the environment has snapshots, a ready design continues for an excursion, an action sequence
-    # beyond the sampled states that tests the model. If the budget has no steps left for it, the design ends not ready.
-    testing = verdict == "ready" and _lacks_excursion(definition, samples, state)
-    if testing:
-        tested_at = len(samples)
-    else:
-        tested_at = state.tested_at if verdict == "ready" else 0
+    # Not in the paper: if the environment has snapshots, a design about to be ready first takes an excursion: an action
+    # sequence beyond the sampled states that tests the model. If it may take no steps for it, it ends not ready.
+    testing = verdict == "ready" and _lacks_excursion(definition, conditions, state)
+    if testing and takes_no_more_steps(state, request, conditions):
+        verdict, testing = "unsure", False
+    tested_at = state.tested_at if verdict == "ready" else 0
     continues = verdict == "continue" or testing
 
     # Line 8, "for each process with CI < target": the indices of the outputs with CI < target, the least confident
     # first. If there are none, only the output with the lowest CI.
     outputs = below_target(judgement.confidences, request.target)
 
-    # Lines 9 and 10: the first rule that does not return None chooses the queries. The last rule, which always applies,
-    # is that of the paper: for each index in ``outputs``, query the candidate with the largest value of the acquisition
-    # (the uncertainty index U in preset "paper"), or plan rollouts; candidates that may end an episode are reserved for
-    # the first query. The rules before it are not in the paper, such as repeated steps, which show what is noise. A
-    # design that has ended chooses only ``request.extra`` further steps, by default none.
+    # Lines 9 and 10: the first rule that does not return None chooses the queries. For single steps the last rule is
+    # the paper's: for each index in ``outputs``, query the candidate with the largest value of the acquisition, which
+    # is U if the setting ``acquisition`` is "uncertainty_index" (preset "paper"). Unlike the paper, under every preset,
+    # no candidate close to an earlier query is chosen, and the first query is a reserved candidate, if there are any,
+    # so that an end of an episode gets sampled. For rollouts, the last rule plans action sequences in the model,
+    # without candidates, whose value is summed over ``outputs``. The rules before the last one are not in the paper,
+    # such as repeated steps, which show what is noise. A design that has ended chooses only ``request.extra`` steps.
     round = Round(state.round, fit.model, samples, request, judgement, tolerances, outputs, continues, testing)
     rules = STEP_RULES if definition.max_rollout is None else ROLLOUT_RULES
     queries = next(choice for rule in rules if (choice := rule(round)) is not None)
+    if testing and queries:
+        tested_at = conditions.cost
     if continues:
         verdict = _verdict_with(queries, round)
 
-    # The state that the next round needs; the caller of ``advance`` adds the predictions of the new samples. A design
-    # with queries has not ended, even if its verdict is not "continue". The conditions are stored so that a design that
-    # has ended continues if they change.
-    ended = verdict != "continue" and not queries
+    # The state that the next round needs. A design with extra queries has not ended, unless it is ready. A design that
+    # has ended continues if its conditions change. ``predictions``, to which ``engine.design_job`` adds those of new
+    # samples by the previous round's model before each round, are only scored and reported.
+    ended = verdict == "ready" or (verdict != "continue" and not queries)
     following = DesignState(
         round=state.round + 1,
         defaults=defaults,
@@ -161,17 +170,22 @@ def _verdict_with(queries: tuple[Query, ...], round: Round) -> Verdict:
     """Return the verdict on a design that may continue: "continue" if a query was chosen or an earlier query may still
     be answered, otherwise "unsure", or "over_budget" if the budget is spent.
 
-    If no query was chosen, either every candidate is close to an earlier query, or the rest of the budget is too small.
+    If no query was chosen, the rest of the budget is too small, less the steps of queries that were set aside; or each
+    candidate is close to an earlier query or would teach nothing, because a lag (past value) is not known there.
     """
     if queries or round.request.open:
         return "continue"
     return "unsure" if round.cost < round.request.budget else "over_budget"
 
 
-def _lacks_excursion(definition: EnvironmentDefinition, samples: Samples, state: DesignState) -> bool:
-    """Return whether a ready design still has to be tested by an excursion (see ``sampling.excursions``). It has to if
-    the stopping rule is ``tested_confidence``, if the environment has snapshots, and if no excursion was planned yet or
-    no sample has come since the last excursion was planned."""
-    if not definition.snapshots or definition.design.stopping != "tested_confidence":
+def _lacks_excursion(definition: EnvironmentDefinition, conditions: Conditions, state: DesignState) -> bool:
+    """Return whether a design whose model satisfies the stopping rule still has to be tested by an excursion (see
+    ``sampling.excursions``).
+
+    It has to if the stopping rule is ``tested_confidence``, if the environment has snapshots, if the design has not
+    ended as ready before, and if no excursion was planned yet or none was answered: the design has taken no real step
+    since the last excursion was planned. Samples of logs and audits don't count, because they may be anywhere.
+    """
+    if not definition.snapshots or definition.design.stopping != "tested_confidence" or state.ended_as == "ready":
         return False
-    return not state.tested_at or len(samples) <= state.tested_at
+    return not state.tested_at or conditions.cost <= state.tested_at

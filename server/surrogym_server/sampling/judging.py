@@ -49,12 +49,17 @@ def judge_model(
 ) -> Judgement:
     """Compute a model's confidences, its verdict, and the candidates for the next queries.
 
+    The candidates are up to 4,096 points of the Monte Carlo set, with states that policies visited, and a point at
+    which the reward may be highest. Some may be reserved for the first query (see ``endings.ending``): under every
+    preset those at which an episode may end, and, if the model and the stopping rule look for them, those at a jump or
+    peak of the reward.
+
     Args:
         model: the model of this round.
         samples: the samples that the model has learned from.
         tolerances: tolerance of each output (O,), in its unit.
         request: budget and target of the design.
-        state: result of the previous round.
+        state: result of the previous round. Its ``predictions`` are only scored, and don't influence the verdict.
 
     Raises:
         PluginFailed: code of the model's family failed.
@@ -103,8 +108,9 @@ def judge_model(
 
 
 def monte_carlo(definition: EnvironmentDefinition) -> tuple[Tensor, Tensor]:
-    """Draw the Monte Carlo set of eq. 8: random points over which the confidence index is averaged. It is the same in
-    every round. Return coordinates (m, C) and actions (m, F)."""
+    """Draw the Monte Carlo set of eq. 8: random points over which the confidence index is averaged. It is drawn from
+    the declared sampling distributions and the action space, and is the same in every round. Return coordinates (m, C)
+    and actions (m, F)."""
     rng = generator_for(definition, "monte carlo")
     return going_on(definition, *random_points(definition, definition.design.monte_carlo, rng), rng)
 
@@ -167,9 +173,10 @@ def verdict_with_history(judgement: Judgement, state: DesignState, request: Requ
     round, if it did.
 
     A design that was ready stays ready, unless a person has changed its budget or target or reduced a tolerance, or
-    later steps contradict the model. Without this rule, a design could lose its readiness because a fit to further
-    steps lowers the confidence index a little, although the model had predicted these steps well. A design that has
-    ended does not continue only because audits or logs have added samples.
+    errors contradict the model: those with which the previous model predicted the new samples, or, if there are none,
+    leave-one-out errors. Without this rule, a design could lose its readiness because a fit to further steps lowers the
+    confidence index a little, although the model had predicted these steps well. Other designs that have ended don't
+    continue only because audits or logs have added samples. They are "unsure" if budget is left.
 
     Args:
         judgement: judgement of the present model.
@@ -183,9 +190,16 @@ def verdict_with_history(judgement: Judgement, state: DesignState, request: Requ
     before = state.ended_under
     if state.ended_as == "ready" and not _asks_more(conditions, before) and not _contradicted(judgement, request):
         return "ready"
-    if judgement.verdict == "continue" and (conditions == before or request.is_mostly_refused(conditions.cost)):
+    if judgement.verdict == "continue" and takes_no_more_steps(state, request, conditions):
         return "unsure"
     return judgement.verdict
+
+
+def takes_no_more_steps(state: DesignState, request: Request, conditions: Conditions) -> bool:
+    """Return whether a design that is not ready takes no further steps although its budget is not spent: its conditions
+    are those under which it ended, or the environment refused too many steps."""
+    stopped = conditions == state.ended_under or request.is_mostly_refused(conditions.cost)
+    return stopped and conditions.cost < request.budget
 
 
 def _asks_more(now: Conditions, before: Conditions | None) -> bool:

@@ -90,7 +90,8 @@ def plan_round(
 ) -> list[Query]:
     """Plan action sequences (rollouts) with ``steps`` real steps in total.
 
-    Each sequence is planned as if the sequences planned before and the unanswered queries had been answered.
+    Each sequence is planned as if the sequences planned before and the unanswered queries had been answered, with the
+    results that the model predicts. For a model without the ability ``Lookahead`` they make no difference.
     """
     rollouts: list[Query] = []
     latest = list(unanswered)

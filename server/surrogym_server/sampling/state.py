@@ -45,9 +45,11 @@ class DesignState:
     warm: dict[str, NDArray[np.float64]] = field(default_factory=dict)  # values at which the next fit of a model starts
     ended_under: Conditions | None = None  # conditions when the design ended; None while it continues
     ended_as: str = ""  # the verdict with which the design ended; "" while it continues
-    predictions: Predictions = ()  # predictions of the latest samples by models that had not learned from them
-    # Number of samples when the last excursion was planned to test a ready model; 0 if none was planned.
-    tested_at: int = 0
+    # Predictions of the latest samples by models that had not learned from them. They are only scored and reported.
+    predictions: Predictions = ()
+    # Number of real steps that counted towards the budget when the last excursion was planned to test a model that
+    # satisfies the stopping rule; 0 if none was planned.
+    tested_at: float = 0
 
     def to_json(self) -> dict[str, Any]:
         warm = {key: array.tolist() for key, array in self.warm.items()}

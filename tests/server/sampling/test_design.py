@@ -377,6 +377,15 @@ def test_a_ready_design_stays_ready_after_audit_steps_within_tolerance():
     assert (after.verdict, len(after.queries), after.state.ended_as) == ("ready", 0, "ready")
 
 
+def test_a_ready_design_stays_ready_after_extra_queries():
+    before = ready()
+    samples = random_steps(pendulum(), LEARNED, seed=0)
+    asked = advance(before.model.definition, samples, before.state, request(budget=100, extra=4))
+    assert (asked.verdict, len(asked.queries), asked.state.ended_as) == ("ready", 4, "ready")
+    after = after_audit(asked, errors=0.9)
+    assert (after.verdict, len(after.queries)) == ("ready", 0)
+
+
 def test_a_ready_design_becomes_unsure_after_audit_steps_beyond_tolerance():
     after = after_audit(ready(), errors=2.0)
     assert (after.verdict, len(after.queries)) == ("unsure", 0), "92 steps of its budget are left"

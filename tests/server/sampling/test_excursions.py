@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +20,8 @@ from surrogym_server.models.gaussian_process.model import GaussianProcessModel
 from surrogym_server.sampling.design import advance
 from surrogym_server.sampling.excursions import FAR, excursion
 from surrogym_server.sampling.rollouts import predict_paths, random_sequences
-from surrogym_server.sampling.state import DesignState, Request
+from surrogym_server.sampling.state import Conditions, DesignState, Request
+from surrogym_shared.nouns import Query
 from surrogym_shared.spec import EnvironmentSpec
 
 STILL = {"kind": "uniform", "low": -0.01, "high": 0.01}  # resets lead to the top, nearly at rest
@@ -74,9 +76,9 @@ def test_an_exploring_rollout_without_snapshots_starts_at_a_reset(model: Gaussia
     assert excursion(model, samples.q, {}, 4, rng()).snapshot is None
 
 
-def request(samples: Samples, budget: int = 60) -> Request:
+def request(samples: Samples, budget: int = 60, **options: Any) -> Request:
     snapshots = {str(number): tuple(state) for number, state in enumerate(samples.q_next.tolist())}
-    return Request(budget=budget, target=0.9, snapshots=snapshots)
+    return Request(budget=budget, target=0.9, snapshots=snapshots, **options)
 
 
 def test_a_confident_design_with_snapshots_is_ready_only_after_an_exploring_rollout(samples: Samples):
@@ -97,6 +99,44 @@ def test_a_design_whose_budget_is_too_small_for_an_exploring_rollout_ends_over_b
     assert not decision.queries
     raised = advance(DEFINITION, samples, decision.state, request(samples))
     assert len(raised.queries) == 1, "once there is room, the excursion is due"
+
+
+def test_a_log_does_not_answer_an_open_exploring_rollout(samples: Samples):
+    first = advance(DEFINITION, samples, DesignState(), request(samples))
+    (rollout,) = first.queries
+    logged = join(samples, roll(SPEC, torch.zeros(2, 1, dtype=torch.float64), 11))
+    waiting = request(logged, pending=first.queries, open=rollout.steps, logged=2)
+    second = advance(DEFINITION, logged, first.state, waiting)
+    assert (second.verdict, second.queries) == ("continue", ())
+    lost = advance(DEFINITION, logged, second.state, request(logged, logged=2))
+    assert (lost.verdict, len(lost.queries)) == ("continue", 1), "its query was withdrawn, so another excursion is due"
+    answered = join(logged, roll(SPEC, rollout.actions, 7))
+    assert advance(DEFINITION, answered, second.state, request(answered, logged=2)).verdict == "ready"
+
+
+def test_a_design_ends_unsure_if_the_environment_refuses_too_many_exploring_rollouts(samples: Samples):
+    """It is sure of its model, so without a limit it would request another excursion for ever."""
+
+    def decide(refusals: int) -> tuple[str, int]:
+        refused = (Query.rollout([[0.0]]),) * refusals
+        decision = advance(DEFINITION, samples, DesignState(), request(samples, refused=refused))
+        return decision.verdict, len(decision.queries)
+
+    limit = 60 + len(samples)
+    assert (decide(limit), decide(limit - 1)) == (("unsure", 0), ("continue", 1))
+
+
+def test_an_ended_design_takes_no_exploring_rollout_after_an_audit(samples: Samples):
+    """Its tolerances are declared, so the audit changes nothing under which it ended."""
+    tolerances = advance(DEFINITION, samples, DesignState(), request(samples)).tolerances
+    declared = DEFINITION.with_tolerances(dict(zip(DEFINITION.outputs, tolerances, strict=True)))
+    conditions = Conditions(len(samples), 60, 0.9, tolerances)
+    ended = DesignState(round=1, ended_under=conditions, ended_as="unsure")
+    audited = join(samples, roll(SPEC, torch.zeros(2, 1, dtype=torch.float64), 11))
+    after = advance(declared, audited, ended, request(audited, audited=2))
+    assert (after.verdict, after.queries, after.state.ended_as) == ("unsure", (), "unsure")
+    raised = advance(declared, audited, after.state, request(audited, 61, audited=2))
+    assert (raised.verdict, len(raised.queries)) == ("continue", 1)
 
 
 def test_without_snapshots_or_in_preset_paper_no_exploring_rollout_is_needed(samples: Samples):
