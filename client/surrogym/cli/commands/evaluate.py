@@ -65,9 +65,9 @@ class Episodes:
         float,
         typer.Option(
             min=0,
-            help="Standard deviation of the random factors that multiply masses, lengths and limits of a built-in "
-            "environment or a MuJoCo model; 0 leaves them as they are. For a changed plant of your own, give its class "
-            "as --env.",
+            help="Standard deviation of the random factors that multiply the masses of a MuJoCo model, or masses, "
+            "lengths, forces and limits of a built-in classic task; 0 leaves them as they are. For a changed plant of "
+            "your own, give its class as --env.",
         ),
     ] = 0.0
     explore: Annotated[

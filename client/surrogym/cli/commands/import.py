@@ -80,8 +80,8 @@ def command(
     file: Annotated[
         Path,
         typer.Argument(
-            help="A .surrogate file from surrogym export; or a log as CSV, NPZ or Parquet; or the name of a Minari "
-            "data set."
+            help="A .surrogate file from surrogym export; or a log as CSV, NPZ, Parquet or HDF5; or the name of a "
+            "Minari data set."
         ),
     ],
     name: Annotated[
