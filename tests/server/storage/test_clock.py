@@ -26,7 +26,8 @@ def seconds_left(storage: Storage, name: str, query: int) -> float:
 def test_these_clock_tests_cover_every_time_column_of_the_database() -> None:
     doubles = {column.name for table in metadata.tables.values() for column in table.c if is_double(column)}
     others = {"target", "reward", "seconds", "fit_seconds"}
-    assert doubles - others == {"created_at", "begun", "expires", "fit_expires", "finished_at"}
+    own = {"finished_at"}  # of jobs, a feature that may be deleted with its table
+    assert doubles - others - own == {"created_at", "begun", "expires", "fit_expires"}
 
 
 def is_double(column: sa.Column[object]) -> bool:
