@@ -45,8 +45,8 @@ def opener_for_policy(
 def opener_of(
     env: str | None, given: EnvironmentSpec | None, card: PolicyCard, fallback: str | None = None, *, quiet: bool
 ) -> Callable[[], Episode]:
-    """Return a function that opens an episode. An environment that only a policy's card names is opened only if it is
-    Gymnasium's own, because the name of a module would run unknown code.
+    """Return a function that opens an episode. An environment that only a policy's card names is opened only if its
+    name runs no file of the user's, because the name of a module would run unknown code.
     """
     from surrogym.cli.errors import CommandError
     from surrogym_sampler.original.episodes import open_episode

@@ -81,7 +81,7 @@ def words_of(settings: EvaluationSettings, varied: Sequence[str] = ()) -> str:
         starts = "starts anywhere in the sampling range"
     elif settings.start_scale != 1:
         starts = f"starts {settings.start_scale:g} times as far apart as declared"
-    machine = f", masses, lengths and limits changed by {settings.perturb:.0%}" if settings.perturb else ""
+    machine = f", physical parameters changed by {settings.perturb:.0%}" if settings.perturb else ""
     changing = f", {', '.join(varied)} changed within episodes" if varied else ""
     random = f", actions changed at random by {settings.explore:.2g}" if settings.explore else ""
     return f"{starts}, from seed {settings.first_seed}{machine}{random}{changing}"
