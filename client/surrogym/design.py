@@ -115,7 +115,7 @@ class Design:
         self._visited: Floats | None = None
         self._phase: Phase = "collecting"
         self._result: DesignResult | None = None
-        self._settled = 0  # number of samples and of queries that were given up, at the last fit
+        self._settled = 0  # sum of the samples and of the queries that were given up, at the last fit
         self._state: dict[str, Any] = {}
         self._snapshots: dict[str, nouns.Vector] = {}  # for each snapshot, by its name, the state (C,) that it restores
         self._queue = deque(self._numbered("initial", initial_queries(self._definition, self.budget)))

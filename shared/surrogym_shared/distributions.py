@@ -14,13 +14,12 @@ from numpy.typing import NDArray
 
 HALF_LOG_TAU = 0.5 * float(np.log(2 * np.pi))
 
-Array = NDArray[np.floating[Any]]  # of float32 during a training
+Array = NDArray[np.floating[Any]]  # float32 in a training
 
 
 class Sampled(Protocol):
     """Distribution of actions of F entries for B observations, (B, F), given A outputs of an actor for each, (B, A),
-    and
-    K further parameters (K,), such as logarithms of standard deviations."""
+    and K further parameters (K,), such as logarithms of standard deviations, which do not depend on the state."""
 
     @property
     def outputs(self) -> int:
@@ -28,7 +27,8 @@ class Sampled(Protocol):
         ...
 
     def sample(self, outputs: Array, further: Array, rng: np.random.Generator) -> tuple[Array, Array]:
-        """Draw B actions (B, F) with F entries, not clipped to bounds. Return them and their log probabilities (B,)."""
+        """Draw an action for each row of ``outputs`` (B, A), given the distribution's parameters ``further`` (K,).
+        Return the actions (B, F), not clipped to bounds, and their log probabilities (B,)."""
         ...
 
     def sent(self, actions: Array) -> NDArray[Any]:
@@ -36,8 +36,8 @@ class Sampled(Protocol):
         ...
 
     def log_probability(self, outputs: Array, further: Array, actions: Array) -> Array:
-        """Return the log probability of each of B actions (B, F) with F entries, (B,), given the actor's outputs (B,
-        A)."""
+        """Return the log probabilities (B,) of B actions (B, F), given the actor's outputs (B, A) and the
+        distribution's parameters ``further`` (K,)."""
         ...
 
 

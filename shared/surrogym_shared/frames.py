@@ -220,8 +220,8 @@ def read_reply(content: bytes) -> Reply:
 
 
 def reset_request(seq: int | None, seed: int | Sequence[int] | None, mask: Bools | None) -> ResetRequest:
-    """Build the request of a reset. The seed is one integer, one integer for each lane, or None for no new seed.
-    ``mask`` (N,) is True for the lanes to reset; None resets all.
+    """Build the request of a reset, with its number ``seq`` in the session. The seed is one integer, one integer for
+    each lane, or None for no new seed. ``mask`` (N,) is True for the lanes to reset; None resets all.
 
     Raises:
         FrameError: int64 can't represent a seed.
@@ -233,9 +233,7 @@ def reset_request(seq: int | None, seed: int | Sequence[int] | None, mask: Bools
 
 def step_request(seq: int | None, action: Array, mask: Bools | None, deviations: bool) -> StepRequest:
     """Build the request of a step with the actions (N, F) of N lanes. ``mask`` (N,) is True for the lanes to step; None
-    steps all.
-    With
-    ``deviations``, the reply has the predicted standard deviation of each output."""
+    steps all. With ``deviations``, the reply has the predicted standard deviation of each output."""
     view = None if mask is None else _flat(mask, BOOL)
     return StepRequest(seq=seq, action=_flat(action, FLOAT64), mask=view, deviations=deviations)
 
@@ -295,7 +293,7 @@ def actions_of(request: RolloutRequest, shape: Shape) -> NDArray[np.float64]:
 
 def policy_of(request: PolicyRequest, shape: Shape) -> ActingPolicy:
     """Return the policy of a request, as views of the frame. Raises ``FrameError``."""
-    from surrogym_shared.acting import ActingPolicy, layers_of, parameters_of  # a client loads no policies to step
+    from surrogym_shared.acting import ActingPolicy, layers_of, parameters_of  # imported late: steps do not need it
 
     dtype, size = FLOAT32 if request.precision == "float32" else FLOAT64, shape.observation
     if (count := parameters_of(size, request.units)) > MAX_PARAMETERS:

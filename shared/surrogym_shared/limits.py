@@ -99,8 +99,8 @@ def nearest(spec: EnvironmentSpec, coordinates: Array) -> tuple[Limit, float]:
 
 
 def left_too_often(left: int, episodes: int, share: float, level: float) -> bool:
-    """Return whether too many episodes left a limit: an exact one-sided binomial test, at a level such as 0.01, of
-    ``left`` of so many episodes against the allowed share."""
+    """Return whether more of the ``episodes`` left a limit (``left`` of them) than the allowed ``share`` explains:
+    an exact one-sided binomial test with the significance level ``level``."""
     if left == 0 or share >= 1:
         return False
     constant, odds = math.lgamma(episodes + 1) + episodes * math.log1p(-share), math.log(share) - math.log1p(-share)

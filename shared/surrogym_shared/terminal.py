@@ -134,8 +134,7 @@ def _bar(title: str) -> Iterator[Update]:
 
 class _Lines:
     """Progress as lines of text, at most one every ``PLAIN_SECONDS``, and none before ``begin`` is called. The end of
-    the
-    work (share 1) is always shown."""
+    the work (share 1) is always shown."""
 
     def __init__(self, title: str) -> None:
         self._title = title

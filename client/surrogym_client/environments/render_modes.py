@@ -63,7 +63,7 @@ def drawn_with(name: str) -> list[tuple[str, str]]:
 
 def read_of(spec: EnvironmentSpec, name: str) -> Read | None:
     """Return a function that computes a coordinate from an observation; None if no entry shows the coordinate."""
-    found: dict[str, tuple[int, float, float]] = {}  # index, factor and offset of an entry, by linear, sin or cos
+    found: dict[str, tuple[int, float, float]] = {}  # an entry's index, factor and offset, by its function, as "sin"
     for index, entry in enumerate(spec.observation):
         parts = [part for part in entry.term.parts if part.function != "one"]
         if len(parts) != 1 or not _of_alone(parts[0], name):

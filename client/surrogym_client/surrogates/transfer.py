@@ -100,7 +100,7 @@ def _samples(api: Api, name: str) -> RealSamples:
 
 
 def _batches(samples: RealSamples) -> Iterator[list[int]]:
-    """Yield the indices of the samples in order, in batches of either logged or other samples."""
+    """Yield the indices of the samples in order, in batches. A batch has only samples of a log, or none of them."""
     for _, group in groupby(range(len(samples)), partial(_is_logged, samples)):
         rows = list(group)
         yield from (rows[first : first + BATCH] for first in range(0, len(rows), BATCH))

@@ -164,7 +164,7 @@ class HttpSurrogate:
         noise: NoiseKey | None = None,
         until: Bools | None = None,
     ) -> PolicyRollout:
-        from surrogym_shared.acting import PolicyRun  # which steps alone do not need
+        from surrogym_shared.acting import PolicyRun  # imported late: steps do not need it
 
         try:
             run = PolicyRun(policy, steps, noise, until)

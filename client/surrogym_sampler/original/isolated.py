@@ -56,7 +56,7 @@ class IsolatedEnvironment:
         self._number = 0  # number of the last request
         # Additional seconds for closing, in which the fallback controller brings the machine to rest.
         self._rest_seconds = 0.0
-        self._fallback_steps = self._earlier_steps = 0  # of the running process, and of those before it
+        self._fallback_steps = self._earlier_steps = 0  # fallback's steps in the running process, and in earlier ones
         self._process: BaseProcess | None = None
         self._pipe: Connection | None = None
 
@@ -204,7 +204,7 @@ class _Ending:
     """Handler that ends the child process on SIGTERM, but lets a running step finish first.
 
     Args:
-        seconds: that the child may run on after its parent has ended.
+        seconds: longest time for which the child may continue after its parent has ended.
     """
 
     def __init__(self, seconds: float) -> None:

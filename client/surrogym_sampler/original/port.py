@@ -46,7 +46,7 @@ class OriginalPort:
         self.steps = 0  # number of real steps in all sessions
         self._spec = spec
         self._open_episode = open_episode
-        self._parallel = True  # whether several instances may exist; the first one that is opened tells
+        self._parallel = True  # whether several instances may exist, as the first one says once it is open
         self._sessions: dict[str, list[_Lane]] = {}
         self._names = count()
 

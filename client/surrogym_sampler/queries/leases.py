@@ -72,7 +72,7 @@ class Leases:
         self._thread.join(timeout=5.0)
 
     def hold(self, queries: Sequence[Query], since: float) -> None:
-        """Add the leases of queries that were claimed no earlier than the time ``since``."""
+        """Add the leases of claimed queries. Each lease is taken to begin at ``since``, the time before the claim."""
         with self._lock:
             self._held.update({query.id: _Held(query, since + self._lease_seconds) for query in queries})
 

@@ -218,8 +218,8 @@ class SnapshotFolder:
 
 
 def least_useful(points: Array, keep: int | None = None) -> int:
-    """Return the index of the older of the two nearest of n points (n, K), which are ordered from old to new; ``keep``
-    is never returned."""
+    """Find the two nearest of n points of K entries, (n, K), which are ordered from old to new, and return the index of
+    the older one. The index ``keep`` is never returned."""
     nearest = np.full(len(points), np.inf)
     for number, point in enumerate(points):  # the matrix of all distances would need gigabytes if there are many points
         if number != keep:

@@ -286,8 +286,10 @@ def _check(controller: Controller, spec: EnvironmentSpec, predict: Predict) -> N
 
 
 def _close(y: Array, counts: tuple[int, ...]) -> NDArray[np.bool_]:
-    """Return for each of F discrete action entries, (N, F), whether its two largest outputs of the network, among
-    (N, A), are equal up to rounding."""
+    """Return a mask (N, F) of the discrete action entries whose two largest scores are equal up to rounding.
+
+    The network's outputs y (N, A) have a score for each of an entry's choices, whose numbers are ``counts``.
+    """
     groups = np.split(y, np.cumsum(counts)[:-1], axis=1)
     best = [np.sort(group, axis=1)[:, -2:] for group in groups]
     return np.stack([b[:, 1] - b[:, 0] <= TOLERANCE * (1 + np.abs(b[:, 1])) for b in best], axis=1)

@@ -158,7 +158,7 @@ def _placed(controller: Controller, memory: Memory, read: Array, sound: Bools) -
         controller: the controller.
         memory: the memory after the previous step.
         read: measurements (N, R); 0 where they have a fault.
-        sound: whether (N,) the measurements have no fault.
+        sound: mask (N,) of the controllers whose measurements have no fault.
     """
     after = memory.coordinates.copy()
     for i, one in enumerate(controller.measurements):

@@ -255,7 +255,7 @@ def missed(audit: Audit, returns: Array, floor: float | None) -> Audit:
 
 
 def untested(spec: EnvironmentSpec, q: Array, audited: Array) -> float:
-    """Return the share of the states q (m, C) that a policy visits that are far from every audited state (n, C).
+    """Of the states q (m, C) that a policy visits, return the share that is far from every audited state (n, C).
 
     Two states are far apart if a coordinate differs by more than ``FAR`` standard deviations over the visited states.
     """
@@ -375,7 +375,7 @@ def on_one_scale(spec: EnvironmentSpec, q: Array, u: Array, first: int | None = 
     """Return states q (m, C) and actions u (m, F) as points (m, P) whose distances can be compared. An angle becomes
     its cosine and sine.
 
-    Each of the P columns is divided by its standard deviation over all rows, or over the ``first`` rows.
+    Each of the P columns is divided by its standard deviation over all m rows, or over the first ``first`` rows.
     """
     at = columns(spec, q, u)
     spread = at[:first].std(0)
@@ -384,7 +384,7 @@ def on_one_scale(spec: EnvironmentSpec, q: Array, u: Array, first: int | None = 
 
 
 def _settable(spec: EnvironmentSpec, q: Array) -> Bools:
-    """Return which of the states (m, C) the original environment can be set to, (m,)."""
+    """Return a mask (m,) of those of the states q (m, C) to which the original environment can be set."""
     inside = np.ones(len(q), dtype=bool)
     for index, coordinate in enumerate(spec.coordinates):
         low, high = coordinate.settable

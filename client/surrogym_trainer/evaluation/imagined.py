@@ -21,8 +21,8 @@ DECLARED = {"start_box": 0.0, "start_visited": 0.0}
 # session options of whole episodes; none ends where the model is unsure (trust), because a shortened episode would earn
 # more if rewards are costs
 WHOLE = {**DECLARED, "trust": None}
-# session options if the specification penalises leaving the trusted states: an episode that ends there
-# gets a penalty for its missing steps, so the trust limit stays
+# session options if the specification declares a reward outside the trusted states: an episode may end there, because
+# it gets this reward for each missing step
 PAID_OUTSIDE = DECLARED
 STATISTICS_LANES = 1_024
 # largest number of steps that one request to the server takes; a longer episode needs several requests
@@ -118,7 +118,8 @@ class _Sums:
 
 class _Rewards(NamedTuple):
     """The results of T steps in N lanes, (T, N) each: rewards less the penalty, rewards without the penalty, and
-    whether the step ended its episode; and ``left`` of the result, or None."""
+    whether the step ended its episode; ``left`` is whether the episode ended outside the sampling range or where the
+    fallback acts, or None."""
 
     reward: NDArray[np.floating[Any]]
     mean: NDArray[np.floating[Any]]

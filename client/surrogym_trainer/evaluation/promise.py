@@ -68,7 +68,8 @@ def fallback_share(fallen: NDArray[np.bool_]) -> FallbackShare:
         fallen: whether the fallback acts in each virtual episode, (starts, functions).
     """
     share = interval(fallen.astype(np.float64))
-    bound = 1 - (1 - HIGH) ** (1 / fallen.size)  # largest share that shows in none of the episodes with 5 % chance
+    # share of episodes with a fallback at which, with a probability of 5 %, all ``fallen.size`` episodes have none
+    bound = 1 - (1 - HIGH) ** (1 / fallen.size)
     high = max(share.high, bound) if not fallen.any() else share.high
     low = min(share.low, 1 - bound) if fallen.all() else share.low
     return FallbackShare(median=share.median, low=low, high=high)

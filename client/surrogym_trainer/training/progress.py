@@ -51,6 +51,6 @@ class ProgressEstimate:
 
 
 def after(now: TrainProgress, done: int, total: int = 0) -> TrainProgress:
-    """Return the progress ``now`` of a training, counted from before the ``done`` virtual steps of earlier trainings.
-    Its total is at least ``total``."""
+    """Return the progress ``now`` of a training, with the ``done`` virtual steps of earlier trainings added to its
+    steps and to its total. The total is at least ``total``."""
     return replace(now, steps=done + now.steps, total_steps=max(total, done + now.total_steps))

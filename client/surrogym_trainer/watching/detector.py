@@ -21,8 +21,9 @@ Without a change the error e of a step has these parts, of which z = (e - m) / s
 - noise of standard deviation s. The stream shows it, beginning with the model's error on left-out samples.
 
 A single error counts for at most ``MOST`` deviations, so that one spike is no alarm. Noise with heavier tails than a
-normal variable pays some bets more than 1 on average. What the stream has paid a bet, up to ``MOST_PAID``, divides its
-evidence. Errors that resemble those of the step before, beyond their mean, raise the rate of false alarms.
+normal variable can give a bet an average L above 1. So each L of this bet is divided by its average L in the stream so
+far, limited to the range from 1 to ``MOST_PAID``. Errors that resemble those of the step before, beyond their mean,
+raise the rate of false alarms.
 
 Shapes: O outputs, B bets.
 """

@@ -204,8 +204,8 @@ class Watcher:
         )
 
     def _quarters(self, inputs: Array) -> NDArray[np.intp]:
-        """Return the quarter, 0 to 3, of its range in which each of the K inputs with a range is: (n, K), for n rows of
-        coordinates and action entries (n, C + F). Values outside of a range count as in its first or last quarter."""
+        """Return the quarter (n, K), 0 to 3, of its range in which each of K inputs with a range lies, for n rows of
+        coordinates and action entries (n, C + F). A value outside the range counts as in its first or last quarter."""
         names = [*self._view.spec.coordinate_names, *_actions(self._view.spec)]
         columns = inputs[:, [names.index(name) for name, _, _ in self._inputs]]
         low, high = (np.array([one[end] for one in self._inputs]) for end in (1, 2))

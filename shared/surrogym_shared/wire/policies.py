@@ -172,8 +172,7 @@ class AddPolicy(Request):
 
 def _require_sane(place: str, value: Any, depth: int) -> None:
     """Raise ``ValueError`` unless a value of lists and objects has only finite numbers of at most ``MAX_MEASURED``,
-    text
-    without NUL, and at most ``depth`` nested levels. ``place`` is the value's name in the message."""
+    text without NUL, and at most ``depth`` nested levels. ``place`` is the value's name in the message."""
     if depth < 0:
         raise ValueError(f"{place}: expected at most {CARD_DEPTH} levels of lists and objects, got more")
     if isinstance(value, dict):

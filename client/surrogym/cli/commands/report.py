@@ -54,7 +54,7 @@ def command(
         from surrogym_trainer.report.known import collect, cuts_of
 
         known = collect(api, surrogate, policy, controller)
-        # maps of the model's uncertainty; if they can't be computed, none and the reason
+        # maps of the model's uncertainty; if they can't be computed, an empty list, and the reason in ``lacking``
         shown, lacking = cuts_of(api, known)
         update(0.3, "drawing")
         from surrogym_trainer.report.files import write

@@ -32,7 +32,7 @@ ALMOST_ALL = 0.75
 class _Face:
     term: Term
     level: float
-    points: NDArray[np.bool_]  # which points of the boundary lie on the face (K,)
+    points: NDArray[np.bool_]  # (K,) mask of those of K boundary points that lie on the face
 
 
 def has_face(spec: EnvironmentSpec, terms: Sequence[Term], bounds: Array, states: Array) -> bool:
@@ -49,7 +49,7 @@ def has_face(spec: EnvironmentSpec, terms: Sequence[Term], bounds: Array, states
 
 
 def alone(spec: EnvironmentSpec, terms: Sequence[Term], bounds: Array, states: Array) -> NDArray[np.bool_]:
-    """Return which points of the boundary (K,) have no quantity whose value (level) another point has too.
+    """Return a mask (K,) of those of K boundary points that share the value (level) of no quantity with another point.
 
     Args:
         spec: the environment.
@@ -75,8 +75,8 @@ def box(
         spec: the environment.
         terms: quantities that the inequalities may limit.
         bounds: K points of the boundary (K, C).
-        states: states inside and outside the region (n, C).
-        inside: which of these states are in the region (n,).
+        states: states (n, C) inside and outside the region.
+        inside: mask (n,) of those of these states that are in the region.
     """
     left, chosen = np.ones(len(bounds), dtype=bool), list[tuple[int, Inequality]]()
     sided = [
@@ -99,7 +99,7 @@ def box(
 
 
 def contains(spec: EnvironmentSpec, when: Sequence[Inequality], states: Array) -> NDArray[np.bool_]:
-    """Return which of the states (n, C) fulfil all inequalities ``when`` (n,)."""
+    """Return a mask (n,) of those of the states (n, C) that fulfil all inequalities ``when``."""
     return np.asarray(np.all([holds(spec, one, states) for one in when], axis=0))
 
 

@@ -32,7 +32,7 @@ BATCH = 12
 ENOUGH = 4  # bisections begin once this number of steps has the rarer one of the two reward values
 POINTS = 12  # number of boundary points to find: twice the unknowns of an ellipsoid in three dimensions
 HALVINGS = 24
-COARSE = 10  # the first steps of a bisection, this many, are far enough from the boundary to test a formula of it
+COARSE = 10  # number of first steps of a bisection, which are far enough from the boundary to test a formula of it
 # To find a neighbour of a boundary point, one end of its bisection moves by this share of the states' range.
 NEAR = 0.02
 FLAT = 1e-3  # if a singular value is below this share of the largest one, more than one ellipsoid fits the points
@@ -276,7 +276,7 @@ def _ellipsoid(group: Sequence[Term], x: Array, elsewhere: Array) -> tuple[Quant
         return None
     if np.abs(others @ weights - 1).max() <= LEVEL:
         return None
-    scale = np.sqrt(a / (1 + (b**2 / (4 * a)).sum())) / reach  # 1 / r of each entry
+    scale = np.sqrt(a / (1 + (b**2 / (4 * a)).sum())) / reach  # (k,) 1 / r_i for the semi-axes r_i
     centre = middle - reach * b / (2 * a)
     return tuple(
         Quantity(term=float(s) * (term + Term.constant(-float(c))))

@@ -188,7 +188,7 @@ class Process:
 
 
 def _extract(archive: Archive, directory: Path, others: Sequence[object]) -> bytes:
-    """Extract the FMU, and return a digest (16 bytes) of its file and of ``others``, all that a snapshot depends on."""
+    """Extract the FMU, and return a digest (16 bytes) of its file and of ``others``: snapshots depend on both."""
     from fmpy import extract
 
     try:

@@ -42,7 +42,7 @@ class Guard:
 
     def __init__(self, spec: EnvironmentSpec, program: Program | None = None) -> None:
         self._spec = spec
-        self._program = program  # of a named fallback; None if the fallback is terms
+        self._program = program  # program of a named fallback; None if terms of the state give its action
         self._at = np.zeros(len(spec.coordinates))
         self._change = np.zeros(len(spec.coordinates))  # (C,) absolute change of each coordinate in the last step
         self._margins = margins(spec)

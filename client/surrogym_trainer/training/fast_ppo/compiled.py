@@ -164,8 +164,8 @@ def add(total: Floats, more: Floats) -> None:
 
 @inlined
 def slope_of(log: np.float32, before: np.float32, advantage: np.float32, clip: np.float32) -> np.float32:
-    """Return the derivative of a row's loss with respect to its log probability; 0 if the probability ratio is
-    clipped."""
+    """Return the derivative of a row's loss with respect to its log probability ``log``; 0 if the ratio to the
+    probability before, whose logarithm is ``before``, is clipped to 1 - ``clip`` to 1 + ``clip``."""
     ratio = np.float32(math.exp(log - before))
     free = ratio <= ONE + clip if advantage > NONE else ratio >= ONE - clip
     return -advantage * ratio if free else NONE
@@ -184,7 +184,10 @@ def bounded(
     by_further: Floats,
 ) -> None:
     """Replace the outputs y (n, F) for continuous actions by the derivatives of the loss with respect to these outputs.
-    Add its derivatives with respect to the logarithms of the standard deviations to ``by_further`` (F,)."""
+    Add its derivatives with respect to the logarithms of the standard deviations to ``by_further`` (F,).
+
+    ``further`` (F,) are these logarithms. The other arguments are those of ``update``, for n rows.
+    """
     inverse = np.empty_like(further)
     for j in range(further.size):
         inverse[j] = math.exp(-further[j])
@@ -217,7 +220,7 @@ def log_softmax(scores: Floats) -> None:
 @compiled
 def choices(y: Floats, actions: Floats, logs: Floats, advantages: Floats, clip: np.float32, counts: Ints) -> None:
     """Replace the outputs y (n, A) for discrete actions by the derivatives of the loss with respect to these
-    outputs."""
+    outputs. The other arguments are those of ``update``, for n rows."""
     for i in range(len(y)):
         log, begin = NONE, 0
         for k in range(counts.size):
@@ -254,8 +257,8 @@ def normalised(advantages: Floats) -> Floats:
 def adam(
     parameters: Floats, gradient: Floats, first: Floats, second: Floats, updates: int, largest: float, rate: float
 ) -> None:
-    """Take step number ``updates`` of Adam, with the gradient (P,) scaled to a norm of at most ``largest``,
-    in place."""
+    """Take step number ``updates`` of Adam, with the gradient (P,) scaled to a norm of at most ``largest`` and the
+    learning rate ``rate``. Parameters (P,) and moments ``first`` and ``second`` (P,) change in place."""
     squares = NONE
     for i in range(gradient.size):
         squares += gradient[i] * gradient[i]

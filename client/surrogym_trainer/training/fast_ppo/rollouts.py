@@ -92,7 +92,7 @@ class Collector:
 
     def _end(self, ended: NDArray[np.bool_], lost: NDArray[np.bool_]) -> list[float]:
         """Begin the sums of returns anew in the lanes that ``ended`` (N,) marks. Returns the returns of the ended
-        episodes, except those of ``lost`` (N,) ones."""
+        episodes, except in the lanes ``lost`` (N,), whose session the server lost."""
         earned: list[float] = self._earned[ended & ~lost].tolist()
         if self._penalised:
             self._penalties.extend(self._penalty[ended].tolist())
@@ -137,7 +137,7 @@ class RewardScale:
         self._mean, self._variance, self._count = 0.0, 1.0, 1e-4
 
     def __call__(self, reward: NDArray[Any], ended: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """Return scaled rewards (N,). Discounted returns of episodes that ``ended`` (N,) restart at zero."""
+        """Scale the rewards (N,) of a step. In lanes that ``ended`` (N,) marks, the discounted return restarts at 0."""
         self._returns = self._returns * self._gamma + reward
         self._learn()
         scaled = np.clip(reward / np.sqrt(self._variance + 1e-8), -LARGEST_REWARD, LARGEST_REWARD)

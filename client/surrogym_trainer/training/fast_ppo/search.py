@@ -223,7 +223,8 @@ class _Training:
         return number, not self._checks.saturated and self._checks.gained(before)
 
     def _hopeless(self, own: int, left: int) -> bool:
-        """Return whether the network has learned nothing in its first rollouts, and there is time for another one."""
+        """Return whether a network has learned nothing in its first rollouts (``own``, their number), and the rollouts
+        ``left`` are enough for another network."""
         return own == self._patience <= left and not self._checks.learned
 
     def _candidates(self) -> Iterator[tuple[Learner, int]]:
