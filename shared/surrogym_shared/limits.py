@@ -21,6 +21,8 @@ from surrogym_shared.terms import evaluate
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 CORNERS = 10  # with at most this many coordinates, all corners of the start ranges are checked
+FEWEST_LEFT = 2  # a machine stops only if at least this number of its episodes left a limit
+LEFT_LEVEL = 0.01  # greatest probability that a machine stops although it keeps twice the allowed probability
 STARTS = 1_000  # number of random start states at which the limits are checked
 
 
@@ -109,6 +111,12 @@ def left_too_often(left: int, episodes: int, share: float, level: float) -> bool
         for k in range(left, episodes + 1)
     )
     return math.fsum(tail) < level
+
+
+def must_stop(left: int, episodes: int, probability: float) -> bool:
+    """Return whether a machine must take no further episodes: at least two of so many ``left`` a limit, and these are
+    more than twice the allowed ``probability`` explains. A stop by mistake has a probability of at most 1 %."""
+    return left >= FEWEST_LEFT and left_too_often(left, episodes, 2 * probability, LEFT_LEVEL)
 
 
 class Step(Protocol):

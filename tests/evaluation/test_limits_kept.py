@@ -7,9 +7,10 @@ import json
 import numpy as np
 import pytest
 
-from support.limited import SPEC, PatientCart, with_limits
+from support.limited import RAIL, SPEC, Cart, PatientCart, with_limits
 from support.rated import RATED, RatedRail
 from surrogym_sampler.original.episodes import open_episode
+from surrogym_shared.spec import Limits, Term
 from surrogym_trainer.evaluation.evaluator import Evaluation, EvaluationSettings, evaluate
 from surrogym_trainer.evaluation.limits import LimitsKept, limits_kept
 
@@ -78,3 +79,18 @@ def test_the_summary_of_limits_is_json_with_an_exact_interval() -> None:
     summary = json.loads(json.dumps(counted(0, 100).summary()))
     assert summary["interval"] == pytest.approx([0.0, 0.0362], abs=1e-4)
     assert "0 of 100 episodes left a limit" in counted(0, 100).words()
+
+
+def test_an_evaluation_of_a_machine_ends_early_if_the_limits_are_left_more_often_than_allowed() -> None:
+    spec = with_limits(Limits(keep=(RAIL,), fallback=(Term.constant(1.0),)))  # a fallback that drives off the rail
+    always = lambda shown: np.ones((len(shown), 1))  # noqa: E731
+    said: list[str] = []
+    stopped = evaluate(
+        always, lambda: open_episode("cart:Cart", spec, lambda: Cart(spec)), EvaluationSettings(10), remark=said.append
+    )
+    assert len(stopped.returns) == 2
+    assert [line for line in said if line.startswith("2 of 2 episodes left a limit")]
+    simulated = evaluate(
+        always, lambda: open_episode("cart:Cart", spec, lambda: PatientCart(spec)), EvaluationSettings(10)
+    )
+    assert len(simulated.returns) == 10, "nothing is damaged in a simulator"

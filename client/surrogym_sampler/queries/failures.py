@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from surrogym_sampler.original.errors import LimitsLeft, MachineFails
-from surrogym_shared.limits import left_too_often, limits_of, room
+from surrogym_shared.limits import limits_of, must_stop, room
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import NewSample
 
@@ -16,9 +16,6 @@ FIRST_FEW = 4  # a machine that has never answered counts as broken after this n
 MANY = 8  # a machine that has answered before counts as broken after this number of failed queries in a row
 # Wait in seconds after a failure: the first, doubled with each failure, to the longest.
 FIRST_DELAY, LONGEST_DELAY = 1.0, 30.0
-FEWEST_LEFT = 2  # a sampler stops only if at least this number of its rollouts left a limit
-# Probability that a sampler stops by mistake, although at most twice the allowed share of its rollouts leave a limit.
-LEFT_LEVEL = 0.01
 
 
 class Failures:
@@ -88,8 +85,7 @@ class Violations:
         self._rollouts += 1
         self._left += bool(left.any())
         self._limits += left
-        share = 2 * self._spec.limits.probability
-        self._too_many = self._left >= FEWEST_LEFT and left_too_often(self._left, self._rollouts, share, LEFT_LEVEL)
+        self._too_many = must_stop(self._left, self._rollouts, self._spec.limits.probability)
 
     def check(self) -> None:
         """Raise ``LimitsLeft`` if too many rollouts left a limit, before further queries begin."""

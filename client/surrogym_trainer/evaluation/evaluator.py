@@ -17,6 +17,7 @@ from surrogym_sampler.original.episodes import draw
 from surrogym_sampler.original.errors import RAISED, EvaluationFailed, PolicyMisfit
 from surrogym_sampler.original.fitting import check_policy
 from surrogym_sampler.original.protocol import LONGEST_EPISODE
+from surrogym_shared.limits import must_stop, past
 from surrogym_shared.spec import Coordinate, EnvironmentSpec, Success, limits
 from surrogym_shared.terms import holds
 from surrogym_shared.wire import TraceRank
@@ -179,7 +180,8 @@ def evaluate(
         open_episode: opens one instance of the environment.
         settings: number of episodes, their starts and the environment's perturbation.
         progress: called after every step.
-        remark: called with a sentence, once, if the first episodes are equal and others are still to begin.
+        remark: called with a sentence if the first episodes are equal and others are still to begin, and if no other
+            episode of a machine begins because too many left a limit.
         trained_for: specification that the policy was trained for, such as that of its card. The environment must fit.
 
     Returns:
@@ -290,23 +292,26 @@ class _Run:
     ) -> None:
         self.settings = settings
         self.begun = 0  # number of real steps begun, including interrupted and failed ones
+        self._wanted = settings.episodes  # number of episodes to take
         self._seeded = True
         self._policy = policy
         self._progress = progress
         self._remark = remark
+        self._looked = False  # whether the first episodes were compared with each other
         self._tallies: list[_Tally] = []
 
     def on(self, instances: Sequence[Episode], between_steps: Callable[[], None]) -> Evaluation:
         """Run all episodes in these open instances of the environment, and return the result. ``between_steps`` is
         called each time all running episodes have taken a step."""
         free, running = list(instances), list[_Tally]()
-        while running or len(self._tallies) < self.settings.episodes:
+        while running or len(self._tallies) < self._wanted:
             running += self._begin(free)
             self._step(running)
             free = [tally.episode for tally in running if tally.over]
             if free:
                 running = [tally for tally in running if not tally.over]
                 self._look_for_equal_ones()
+                self._stop_if_limits_are_left()
             self._tell()
             between_steps()
         return replace(_account(self._tallies), seeded=self._seeded)
@@ -317,7 +322,7 @@ class _Run:
         before = _reset(free[0], self.settings) if first == 0 else None
         begun = [
             _Tally(first + i, episode, _start(episode, self.settings, first + i), self._noise(first + i))
-            for i, episode in enumerate(free[: self.settings.episodes - first])
+            for i, episode in enumerate(free[: self._wanted - first])
         ]
         if before is not None:
             self._seeded = _same_start(free[0].spec, before, begun[0].moment.coordinates)
@@ -351,13 +356,32 @@ class _Run:
         over = [tally for tally in self._tallies if tally.over]
         if self._remark is None or len(over) < FEW_EQUAL or len(self._tallies) == self.settings.episodes:
             return
-        remark, self._remark = self._remark, None
-        first = over[0].trace
+        first, remark = over[0].trace, self._remark
+        if self._looked:
+            return
+        self._looked = True
         if all(_is_equal(first, tally.trace) for tally in over[1:]):
             remark(
                 f"the first {len(over)} of {self.settings.episodes} episodes are equal in every number: if nothing is "
                 "random, all will be; --episodes takes fewer"
             )
+
+    def _stop_if_limits_are_left(self) -> None:
+        """Begin no other episode if too many left a limit of the specification. A simulator, which nothing damages,
+        takes all of them."""
+        over = [tally for tally in self._tallies if tally.over]
+        spec, simulated = over[0].episode.spec, over[0].episode.parallel
+        if spec.limits is None or simulated or len(self._tallies) == self._wanted:
+            return
+        left = sum(bool(past(spec, np.stack(tally.path)).any()) for tally in over)
+        if must_stop(left, len(over), spec.limits.probability):
+            self._wanted = len(self._tallies)
+            if self._remark is not None:
+                self._remark(
+                    f"{left} of {len(over)} episodes left a limit, which is more than the allowed "
+                    f"{100 * spec.limits.probability:g} % explain, so no other episode begins: choose a larger margin, "
+                    "a smaller range of actions, or a fallback that holds, and train anew"
+                )
 
     def _tell(self) -> None:
         if self._progress is not None:
