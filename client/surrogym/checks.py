@@ -67,7 +67,8 @@ def share(what: str, value: Any) -> float:
 
 def states(definition: EnvironmentDefinition, what: str, values: Any) -> Floats:
     """Return ``values`` as an array (v, C): v states, at least one, of C coordinates. Raises ``InvalidInput`` if they
-    have another shape, are not finite, or lie absurdly far from the sampling range."""
+    have another shape, are not finite, or lie absurdly far from the sampling range.
+    ``what`` is the name of the values in the message."""
     rows = check_coordinates(definition, what, _numbers(what, values))
     if not len(rows):
         raise InvalidInput(f"{what}: expected at least one state, got none")
@@ -101,8 +102,8 @@ def real_step(definition: EnvironmentDefinition, step: RealStep) -> RealStep:
 
 
 def _near(definition: EnvironmentDefinition, what: str, rows: Floats) -> Floats:
-    """Return states (n, C) if they are finite and no more than about ``FARTHEST`` widths of the sampling range away
-    from it; otherwise raise ``InvalidInput``."""
+    """Return the states ``rows`` (n, C) if they are finite and no more than about ``FARTHEST`` widths of the sampling
+    range away from it; otherwise raise ``InvalidInput``, with the name ``what`` in the message."""
     if not np.isfinite(rows).all():
         raise InvalidInput(f"{what}: expected finite numbers, got {_shown(rows.tolist())}")
     for index, coordinate in enumerate(definition.coordinates):

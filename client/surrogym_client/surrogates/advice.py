@@ -188,7 +188,7 @@ def _end(value: float | None) -> str | None:
 
 
 def _steps_to_go(view: SurrogateView, worst: OutputFidelity, models: Sequence[ModelView]) -> int | None:
-    """Forecast the real steps until the output reaches its target; None if it does not improve.
+    """Forecast the real steps until the output reaches its target; None if it does not improve, or far too slowly.
 
     The gap to the target is assumed to shrink as it did over the last half of the fits.
     """
@@ -208,7 +208,7 @@ def _steps_to_go(view: SurrogateView, worst: OutputFidelity, models: Sequence[Mo
 
 
 def _too_slow(worst: OutputFidelity, models: Sequence[ModelView]) -> str:
-    """Describe that more real steps don't help an output enough, by its error over the last half of the fits."""
+    """Return a sentence that more real steps hardly help an output, with its errors at the last half of the fits."""
     seen = [
         (model.samples, output.leave_one_out_error)
         for model in models[len(models) // 2 :]

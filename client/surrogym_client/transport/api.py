@@ -244,8 +244,8 @@ class Api:
     ) -> list[wire.QueryView]:
         """Add queries of your own to the queue.
 
-        A query is a state and an action: coordinates (n, C) and action (n, F). If the original environment can only be
-        reset, a query is a sequence of T actions (T, F). Queries of an audit don't count towards the budget.
+        Give n queries of one step by their states, ``coordinates`` (n, C), and their actions, ``action`` (n, F); or
+        give ``rollouts``, each T actions (T, F) from a reset. Queries of an audit don't count towards the budget.
         """
         body = (wire.AuditModel if audit else wire.AddQueries)(
             coordinates=[list(row) for row in coordinates] or None,

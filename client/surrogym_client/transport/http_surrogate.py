@@ -205,8 +205,8 @@ class HttpSurrogate:
         read: Callable[[bytes, Shape], tuple[int, T]],
         timeout: float,
     ) -> T:
-        """Send a request that changes the session, with the next sequence number. If it fails, the next request has the
-        same number."""
+        """Send the request ``what``, which changes the session, and return its result. ``write`` makes the body from
+        the sequence number; ``read`` parses the reply. If the request fails, the next one has the same number."""
         live = self._live.get(session) or self._look_up(session)
         sent = Sent(live.seq + 1, what, write(live.seq + 1, live.shape), read, timeout)
         result: T
@@ -242,7 +242,7 @@ class HttpSurrogate:
                 if behind is None or behind >= sent.seq or returns == _RETURNS:
                     raise
                 returns += 1
-                with suppress(SeqConflict):  # the server restored a checkpoint again; the next attempt finds the number
+                with suppress(SeqConflict):  # the server restored a checkpoint again, so try again
                     self._send_again(live, window, behind)
 
     def _send_again(self, live: _Live, window: ResendBuffer, behind: int) -> None:

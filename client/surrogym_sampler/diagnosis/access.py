@@ -218,8 +218,8 @@ class _Looking:
         return bool(((at >= ends[:, 0]) & (at <= ends[:, 1])).all())
 
     def _between(self, ones: Sequence[RealStep], others: Sequence[RealStep]) -> float:
-        """Return the largest difference between two lists of steps: of next states as a share of the range, of rewards
-        relative. It is 1 if the lists have different lengths."""
+        """Return the largest difference between two lists of steps. Differences of next states are shares of the
+        sampling range; those of rewards are relative. If the lists have different lengths, it is 1."""
         if len(ones) != len(others):
             return 1.0  # one episode ended earlier than the other, so they count as entirely different
         states = [self._apart(a.next_coordinates, b.next_coordinates) for a, b in zip(ones, others, strict=True)]

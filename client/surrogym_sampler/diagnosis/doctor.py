@@ -275,7 +275,7 @@ def _one_step(original: IsolatedEnvironment | Executable | Simulated, spec: Envi
 
 
 def _check(step: RealStep, start: Array, action: Array) -> None:
-    """Raise ``StepFailed`` if a sampler could not submit this step as a sample."""
+    """Raise ``StepFailed`` if a sampler could not submit this step from ``start`` with ``action`` as a sample."""
     query = StepQuery(
         id=1,
         number=0,

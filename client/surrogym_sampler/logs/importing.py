@@ -249,8 +249,8 @@ def _keep(path: Path, table: Table, steps: Transitions, where: str | Path | None
 
 
 def _read_or_keep(path: Path, options: Options, where: str | Path | None) -> tuple[ReadLog, Path | None]:
-    """Read a log, and return it with the file of its rejected rows. The file is written even if the log has too few
-    usable steps."""
+    """Read a log, and return it with the file of its rejected rows (see ``keep_rejected``). The file is written even if
+    the log has too few usable steps."""
     try:
         log = read_log(path, options)
     except TooFewSteps as error:

@@ -48,8 +48,8 @@ class ServerPrior(SimulatorPrior):
         self._name = f"{name[:MOST_OF_NAME]}{MARK}{uuid4().hex[:TOKEN]}"
 
     def learn(self, say: Progress) -> SurrogateFile:
-        """Let the server learn a model of the simulator from ``steps`` of its steps, and return the model. Progress is
-        reported to ``say``.
+        """Let the server learn a model of the simulator from simulated steps, whose number is the attribute ``steps``,
+        and return the model. Progress is reported to ``say``.
 
         Raises:
             SurrogymClientError: the server can't be reached, or refuses a request.

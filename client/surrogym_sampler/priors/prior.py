@@ -110,7 +110,8 @@ class SimulatorPrior(ABC):
 
     @abstractmethod
     def learn(self, say: Progress) -> SurrogateFile:
-        """Learn a model of the simulator with its current parameters, from ``steps`` of its steps, and return it.
+        """Learn a model of the simulator with its current parameters from simulated steps, and return the model. The
+        attribute ``steps`` is their number.
 
         ``say`` is called with the share of the work that is done, and a few words.
         """

@@ -74,7 +74,8 @@ def deploy(controller: Controller, target: str, out: Path) -> list[Path]:
 
 
 def _copy(made: Path, out: Path, names: list[Path]) -> None:
-    """Copy the files that do not exist yet; if one fails, delete those that were copied."""
+    """Copy the files ``names`` from the folder ``made`` to ``out``, unless they exist there. After an error, delete the
+    copies."""
     written = []
     try:
         for name in (name for name in names if not (out / name).exists()):

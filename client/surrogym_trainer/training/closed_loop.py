@@ -192,7 +192,7 @@ def shares(settings: TrainSettings, rounds: int) -> tuple[int, int]:
 
     Steps that collect visited states are not included. If the user requested a number of steps, it limits the whole
     training. Otherwise the last training has the suggested number; the rounds add to it, up to the paper's maximum. In
-    both cases a round has the same share of the last training.
+    both cases each round takes ``ROUND_SHARE`` of the steps of the last training, or less if there are many rounds.
     """
     planned, share = planned_steps(settings), min(ROUND_SHARE, 1 / (rounds + 1))
     if settings.total_steps is not None:

@@ -408,7 +408,8 @@ def _unaudited(subject: Subject, promise: Promise, why: str) -> Handover:
 
 
 def _without(view: SurrogateView, promise: Promise, floor: float | None, why: str) -> Handover:
-    """Return a handover without an audit. It is trusted only if the design is ready."""
+    """Return a handover without an audit; ``why`` is the reason. The promise is trusted only if the design is ready and
+    the interval is not doubtful compared with ``floor``, the return of an untrained policy."""
     if (doubt := _doubtful(promise, floor)) is not None:
         return Handover(promise, None, False, f"{doubt}; not audited: {why}")
     if view.phase == "ready":

@@ -165,7 +165,7 @@ def _is_angle(roles: Roles, steps: Transitions, name: str, index: int, notes: li
 
 
 def _bounds(roles: Roles, name: str, after: Floats, ends: tuple[float, float], notes: list[str]) -> Bounds | None:
-    """Return the limits of a coordinate: declared ones, or extreme values at which many steps end exactly."""
+    """Return the limits of a coordinate: declared ones, or extreme values ``ends`` at which many steps end exactly."""
     low, high = roles.limits.get(name, (None, None))
     limits = [end if _stays_at(after, end, ends) else None for end in ends]
     for side, end, declared in (("low", limits[0], low), ("high", limits[1], high)):

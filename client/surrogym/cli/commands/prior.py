@@ -203,7 +203,7 @@ def _file_of(api: Api, source: str) -> bytes | None:
 
 
 def _has_ended(view: SurrogateView, fitted: int) -> bool:
-    """Whether a design has ended, with no open queries, and with a fit after the round number ``fitted``."""
+    """Whether a design has ended, has no open queries, and has fitted a model after the round number ``fitted``."""
     from surrogym_shared.states import COMPLETED
 
     return view.phase in COMPLETED and view.round > fitted and not _asked(view)

@@ -244,8 +244,9 @@ def _sample_here(
 
 
 def _warn_of_kill(name: str, spec: EnvironmentSpec, output: Output) -> None:
-    """Print a warning if limits hold after ``kill -9`` of the sampler only if the environment's program keeps them.
-    Other environments are in a process that survives the sampler until the machine rests."""
+    """Print a warning for an environment that is a program and has limits: after ``kill -9`` of the sampler, only the
+    program itself can keep them. Other environments run in a process that survives the sampler until the machine rests.
+    """
     from surrogym_sampler.original.executables import is_executable
     from surrogym_shared.terminal import say
 

@@ -68,8 +68,8 @@ def _basis(frame: EnvironmentSpec, turning: Sequence[str]) -> list[Term]:
 
 
 def _weights(design: Array, entry: Array, tolerance: float) -> Array | None:
-    """Return weights (b,) with which b basis terms, at n states (n, b), explain an observation entry (n,); None if no
-    weights do.
+    """Return weights (b,) with which b basis terms, whose values at n states are ``design`` (n, b), explain an
+    observation entry (n,); None if no weights do.
 
     An observation in single precision has rounding errors, which many terms together would explain too. So a single
     term is tried first, then rounded weights of all terms, then exact ones.

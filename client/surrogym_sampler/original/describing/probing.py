@@ -212,7 +212,8 @@ def _leaving(counted: Counted, seen: Seen, rng: np.random.Generator) -> float:
 
 
 def _replayed(counted: Counted, seen: Seen, scale: Array) -> float:
-    """Repeat the first episode with its seed and actions, and return the largest error of its first steps."""
+    """Repeat the first episode with its seed and actions, and return the largest difference of its first
+    steps from the first time, as a share of ``scale``."""
     counted.reset(RESETS)
     rows = np.flatnonzero(seen.episodes == 0)[:PLACES]
     errors = []
