@@ -11,7 +11,11 @@ SHORTEST = 4  # if the environment has no snapshots, a planned round has at leas
 
 def plan_rollouts(round: Round) -> tuple[Query, ...]:
     """Return action sequences (rollouts) that are planned in the model to give most information about the outputs whose
-    confidence index is below the target."""
+    confidence index is below the target.
+
+    The value of a sequence is summed over these outputs. Sequences are not chosen from the candidates of single steps.
+    If some of those are reserved, the first sequence should show an end of an episode or a jump of the reward.
+    """
     request, judgement = round.request, round.judgement
     aim = Aim(
         columns=round.outputs,

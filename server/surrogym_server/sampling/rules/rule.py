@@ -8,4 +8,5 @@ from surrogym_server.sampling.round import Round
 from surrogym_shared.nouns import Query
 
 Rule = Callable[[Round], tuple[Query, ...] | None]
-"""Function that returns the queries of a round, or () to end the design. If it returns None, the next rule is tried."""
+"""Function that returns the queries of a round, or (), which ends the design if no earlier query is open. If it returns
+None, the next rule is tried."""
