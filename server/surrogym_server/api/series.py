@@ -1,4 +1,5 @@
-"""Metrics of surrogates in the text format of Prometheus, written without the library, which takes 10 us for each."""
+"""Metrics of surrogates in the text format of Prometheus, without the Prometheus library, which takes 10 us for a
+value."""
 
 from __future__ import annotations
 

@@ -108,7 +108,8 @@ def _source_of(model: DynamicsModel) -> StepSource:
 
 
 def _variables(definition: EnvironmentDefinition, units: Sequence[str]) -> Iterator[Variable]:
-    """Yield the variables of the FMU, in the order of the values in ``twin.c``.
+    """Yield the variables of the FMU, in the order of the values in ``twin.c``. ``units`` has a unit for each
+    coordinate.
 
     If two have the same name, the second gets its kind as a prefix, such as ``observation``.
     """

@@ -62,7 +62,7 @@ class ModelCache:
             return self._load(surrogate, version)
         except Damaged:
             with self._lock:
-                # Forget which version is the newest, because this may be the damaged one. The storage knows the newest.
+                # The version cached as the newest may be the damaged one. Without it, ``latest`` asks the storage.
                 self._latest.pop(surrogate, None)
             raise
 

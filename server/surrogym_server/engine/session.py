@@ -42,7 +42,8 @@ class Fingerprint:
     __slots__ = ("_digest", "_parts")
 
     def __init__(self, *parts: object, digest: str | None = None) -> None:
-        """Keep the hash of a request, or the values from which it is computed later; these must not change."""
+        """Keep ``digest``, the hash of a request, or if it is None the values ``parts``, from which the hash is
+        computed later; these must not change."""
         self._parts = parts
         self._digest = digest
 
@@ -136,7 +137,8 @@ def answered(session: Session, request: Fingerprint, outcome: Outcome) -> tuple[
 
 
 def reset_session(session: Session, seed: Seeds, mask: Bools | None, latest: int) -> tuple[Session, ResetResult]:
-    """Start new episodes in the lanes of ``mask`` (None: in all lanes), under the model version ``latest``."""
+    """Start new episodes in the lanes of ``mask`` (None: in all lanes), under the model version ``latest``. ``seed`` is
+    explained at ``virtual.environment.reset``."""
     lanes, observation = reset(session.definition, session.settings, session.lanes, seed, mask)
     lanes_reset = np.ones(session.settings.num_envs, dtype=bool) if mask is None else mask
     versions = np.where(lanes_reset, latest, session.versions)

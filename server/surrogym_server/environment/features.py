@@ -64,8 +64,8 @@ class FeatureMap:
 
 
 def leading(definition: EnvironmentDefinition) -> tuple[int, ...]:
-    """Return the indices of the leading coordinates: those with two finite bounds at which no other coordinate becomes
-    0, such as a limited speed.
+    """Return the indices of the leading coordinates: those with two finite bounds, such as a limited speed, except
+    coordinates with a wall, which is a bound at which another coordinate becomes 0.
 
     Models predict leading coordinates first, because their next value can be an input of other outputs.
     """

@@ -132,8 +132,8 @@ def _covariances(head: Floats, rows: Floats, own: Floats, smooth: Floats) -> Flo
     """Return the prior covariances of the inputs ``own`` (d, B) with the n training points, (n, B).
 
     Args:
-        head: matrix HEAD of the process.
-        rows: matrix POLYNOMIALS of the process.
+        head: scalars of the process, such as its scale: its matrix HEAD (1, 11).
+        rows: coefficients of the polynomial parts of the process: its matrix POLYNOMIALS (5 + 2 n, d).
         own: inputs of the process.
         smooth: squared exponentials of the inputs with the n points and then with their mirror images, if there is a
             reflection, (S, B).
@@ -182,8 +182,8 @@ def _std(head: Floats, rows: Floats, own: Floats, explained: Floats, std: Floats
     """Write the standard deviation without noise, sqrt(k(x, x) - |L^-1 k|^2), in the output's unit, to ``std`` (B,).
 
     Args:
-        head: matrix HEAD of the process.
-        rows: matrix POLYNOMIALS of the process.
+        head: scalars of the process, such as its scale: its matrix HEAD (1, 11).
+        rows: coefficients of the polynomial parts of the process: its matrix POLYNOMIALS (5 + 2 n, d).
         own: inputs x of the process, (d, B).
         explained: L^-1 k, (n, B), with the covariances k of the inputs with the n points. Its squares are the variance
             that the points explain.
@@ -219,8 +219,8 @@ def _add_residuals(
     sample each.
 
     Args:
-        head: matrix HEAD of the process.
-        rows: matrix POLYNOMIALS of the process.
+        head: scalars of the process, such as its scale: its matrix HEAD (1, 11).
+        rows: coefficients of the polynomial parts of the process: its matrix POLYNOMIALS (5 + 2 n, d).
         kept, turned: matrices KEPT and TURNED of the process: frequencies of the inputs whose sign a reflection keeps,
             and of those whose sign it changes.
         own: inputs of the process, (d, B).

@@ -245,7 +245,8 @@ def _errors(process: Posterior, x: Tensor, y: Tensor, choices: Sequence[Inputs])
 
 
 def _pooled(numbers: Sequence[int], parts: Sequence[Part], inputs: Sequence[Inputs]) -> Pool:
-    """Fit the common function of the parts, on a subset of the samples if there are many."""
+    """Fit the common function of the parts, on a subset of the samples if there are many. ``numbers`` are the indices
+    of the parts, and ``inputs`` has for each part those of its inputs that are the arguments of the function."""
     first = parts[0]
     x = torch.cat([part.read(read) for part, read in zip(parts, inputs, strict=True)])
     y = torch.cat([first.targets_of(part) for part in parts])

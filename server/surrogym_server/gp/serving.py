@@ -223,7 +223,7 @@ def _weights(posterior: Posterior) -> Tensor:
 
 def _exponents(posterior: Posterior, inputs: Sequence[int], width: int) -> Tensor:
     """Return the columns of the matrix A for one process, (D, n), or (D, 2 n) with mirror images. The product of z =
-    [x, x^2, 1] and A gives the exponents of the squared exponentials."""
+    [x, x^2, 1] and A gives the exponents of the squared exponentials. ``inputs`` and ``width`` are as in ``_in_z``."""
     points = _points(posterior)
     precision = posterior.hyper.lengthscale.square().reciprocal()
     scaled = points / posterior.hyper.lengthscale
@@ -233,14 +233,15 @@ def _exponents(posterior: Posterior, inputs: Sequence[int], width: int) -> Tenso
 
 def _polynomial(posterior: Posterior, inputs: Sequence[int], width: int) -> Tensor:
     """Return the coefficients R (D, n) of z = [x, x^2, 1] in the polynomial covariances of an input x with the n points
-    of one process."""
+    of one process. ``inputs`` and ``width`` are as in ``_in_z``."""
     polynomial, x = posterior.hyper.polynomial, posterior.x
     constant = x.new_full((len(x),), polynomial.constant)
     return _in_z((x * polynomial.linear).T, (x.square() * polynomial.quadratic).T, constant, inputs, width)
 
 
 def _prior(hyper: Hyperparameters, inputs: Sequence[int], width: int) -> Tensor:
-    """Return the coefficients p (D,) of the prior variance k(x, x) = z^2 p, with z^2 = [x^2, x^4, 1]."""
+    """Return the coefficients p (D,) of the prior variance k(x, x) = z^2 p, with z^2 = [x^2, x^4, 1]. ``inputs`` and
+    ``width`` are as in ``_in_z``."""
     polynomial = hyper.polynomial
     constant = polynomial.linear.new_full((1,), hyper.signal_variance + polynomial.constant)
     return _in_z(polynomial.linear[:, None], polynomial.quadratic[:, None], constant, inputs, width)[:, 0]

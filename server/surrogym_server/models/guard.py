@@ -40,6 +40,9 @@ def learn(
 ) -> Learned:
     """Learn a model of the family that the definition names, and check its predictions at a few of the samples.
 
+    ``warm`` has arrays of an earlier fit, at which this fit can start. The model ``prior`` is used if the family has
+    the ability ``TakesPrior``.
+
     Raises:
         InvalidInput: too few samples to learn from.
         NumericalFailure: the fit fails on these samples.

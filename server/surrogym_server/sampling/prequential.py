@@ -52,7 +52,7 @@ class PrequentialScores:
 
 
 def scores_of(predictions: Sequence[Prediction], tolerance: float) -> PrequentialScores | None:
-    """Return the scores of one output's predictions; None if there are none."""
+    """Return the scores of one output's predictions, given its tolerance; None if there are no predictions."""
     if not predictions:
         return None
     error = torch.tensor([p.error for p in predictions], dtype=torch.float64)
@@ -114,7 +114,8 @@ def from_pairs(pairs: Sequence[Sequence[Sequence[float]]]) -> Predictions:
 
 
 def _noise(model: DynamicsModel, like: Tensor) -> Tensor:
-    """Return the standard deviation of a single step's noise that the model has learned, (O,); 0 if it learns none."""
+    """Return the standard deviation of a single step's noise that the model has learned, (O,); 0 if it learns none.
+    ``like`` is a tensor (n, O) that gives the number of outputs."""
     able = offers(model, LearnedNoise)
     return like.new_zeros(like.shape[1]) if able is None else like.new_tensor(able.noise_stds)
 

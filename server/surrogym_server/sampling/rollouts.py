@@ -88,7 +88,7 @@ def first_rollouts(definition: EnvironmentDefinition, steps: int, rng: np.random
 def plan_round(
     model: DynamicsModel, aim: Aim, steps: int, unanswered: Sequence[Query], rng: np.random.Generator
 ) -> list[Query]:
-    """Plan action sequences (rollouts) with ``steps`` real steps in total.
+    """Plan action sequences (rollouts) with ``steps`` real steps in total, for the objective ``aim``.
 
     Each sequence is planned as if the sequences planned before and the unanswered queries had been answered, with the
     results that the model predicts. For a model without the ability ``Lookahead`` they make no difference.
@@ -143,6 +143,7 @@ def _search(
     """Search for the sequence of actions (T, F) with the highest value by the function ``worth``, from any of k
     origins. Each origin consists of s equally likely states; ``origins`` is (k, s, C).
 
+    ``longest`` is the greatest number of actions, and ``population`` the number of sequences that are compared at once.
     Return the sequence, the index of its origin, and its value.
     """
     sequences = random_sequences(definition, population, longest, rng)
@@ -252,8 +253,8 @@ def path_values(model: DynamicsModel, aim: Aim, paths: Paths) -> Tensor:
 
 
 def _view(output: PathOutlook, weight: Tensor, tolerance: float) -> PathView:
-    """Return the properties of paths that an acquisition uses, for one output; ``weight`` (b, T) is the weight of each
-    step."""
+    """Return the values from which an acquisition rates paths with respect to one output, such as its standard
+    deviations along them. ``weight`` (b, T) is the weight of each step, ``tolerance`` that of the output."""
     return PathView(tolerance, weight, lambda: output.std, lambda: output.information(weight, tolerance))
 
 

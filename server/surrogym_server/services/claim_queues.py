@@ -21,8 +21,9 @@ Present = Callable[[], Awaitable[None]]  # function that raises an error if the 
 class _Queue(Generic[T]):
     """Claims (requests for work) that wait for the same kind of work.
 
-    ``answer`` is the last answer that contained no work, and ``version`` the number of the last notice before that
-    answer. If ``heard.version`` still equals ``version``, no notice has come since, so the answer is still valid.
+    ``heard`` listens to notices that work may be available. ``answer`` is the last answer that contained no work, and
+    ``version`` the number of the last notice before that answer. If ``heard.version`` still equals ``version``, no
+    notice has come since, so the answer is still valid.
     """
 
     def __init__(self, listening: ExitStack, heard: Listener) -> None:

@@ -152,7 +152,8 @@ class SampleService:
         return self._definitions.get(name).coordinate_names
 
     def report_steps(self, name: str, steps: int, episodes: int, note: str, key: str) -> LedgerRecord:
-        """Add real steps of an evaluation to the surrogate's counts, once for each key, and return the counts."""
+        """Add ``steps`` real steps of an evaluation of ``episodes`` episodes to the surrogate's counts, once for each key.
+        Return the counts. ``note`` is stored with the report."""
         return self._storage.ledger.report(name, steps, key=key, episodes=episodes, note=note)
 
 

@@ -28,7 +28,7 @@ Plan = Callable[[EnvironmentDefinition, int], tuple[Query, ...]]
 Complete = Callable[[dict[str, Any]], dict[str, Any]]
 
 ABSENT = object()
-READS = 3  # a surrogate's status is read at most this many times, until no fit is stored between its parts
+READS = 3  # if a fit is stored while a surrogate's status is read, it is read again, at most this many times in total
 SHOWN = 120  # a value of a specification is cut to this many characters in an error message
 
 
@@ -192,8 +192,8 @@ class SurrogateService:
     def _read(self, name: str) -> tuple[SurrogateSummary, ModelRecord | None, int]:
         """Return a surrogate's summary, the record of its latest model, and the real steps that its budget has left.
 
-        If a fit is stored between these three reads, they are repeated, so that they fit together, at most ``READS``
-        times.
+        If a fit was stored between these three reads, the results may contradict each other. Then all are read again,
+        at most ``READS`` times in total.
         """
         for _ in range(READS):
             left = self._storage.designs.left(name)

@@ -391,7 +391,8 @@ class Ledger(ABC):
 
     @abstractmethod
     def report(self, name: str, steps: int, *, key: str, episodes: int = 0, note: str = "") -> LedgerRecord:
-        """Add real steps of an evaluation, once for each key, and return the counts of real steps by purpose."""
+        """Add ``steps`` real steps of an evaluation of ``episodes`` episodes, once for each key. Return the counts of real
+        steps by purpose. ``note`` is stored with the report."""
 
     @abstractmethod
     def read(self, name: str) -> LedgerRecord: ...
@@ -461,7 +462,7 @@ class Priors(ABC):
 
     @abstractmethod
     def put(self, name: str, blob: bytes, about: JSON) -> None:
-        """Store a prior, which replaces an earlier one. ``about`` is its description.
+        """Store a prior, which replaces an earlier one. ``blob`` is the file of its model, ``about`` its description.
 
         Adaptive queries without a real step so far are withdrawn, and a fit becomes due.
         """

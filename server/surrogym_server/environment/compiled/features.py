@@ -30,8 +30,8 @@ UNIT_ANGLE = math.sqrt(3) / math.pi  # uniformly distributed angles times this f
 def add_features(tables: TablesBuilder, definition: EnvironmentDefinition, encoder: Encoder) -> int:
     """Add the features of an encoder to the tables, and return the index of their first matrix.
 
-    Features of the lead (the predicted next values of the leading coordinates) come last. They read entries that follow
-    those of coordinates and action.
+    Features of the lead (the predicted next values of the leading coordinates) come last. The indices of
+    the values that features read refer to the sequence [coordinates, action, lead].
     """
     size = len(definition.coordinates)
     rows, weights = np.zeros((len(encoder.columns), 5)), np.zeros((len(encoder.columns), size))

@@ -63,7 +63,8 @@ def add_inverse(tables: TablesBuilder, inverse: ObservationInverse | None) -> in
 
 @compiled
 def clipped(rules: Floats, c: int, value: float) -> float:
-    """Return ``value``, clipped to the limits of the coordinate with index c (see ``EnvironmentDefinition.reach``)."""
+    """Return ``value``, clipped to the limits of the coordinate with index c (see ``EnvironmentDefinition.reach``).
+    ``rules`` is the matrix that ``add_rules`` added."""
     low, high = rules[c, REACH_LOW], rules[c, REACH_HIGH]
     return low if value < low else (high if value > high else value)
 
@@ -71,7 +72,7 @@ def clipped(rules: Floats, c: int, value: float) -> float:
 @inlined
 def settle(rules: Floats, q: Floats) -> None:
     """Apply the rules of the environment to the coordinates q (C, B) of B lanes in place: clip them to limits, set a
-    speed that points into a wall to 0, wrap angles."""
+    speed that points into a wall to 0, wrap angles. ``rules`` is the matrix that ``add_rules`` added."""
     size, lanes = q.shape
     for c in range(size):
         for b in range(lanes):
@@ -91,7 +92,8 @@ def settle(rules: Floats, q: Floats) -> None:
 @inlined
 def repeat(rules: Floats, raw: Floats, q: Floats) -> None:
     """Set the lags among the coordinates q (C, B) of B lanes after a step. A lag is a coordinate that repeats a past
-    value; it is computed from ``raw`` (C + F, B), the coordinates before the step and the action."""
+    value; it is computed from ``raw`` (C + F, B), the coordinates before the step and the action. ``rules`` is the
+    matrix that ``add_rules`` added."""
     size, lanes = q.shape
     for c in range(size):
         lag, source = int(rules[c, LAG]), int(rules[c, SOURCE])

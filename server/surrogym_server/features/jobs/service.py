@@ -49,7 +49,7 @@ class JobService:
         return ()
 
     def train(self, name: str, task: JSON, key: str | None) -> JobRecord:
-        """Queue a training, once for each idempotency key.
+        """Queue a training, once for each idempotency key; ``task`` has its settings.
 
         Raises:
             NoModel: the surrogate has no model yet.

@@ -28,7 +28,7 @@ logger = logging.getLogger(__name__)
 ANSWERING_SECONDS, TAKING_SECONDS = 5.0, 60.0  # longest wait for a host to answer a ping, and to take over a session
 ENDED, SILENT = "has ended and is started again", "does not answer now"
 MOVES = 3  # largest number of hosts that one request tries while its session changes hosts
-REMEMBERED = 10_000  # largest number of cached hosts of sessions, for sessions that have left the host in their id
+REMEMBERED = 10_000  # largest number of sessions whose host is cached, because it is not the host that their id names
 
 
 class _Gone(Exception):
@@ -151,7 +151,7 @@ class RayEngine(SessionEngine):
         number = session.rpartition(".")[2]
         if number.isascii() and number.isdigit() and len(number) <= 4 and int(number) < len(self._hosts):
             return int(number)
-        return crc32(session.encode()) % len(self._hosts)  # another engine made this id, which has no host's number
+        return crc32(session.encode()) % len(self._hosts)  # the id has no host's number: another engine made it
 
     async def _moved(self, session: str, asked: int, error: Exception) -> int:
         """Return the number of the host that has a session, after the host ``asked`` failed with ``error``.

@@ -213,6 +213,8 @@ class RecordedEngine(SessionEngine):
 
     async def _settle(self) -> None:
         """Delete the database records of sessions that the inner engine has ended."""
-        async with self._taking:  # wait: a session that is being taken over has a lease before it is in the engine
+        # Wait until no session is being taken over: such a session has a lease but is not in the engine yet, so its
+        # record would be deleted.
+        async with self._taking:
             await self._leases.remove_all_but([session.id for session in self._inner.sessions()])
             self._behind = {id: seq for id, seq in self._behind.items() if self._leases.holds(id)}

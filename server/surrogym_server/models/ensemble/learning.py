@@ -22,7 +22,8 @@ REWARD_SEED, END_SEED = 1, 2
 
 
 def learn(training: Training, definition: EnvironmentDefinition, samples: Samples) -> NetworkEnsembleModel:
-    """Learn a model from samples. Raises ``InvalidInput`` for fewer than two samples."""
+    """Learn a model from samples, by networks with the settings ``training``. Raises ``InvalidInput`` for fewer than
+    two samples."""
     if len(samples) < MIN_POINTS:
         raise InvalidInput(
             f"a model needs at least {MIN_POINTS} samples, got {len(samples)}; add samples before you learn"

@@ -107,5 +107,5 @@ def drawn_member(noise: Tensor, members: int) -> Tensor:
 
 def between(values: Tensor, correction: int = 1) -> Tensor:
     """Return the variance of values (K, ...) over the K networks (members). Unlike ``torch.var`` it gives no warning
-    for an empty tensor."""
+    for an empty tensor. ``correction`` is the same as in ``torch.var``: 1 divides by K - 1, 0 by K."""
     return values.var(0, correction=correction) if values.numel() else values[0]

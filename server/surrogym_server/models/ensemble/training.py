@@ -48,6 +48,8 @@ Loss = Callable[[Tensor, Tensor], Tensor]  # arguments: predictions of K network
 
 @dataclass(frozen=True)
 class Training:
+    """Settings of the networks and of their training, which ``NetworkEnsembles`` explains."""
+
     members: int
     units: int
     steps: int
@@ -70,8 +72,8 @@ def cross_entropy(predicted: Tensor, target: Tensor) -> Tensor:
 
 
 def train(training: Training, x: Tensor, y: Tensor, loss: Loss, *, quadratic: bool = False) -> Networks:
-    """Fit networks to inputs x (n, d) and targets y (n, p) by minimising ``loss``. If ``quadratic``, their linear part
-    also reads the squares of the inputs."""
+    """Fit networks with the settings ``training`` to inputs x (n, d) and targets y (n, p) by minimising ``loss``. If
+    ``quadratic``, their linear part also reads the squares of the inputs."""
     generator = torch.Generator().manual_seed(training.seed)
     anchors, variances = _priors(training, x.shape[1], y.shape[1], generator)
     linear = basis(x, quadratic)
@@ -125,7 +127,7 @@ def _unlikely(mean: Tensor, log_variance: Tensor, target: Tensor, beta: float) -
 
 
 def _descend(weights: Sequence[Tensor], objective: Callable[[], Tensor], steps: int) -> None:
-    """Minimise the objective by Adam, which changes the weights in place."""
+    """Minimise the objective by ``steps`` steps of Adam, which change the weights in place."""
     adam = torch.optim.Adam(weights, lr=RATE)
     rate = torch.optim.lr_scheduler.CosineAnnealingLR(adam, steps)
     for _ in range(steps):

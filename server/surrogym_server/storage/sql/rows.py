@@ -124,7 +124,8 @@ def insert_queries(
 ) -> list[int]:
     """Insert queries as pending, and return their ids in the same order.
 
-    ``extra`` marks queries that were only chosen because ``improve`` requested them.
+    ``round`` is the number of the design's round that chose them. ``extra`` marks queries that were only chosen because
+    ``improve`` requested them.
     """
     if not new_queries:
         return []

@@ -88,7 +88,8 @@ def open_storage(url: str, synchronous: Synchronous = "full") -> Storage:
 
 
 def _way_out(url: str, message: str) -> str:
-    """Return what a person can do if the PostgreSQL database at ``url`` can't be opened."""
+    """Return what a person can do if the PostgreSQL database at ``url`` can't be opened, with this error
+    ``message``."""
     name = sa.make_url(url).database
     if f'database "{name}" does not exist' in message:
         return f"createdb {name} makes it, or check --database"

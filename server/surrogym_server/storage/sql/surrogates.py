@@ -203,9 +203,10 @@ def withdraw_unbegun(
 ) -> dict[str, Any]:
     """Withdraw those adaptive queries of a design that have no real step so far, and the lease of a running fit.
 
-    A change of target, tolerance, prior or budget needs this. ``budget`` is the new budget if it is lower, else None.
-    With a lower budget, initial queries beyond it are withdrawn too; otherwise, steps that ``improve`` requested are
-    requested again. Returns the columns of the surrogate that the caller has to change.
+    A change of target, tolerance, prior or budget needs this. ``before`` is the surrogate before the change, and
+    ``budget`` the new budget if it is lower, else None. With a lower budget, initial queries beyond it are withdrawn
+    too; otherwise, steps that ``improve`` requested are requested again. Returns the columns of the surrogate that the
+    caller has to change.
     """
     unbegun = is_unbegun(surrogate.id)
     statement = sa.delete(queries).where(unbegun, queries.c.purpose == "adaptive")
@@ -317,7 +318,7 @@ def read_summaries(
 ) -> list[SurrogateSummary]:
     """Return summaries of up to ``limit`` surrogates that meet an SQL condition, oldest first.
 
-    The condition must select a contiguous range of ids.
+    The condition must select a contiguous range of ids. ``counts`` is the cache of the surrogates' numbers of samples.
     """
     statement = (
         sa.select(*SUMMARY_COLUMNS, sa.type_coerce(surrogates.c.spec, sa.Text), NEWEST, *OPEN_COUNTS)

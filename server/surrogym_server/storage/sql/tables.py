@@ -167,7 +167,7 @@ surrogates = sa.Table(
     sa.Column("revision", sa.BigInteger, nullable=False),  # increases with each change that makes a fit due
     # Revision of the surrogate up to which its last fit read the data.
     sa.Column("fitted_revision", sa.BigInteger, nullable=False),
-    # Revision with which the last log is complete. Pending or leased queries don't delay the fit of this revision.
+    # Revision of the surrogate at which its last log was complete. Pending or leased queries don't delay its fit.
     sa.Column("logged_revision", sa.BigInteger, nullable=False, server_default="0"),
     sa.Column("fit_token", sa.Text),
     sa.Column("fit_owner", sa.Text),

@@ -106,7 +106,8 @@ def compiled_step(
 def _divided(
     settings: VirtualSettings, lanes: LaneState, phase: NDArray[np.int8], mask: Bools | None
 ) -> tuple[Bools, Chosen, Bools | None]:
-    """Divide the lanes (parallel environments) into those that this step moves and those that it resets.
+    """Divide the lanes (parallel environments) that ``mask`` (N,) selects into those that this step moves and those
+    that it resets; None selects all. ``phase`` (N,) has the phase of each lane.
 
     Returns:
         A mask (N,) of the lanes to move; the same lanes as a mask or, if they are all, EVERY; and a mask (N,) of the
@@ -216,7 +217,8 @@ def _shown(
     chosen: Ints | None = None,
 ) -> Floats:
     """Return the states (n, C) of the n lanes whose indices are ``chosen``, or of all lanes, as sensors show them: with
-    the measurement errors of the setting ``sensor_noise``."""
+    the measurement errors of the setting ``sensor_noise``. The step changed the lanes' state ``before`` to
+    ``changed``."""
     if not settings.sensor_noise or (chosen is not None and not len(chosen)):
         return changed.q if chosen is None else changed.q[chosen]
     lanes = changed.lanes(before)

@@ -86,7 +86,7 @@ def output_header(output: OutputModel) -> dict[str, Any]:
 def read_output(
     definition: EnvironmentDefinition, entry: dict[str, Any], tensors: Mapping[str, Tensor], prefix: str
 ) -> OutputModel:
-    """Build an output from its entry in the header and its arrays.
+    """Build an output from its entry in the header and its arrays, whose names in ``tensors`` begin with ``prefix``.
 
     Raises:
         LookupError, TypeError, ValueError: the entry is malformed.

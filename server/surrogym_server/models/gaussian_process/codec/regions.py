@@ -44,7 +44,8 @@ def region_tensors(region: Region, prefix: str) -> dict[str, Tensor]:
 def read_region(
     definition: EnvironmentDefinition, entry: Any, tensors: Mapping[str, Tensor], prefix: str
 ) -> Region | None:
-    """Build a region from its entry in the header and its arrays. Return None if ``entry`` is None.
+    """Build a region from its entry in the header and its arrays, whose names in ``tensors`` begin with ``prefix``.
+    Return None if ``entry`` is None.
 
     Raises:
         LookupError, TypeError, ValueError: the entry is malformed.
@@ -61,7 +62,8 @@ def read_region(
 def read_jumps(
     definition: EnvironmentDefinition, entries: Any, tensors: Mapping[str, Tensor], prefix: str
 ) -> tuple[Jump, ...]:
-    """Build the jumps of a reward from their entries in the header and their arrays.
+    """Build the jumps of a reward from their entries in the header and their arrays, whose names in ``tensors`` begin
+    with ``prefix``.
 
     Raises:
         LookupError, TypeError, ValueError: an entry is malformed.

@@ -19,8 +19,10 @@ ODDS = -1.0  # prior log odds of leaving out an input
 # Inputs are left out only if the log evidence increases by at least this much per sample. With a smaller value, some
 # predictions were overconfident.
 WIN = 2.0
-LESS = 0.5  # inputs are left out only if the leave-one-out error falls to at most this share
-# No inputs are left out if there are fewer samples than this, because wrong inputs were left out then.
+# Inputs are left out only if the leave-one-out error without them is at most this multiple of the error with them.
+LESS = 0.5
+# No inputs are left out if there are fewer samples than this. In experiments with fewer, inputs that matter were left
+# out.
 FEWEST = 20
 
 
@@ -88,7 +90,7 @@ def _may_be_dropped(learner: OutputLearner, output: OutputModel) -> Tensor:
 
 def _with_fewer(learner: OutputLearner, output: OutputModel, x: Tensor, y: Tensor, selection: Selection) -> OutputModel:
     """Return the output with only the selected inputs, fitted to points x (n, d), y (n,), if this reduces the
-    leave-one-out error enough. Otherwise return it unchanged."""
+    leave-one-out error to at most ``LESS`` (0.5) times its value. Otherwise return it unchanged."""
     assert output.posterior is not None
     mask, x = selection.mask, x[:, selection.mask]
     feature_map = map_without(output.feature_map, mask)

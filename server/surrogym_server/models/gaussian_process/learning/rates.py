@@ -71,6 +71,7 @@ def _may_have_rates(
     """Return for each of the d inputs of an output whether it may have a rate, (d,) bool.
 
     No input may have a rate if there are too few samples to determine rates, or if the process predicts well already.
+    ``inputs`` and ``keep`` are those of ``output_with_rates``.
     """
     plain, posterior = output.feature_map, output.posterior
     kinds = torch.tensor([feature.function == "affine" for feature in features(learner.definition, plain)])

@@ -137,7 +137,8 @@ def _encode_stage(
 
     They are computed from ``raw`` (C + F + L, B): C coordinates and F action entries, which the first stage reads, and
     the predicted next values of L leading coordinates, which the second stage first writes and then reads. The third
-    stage replaces the coordinates by the next coordinates ``arrived`` (C, B).
+    stage replaces the coordinates by the next coordinates ``arrived`` (C, B). ``head`` is the first matrix of the
+    tables, and ``mean`` (columns, B) has the changes that earlier stages predicted.
     """
     size, lanes, observe = len(arrived), raw.shape[1], int(head[0, OBSERVE])
     width, begin, end = int(head[0, WIDTH]), 0, int(head[0, WIDTH])
@@ -234,7 +235,7 @@ def _predict_stage(
 def _arrive(numbers: Floats, places: Ints, head: Floats, raw: Floats, mean: Floats, arrived: Floats) -> None:
     """Compute the next coordinates, and write them to ``arrived`` (C, B): the coordinates in the first C rows of
     ``raw``, changed by the predicted changes ``mean`` (columns, B) of coordinates or observation entries, with the
-    environment's rules (such as limits) applied."""
+    environment's rules (such as limits) applied. ``head`` is the first matrix of the tables."""
     size, lanes = arrived.shape
     for c in range(size):
         for b in range(lanes):
@@ -257,7 +258,7 @@ def _arrive(numbers: Floats, places: Ints, head: Floats, raw: Floats, mean: Floa
 @inlined
 def _unwarp(warp: Floats, mean: Floats, spread: Floats) -> None:
     """Convert mean and standard deviation, (B,) each, of the logarithm of a reward to those of the reward, in place.
-    ``Warp`` does the same in torch."""
+    ``warp`` (1, 2) has the base and the sign of ``Warp``, which does the same in torch."""
     for b in range(len(mean)):
         y, s = mean[b], spread[b]
         spread[b] = 0.5 * (math.exp(min(y + s, LARGEST)) - math.exp(min(y - s, LARGEST)))
@@ -266,7 +267,8 @@ def _unwarp(warp: Floats, mean: Floats, spread: Floats) -> None:
 
 @inlined
 def _ended(numbers: Floats, places: Ints, head: Floats, arrived: Floats) -> Bools:
-    """Return whether the declared termination holds at coordinates ``arrived`` (C, B), (B,)."""
+    """Return whether the declared termination holds at coordinates ``arrived`` (C, B), (B,). ``head`` is the first
+    matrix of the tables."""
     over = np.zeros(arrived.shape[1], dtype=np.bool_)
     if head[0, CONDITIONS] != NONE:
         holds = holding(numbers, places, int(head[0, CONDITIONS]), arrived)
