@@ -152,8 +152,8 @@ class SampleService:
         return self._definitions.get(name).coordinate_names
 
     def report_steps(self, name: str, steps: int, episodes: int, note: str, key: str) -> LedgerRecord:
-        """Add ``steps`` real steps of an evaluation of ``episodes`` episodes to the surrogate's counts, once for each key.
-        Return the counts. ``note`` is stored with the report."""
+        """Add ``steps`` real steps of an evaluation of ``episodes`` episodes to the surrogate's counts, once for each
+        key. Return the counts. ``note`` is a text about the evaluation."""
         return self._storage.ledger.report(name, steps, key=key, episodes=episodes, note=note)
 
 

@@ -391,8 +391,8 @@ class Ledger(ABC):
 
     @abstractmethod
     def report(self, name: str, steps: int, *, key: str, episodes: int = 0, note: str = "") -> LedgerRecord:
-        """Add ``steps`` real steps of an evaluation of ``episodes`` episodes, once for each key. Return the counts of real
-        steps by purpose. ``note`` is stored with the report."""
+        """Add ``steps`` real steps of an evaluation of ``episodes`` episodes, once for each key. Return the counts of
+        real steps by purpose. ``note`` is a text about the evaluation."""
 
     @abstractmethod
     def read(self, name: str) -> LedgerRecord: ...

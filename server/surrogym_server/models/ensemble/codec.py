@@ -30,8 +30,8 @@ class Header:
         terminal_reward: reward that is added on a step that ends an episode.
         samples: number of samples to which the model was fitted.
         digest: ``Samples.digest`` of these samples.
-        label: 1 if all samples ended an episode, 0 if none did, None if some did or if termination is declared. Code
-            that reads it checks it.
+        label: 1 if all samples ended an episode, 0 if none did, None if some did or if termination is declared. In
+            the header of a file it may be anything, until ``_only_label`` checks it.
     """
 
     terminal_reward: float
