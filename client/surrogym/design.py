@@ -358,7 +358,7 @@ class Design:
             return
         why = "was answered already" if query in self._answered else "belongs to another design"
         why = "was given up" if query in self._given_up else why
-        raise InvalidInput(f"expected an open query, got query {query.id}, which {why}")
+        raise InvalidInput(f"expected an open query, got query {query.id}, which {why}: call ask() for the next query")
 
     def _spoken_for(self) -> int:
         waiting = [*self._queue, *self._open.values(), *self._given_up]

@@ -14,5 +14,7 @@ def existing(path: str | Path) -> Path:
         FileNotFoundError: there is no such file.
     """
     if not Path(path).exists():
-        raise FileNotFoundError(f"expected a file that Design.save or surrogym export wrote, got no file at {path}")
+        raise FileNotFoundError(
+            f"expected a file that Design.save or surrogym export wrote, got no file at {path}: check the path"
+        )
     return Path(path)

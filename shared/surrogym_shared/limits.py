@@ -157,11 +157,12 @@ def check_limits(spec: EnvironmentSpec) -> None:
     require_unique("limit", (limit.name for limit in declared.keep))
     require(
         spec.sampling_period is not None,
-        "limits: expected a sampling_period, because the fallback acts when no action came for one, got none",
+        "limits: expected a sampling_period, because the fallback acts if no action arrives in one period, got none",
     )
     require(
         spec.time_limit is not None,
-        "limits: expected a time_limit, because a virtual episode pays for the steps that it lacks, got none",
+        "limits: expected a time_limit, got none: a virtual episode ends where the fallback would act, and gets the "
+        "least reward for each further step up to the time_limit",
     )
     for limit in declared.keep:
         _check_term(spec, limit)
@@ -173,7 +174,8 @@ def check_limits(spec: EnvironmentSpec) -> None:
         limit = declared.keep[int(column)]
         require(
             inside[row, column] >= 0,
-            f"limit {limit.name!r}: expected every start to lie at least its margin of {limit.margin:g} inside, got "
+            f"limit {limit.name!r}: expected every start to be inside by at least the margin of {limit.margin:g}, got "
+            "the start "
             f"{dict(zip(spec.coordinate_names, states[row].round(6).tolist(), strict=True))}",
         )
 

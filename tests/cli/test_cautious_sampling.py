@@ -118,10 +118,10 @@ def test_a_sampler_whose_rollouts_leave_a_limit_more_often_than_allowed_ends_bef
     said = on_server("sample", name, *leaving, "--until-done")
     assert said.code != 0
     stopped = re.search(
-        r"(\d) of (\d) rollouts of this sampler left a limit \(rail: \1\), which is more than", said.err
+        r"(\d) of (\d) rollouts of this sampler left a limit \(rail: \1\), which is clearly more than", said.err
     )
     assert stopped is not None
-    assert "choose a larger margin, a smaller range of actions, or a fallback that holds" in said.err
+    assert "choose a larger margin, a smaller range of actions, or a fallback that keeps the limits" in said.err
     view = json.loads(on_server("status", name, "--json").out)
     assert (view["ledger"]["unresolved"], view["queries"]["leased"]) == (0, 0)
     assert view["queries"]["answered"] == int(stopped[2])

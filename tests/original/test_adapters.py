@@ -234,7 +234,7 @@ def test_an_environment_with_unreadable_state_is_reset_only(registered: Register
     [
         ({"action_space": gymnasium.spaces.Box(-np.inf, np.inf, (1,))}, "expected a Box with one row of finite bounds"),
         ({"action_space": gymnasium.spaces.MultiBinary(2)}, "expected a Box with one row of finite bounds"),
-        ({"observation_space": gymnasium.spaces.Discrete(4)}, "a symbol out of several"),
+        ({"observation_space": gymnasium.spaces.Discrete(4)}, "a discrete observation"),
     ],
 )
 def test_gymnasium_spaces_that_a_specification_cannot_express_are_refused(

@@ -189,7 +189,7 @@ def test_the_error_for_a_name_that_cannot_be_described_lists_the_valid_forms(nam
 def test_the_function_describe_refuses_unsupported_action_spaces_in_one_line(
     registered: Register, space: Space
 ) -> None:
-    with pytest.raises(UnknownEnvironment, match=r"\AFails-v0 can't be specified: .+\Z") as refused:
+    with pytest.raises(UnknownEnvironment, match=r"\AFails-v0 does not fit into a specification: .+\Z") as refused:
         open_simulator(registered("Fails-v0", space={"action_space": space}))
     assert "\n" not in str(refused.value)
 

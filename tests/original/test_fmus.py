@@ -247,8 +247,8 @@ def test_a_specification_from_a_server_never_opens_an_fmu() -> None:
     ("push", "message"),
     [
         (1.5, r"the process of Moody.fmu ended with exit code -6 \(SIGABRT\) during step"),
-        (3.0, r"Moody.fmu: expected finite values from the FMU, got x is nan"),
-        (4.0, r"Moody.fmu: the FMU answered fmi2DoStep with status"),
+        (3.0, r"Moody.fmu refused the request step: expected finite values from the FMU, got x is nan"),
+        (4.0, r"Moody.fmu refused the request step: the FMU answered fmi2DoStep with status"),
     ],
 )
 def test_a_crash_of_fmu_native_code_costs_one_step(moody: Path, tmp_path: Path, push: float, message: str) -> None:

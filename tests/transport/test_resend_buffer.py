@@ -82,8 +82,8 @@ def test_a_session_may_fall_back_to_an_earlier_step_again_while_requests_are_rep
 @pytest.mark.parametrize(
     ("kept", "replay", "said"),
     [
-        (2, (), "from number 1 on, which this client no longer keeps"),
-        (10, (step(1, 9.0),), "gives another answer to"),
+        (2, (), "from number 1 on again, which this client no longer keeps"),
+        (10, (step(1, 9.0),), "answers the repeated request 1 differently"),
     ],
 )
 def test_a_session_that_cannot_be_restored_exactly_is_reported_lost(kept: int, replay: tuple[Answer, ...], said: str):

@@ -172,7 +172,9 @@ def test_a_reply_to_another_request_is_refused():
         HttpSurrogate(server.url, "pendulum", transport="binary") as port,
     ):
         port.open(wire.OpenSession(num_envs=2))
-        with pytest.raises(errors.ProtocolMismatch, match="expected the answer to seq 1 of abc, got 7"):
+        with pytest.raises(
+            errors.ProtocolMismatch, match="expected the answer to request 1 of session abc, got the one to request 7"
+        ):
             port.step("abc", ACTION)
 
 

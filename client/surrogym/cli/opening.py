@@ -55,7 +55,7 @@ def opener_of(
     noted = card.spec
     name = env or (noted.environment if noted is not None else None)
     if name is None or (env is None and not is_known(name)):
-        raise CommandError(f"expected --env with the original environment, got none (noted beside the policy: {name})")
+        raise CommandError(f"expected --env with the original environment, got none (the policy's card names: {name})")
     if is_own(name):
         bins = _bins(noted) if given is None else None
         return lambda: open_episode(name, given, lambda: make(name, spec=given, bins=bins), fallback)

@@ -262,7 +262,7 @@ def read_spec_file(path: Path) -> SpecContent:
             f"{path} is not a specification: expected JSON as text in UTF-8, got other bytes; write it again in UTF-8"
         ) from error
     except (ValueError, RecursionError) as error:
-        raise CommandError(f"{path} is not a specification: {error}") from error
+        raise CommandError(f"{path} is not a specification: {error}; correct it and try again") from error
     steps = read.get("real_steps") if isinstance(read, dict) else None
     return SpecContent(spec, steps if type(steps) is int and steps > 0 else 0, content)
 

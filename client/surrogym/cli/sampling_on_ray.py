@@ -72,7 +72,9 @@ def samplers_on_ray(options: RayOptions, plan: SamplerPlan) -> RaySamplers:
     try:
         return RaySamplers(plan, options.on_ray, resources)
     except ValueError as error:
-        raise CommandError(f"--ray-resources: {' '.join(str(error).split())}") from error
+        raise CommandError(
+            f"--ray-resources: Ray refused them ({' '.join(str(error).split())}): correct them"
+        ) from error
 
 
 def run_samplers(

@@ -217,11 +217,15 @@ class HttpSurrogate:
             raise
         except UNREADABLE as error:
             live.stream.close()
-            raise ProtocolMismatch(f"the answer of {live.route}/{what} can't be read: {error}") from error
+            raise ProtocolMismatch(
+                f"the server's answer to {live.route}/{what} can't be read: {error}; upgrade the older of client and "
+                "server"
+            ) from error
         if seq != live.seq + 1:
             live.stream.close()
             raise ProtocolMismatch(
-                f"expected the answer to seq {live.seq + 1} of {session}, got {seq}: open a new session"
+                f"expected the answer to request {live.seq + 1} of session {session}, got the one to request {seq}: "
+                "open a new session"
             )
         live.seq = seq
         if live.window is not None:
@@ -250,12 +254,12 @@ class HttpSurrogate:
         if (missing := window.since(behind)) is None:
             raise self._given_up(
                 live,
-                f"its successor needs requests again from number {behind} on, which this client no longer keeps",
+                f"the new process needs the requests from number {behind} on again, which this client no longer keeps",
             )
         for sent in missing:
             answer, _ = self._sent(live, sent)
             if digest_of(answer) != sent.digest:
-                raise self._given_up(live, f"its successor gives another answer to the repeated request {sent.seq}")
+                raise self._given_up(live, f"the new process answers the repeated request {sent.seq} differently")
 
     def _given_up(self, live: _Live, what: str) -> SurrogymClientError:
         with suppress(SurrogymClientError):

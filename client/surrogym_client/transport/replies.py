@@ -24,7 +24,9 @@ def parse(reply: type[R], content: bytes, path: str) -> R:
     except ValidationError as error:
         from surrogym_shared.faults import first_fault  # imported here, because only an error needs it
 
-        raise ProtocolMismatch(f"the answer of {path} can't be read: {first_fault(error)}") from error
+        raise ProtocolMismatch(
+            f"the server's answer to {path} can't be read: {first_fault(error)}; upgrade the older of client and server"
+        ) from error
 
 
 def new_key() -> str:

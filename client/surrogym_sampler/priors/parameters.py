@@ -82,7 +82,9 @@ class Parameter:
         value = present[name]
         if not equals:
             if value == 0:
-                raise ValueError(f"{name}: expected NAME=LOW..HIGH, because the simulator's own value is 0")
+                raise ValueError(
+                    f"{name}: expected a range, because the simulator's own value is 0, got none: give {name}=LOW..HIGH"
+                )
             return cls(name, *sorted((value / AROUND, value * AROUND)))
         try:
             low, high = (float(end) for end in span.split(".."))

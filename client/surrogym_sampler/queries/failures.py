@@ -94,8 +94,8 @@ class Violations:
         limits = limits_of(self._spec)
         each = ", ".join(f"{limit.name}: {n}" for limit, n in zip(limits.keep, self._limits, strict=True) if n)
         raise LimitsLeft(
-            f"{self._left} of {self._rollouts} rollouts of this sampler left a limit ({each}), which is more than "
-            f"the allowed {100 * limits.probability:g} % explain, so no other query was begun: choose a larger margin, "
-            "a smaller range of actions, or a fallback that holds, and register "
+            f"{self._left} of {self._rollouts} rollouts of this sampler left a limit ({each}), which is clearly more "
+            f"than the allowed {100 * limits.probability:g} %, so no other query was begun: choose a larger margin, "
+            "a smaller range of actions, or a fallback that keeps the limits, and register "
             "the environment under another name"
         )

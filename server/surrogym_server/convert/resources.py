@@ -31,7 +31,7 @@ from surrogym_shared import spec as wire
 from surrogym_shared import wire as replies
 from surrogym_shared.nouns import Query, Vector
 
-FIDELITY = "the fidelity of a model"  # how error messages name the stored confidence and errors of a model
+FIDELITY = "the confidence index with the errors of a model"  # how error messages name a stored fidelity
 
 
 def surrogate_list(listed: Sequence[Listed], limit: int) -> replies.SurrogateList:

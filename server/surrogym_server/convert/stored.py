@@ -26,4 +26,6 @@ def read_stored(model: type[M], what: str, stored: dict[str, Any]) -> M:
     try:
         return model.model_validate(stored)
     except ValidationError as error:
-        raise Damaged(f"{what} in the database can't be read: {first_fault(error)}") from error
+        raise Damaged(
+            f"{what} in the database can't be read: {first_fault(error)}; restore a copy of the database"
+        ) from error

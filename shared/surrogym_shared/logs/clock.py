@@ -212,8 +212,9 @@ def ticks_of(rows: Rows, episode: Ints, left_out: Mapping[int, str]) -> Ticks | 
     if differ < DIFFER:
         raise UnusableLog(
             f"{rows.roles.time}: expected times that grow from row to row, got {same.mean():.0%} of the rows with the "
-            f"time of the row before, of which {differ:.0%} differ from it: they may repeat it or follow it; give "
-            "finer times, leave out the column with a mapping file (--map), or remove the repeats"
+            f"time of the row before. {differ:.0%} of these differ from the row before in other columns, so it is "
+            "unclear whether such rows are repeats or steps of their own: give finer times, leave out the column with "
+            "a mapping file (--map), or remove the repeats"
         )
     begins = np.concatenate([[True], ~same])
     moment = np.cumsum(begins) - 1

@@ -41,7 +41,11 @@ class Normal(Frozen):
         low, high = self.limits
         require_range("truncated range", low, high)
         z = max(low - self.mean, self.mean - high) / self.std
-        require(z < 6, f"truncation [{low}, {high}] lies {z:.1f} standard deviations from the mean {self.mean}")
+        require(
+            z < 6,
+            f"truncation [{low}, {high}] lies {z:.1f} standard deviations from the mean {self.mean}: expected less "
+            "than 6",
+        )
         return self
 
     @property
@@ -108,11 +112,14 @@ class Lag(Frozen):
     @model_validator(mode="after")
     def _sourced(self) -> Self:
         if self.kind == "action":
-            require(self.entry is not None and self.of is None, "a lag of an action: expected an entry alone")
+            require(self.entry is not None and self.of is None, "a lag of kind 'action': expected 'entry' without 'of'")
         elif self.kind == "steps":
-            require(self.entry is None and self.of is None, "a lag of kind 'steps': expected no entry and no 'of'")
+            require(self.entry is None and self.of is None, "a lag of kind 'steps': expected neither 'entry' nor 'of'")
         else:
-            require(self.of is not None and self.entry is None, f"a lag of kind {self.kind!r}: expected 'of' alone")
+            require(
+                self.of is not None and self.entry is None,
+                f"a lag of kind {self.kind!r}: expected 'of' without 'entry'",
+            )
         return self
 
 
@@ -145,7 +152,10 @@ class Coordinate(Frozen):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        require(self.lag is None or self.kind == "linear", f"coordinate {self.name!r}: a lag must be linear")
+        require(
+            self.lag is None or self.kind == "linear",
+            f"coordinate {self.name!r}: expected kind 'linear', because it is a lag",
+        )
         if self.lag is not None and self.lag.kind == "steps":
             require(self.counted > 0, f"coordinate {self.name!r}: a lag of kind 'steps' needs an upper bound above 0")
         if self.kind != "linear":

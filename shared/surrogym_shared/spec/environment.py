@@ -221,14 +221,14 @@ class EnvironmentSpec(Frozen):
         for entry in self.observation:
             low = -math.inf if entry.low is None else entry.low
             high = math.inf if entry.high is None else entry.high
-            require(low < high, f"observation {entry.name!r} crosses: expected low < high, got [{low}, {high}]")
+            require(low < high, f"limits of observation {entry.name!r}: expected low < high, got [{low}, {high}]")
         require(
             self.max_rollout is None or self.query == "rollout",
             f"max_rollout {self.max_rollout} needs query 'rollout', got {self.query!r}",
         )
         require(
             not self.snapshots or self.query == "rollout",
-            f"snapshots need query 'rollout', got {self.query!r}: any state can be set",
+            f"snapshots need query 'rollout', got {self.query!r}, with which any state can be set: leave snapshots out",
         )
         require(
             self.query == "step" or self.preset.takes_rollouts,
@@ -285,7 +285,8 @@ class EnvironmentSpec(Frozen):
         for name, steps in (("budget", self.design.budget), ("initial", self.design.initial)):
             require(
                 not self.unknown_steps or not steps or steps > self.unknown_steps + 1,
-                f"design: nothing is learned from the first {self.unknown_steps} steps of an episode: expected "
+                f"design: nothing is learned from the first {self.unknown_steps} steps of an episode, because "
+                "their lags are unknown: expected "
                 f"{name} of more than {self.unknown_steps + 1}, got {steps}",
             )
 
@@ -303,11 +304,15 @@ class EnvironmentSpec(Frozen):
         )
 
     def _require_stoppable(self, name: str, stopped: str) -> None:
-        require(stopped != name, f"coordinate {name!r} stops itself: expected the name of another coordinate")
+        require(stopped != name, f"coordinate {name!r}: expected another coordinate in its bounds' stops, got itself")
         bounds = self.coordinates[self.coordinate_names.index(stopped)].bounds
         if bounds is not None:
             holds = (bounds.low is None or bounds.low <= 0) and (bounds.high is None or bounds.high >= 0)
-            require(holds, f"coordinate {name!r} sets {stopped!r} to 0, outside its [{bounds.low}, {bounds.high}]")
+            require(
+                holds,
+                f"coordinate {name!r} sets {stopped!r} to 0 at its bounds: expected bounds of {stopped!r} that contain "
+                f"0, got [{bounds.low}, {bounds.high}]",
+            )
 
     def _terms(self) -> Iterable[tuple[str, Term]]:
         for entry in self.observation:

@@ -41,7 +41,9 @@ class Term(Frozen):
     @model_validator(mode="after")
     def _ordered(self) -> Self:
         if self.low is not None and self.high is not None:
-            require(self.low < self.high, f"term clip crosses: expected low < high, got [{self.low}, {self.high}]")
+            require(
+                self.low < self.high, f"limits of a clipped term: expected low < high, got [{self.low}, {self.high}]"
+            )
         return self
 
     @classmethod
@@ -67,12 +69,12 @@ class Term(Frozen):
     def __add__(self, other: Term) -> Term:
         require(
             self.low is None and self.high is None and other.low is None and other.high is None,
-            "clipped terms can't be added",
+            "clipped terms can't be added: add the terms first, then clip the sum",
         )
         return Term(parts=self.parts + other.parts)
 
     def __mul__(self, factor: float) -> Term:
-        require(self.low is None and self.high is None, "a clipped term can't be scaled")
+        require(self.low is None and self.high is None, "a clipped term can't be scaled: scale it before clipping")
         parts = (p.model_copy(update={"coefficient": p.coefficient * factor}) for p in self.parts)
         return Term(parts=tuple(parts))
 

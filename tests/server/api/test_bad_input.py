@@ -116,7 +116,7 @@ def crossed(field: str, value: Any) -> dict[str, Any]:
         ("coordinates.0.sampling.high", 1e308, "less than or equal to 1000000000000, got 1e+308"),
         ("coordinates.0.sampling", {"kind": "uniform", "low": 0, "high": 5e-324}, "too narrow"),
         ("coordinates.0.sampling", {"kind": "uniform", "low": 1e10, "high": 1e10 + 1}, "too narrow"),
-        ("coordinates.1.bounds.stops", "theta_dot", "stops itself"),
+        ("coordinates.1.bounds.stops", "theta_dot", "in its bounds' stops, got itself"),
         ("termination", [[{"term": ONE, "relation": ">", "value": 0}]] * 17, "at most 16 entries"),
     ],
 )
@@ -135,7 +135,7 @@ def test_a_bound_that_stops_another_coordinate_outside_its_range_is_refused(clie
     spec["coordinates"].append({"name": "gear", "sampling": TWO, "bounds": {"low": 1, "high": 2}})
     spec["start"] |= {"x": UNIT, "gear": TWO}
     reply = post(client, "/v1/surrogates", {"name": name, "spec": spec})
-    refused(reply, Code.INVALID_SPEC, "'x' sets 'gear' to 0, outside its [1.0, 2.0]")
+    refused(reply, Code.INVALID_SPEC, "expected bounds of 'gear' that contain 0, got [1.0, 2.0]")
 
 
 def test_another_specification_under_an_existing_surrogate_name_is_refused(client: httpx.Client, fresh: str):

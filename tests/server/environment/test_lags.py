@@ -96,9 +96,9 @@ def test_the_model_does_not_predict_lagged_coordinates():
         ({"kind": "change", "of": "nothing"}, "of an earlier coordinate"),
         ({"kind": "value", "of": "angle"}, "lags of an angle are of kind 'change'"),
         ({"kind": "action", "entry": 2}, "expected an entry below 2, got 2"),
-        ({"kind": "action", "of": "level"}, "expected an entry alone"),
-        ({"kind": "change"}, "expected 'of' alone"),
-        ({"kind": "steps", "of": "level"}, "expected no entry and no 'of'"),
+        ({"kind": "action", "of": "level"}, "expected 'entry' without 'of'"),
+        ({"kind": "change"}, "expected 'of' without 'entry'"),
+        ({"kind": "steps", "of": "level"}, "expected neither 'entry' nor 'of'"),
     ],
 )
 def test_a_lagged_coordinate_without_a_source_is_refused(lag, message):

@@ -136,7 +136,7 @@ BROKEN_ROWS = [
     ("UPDATE surrogates SET spec = '{\"a'", "surrogates", r"JSON in surrogates\.spec, got '{\"a'"),
     ("UPDATE surrogates SET phase = 'reaxy'", "surrogates", r"surrogates\.phase, got 'reaxy'"),
     ("UPDATE queries SET status = ''", "counts", r"queries\.status"),
-    ("UPDATE models SET fidelity = ''", "surrogates", "the fidelity of a model can't be read"),
+    ("UPDATE models SET fidelity = ''", "surrogates", "the confidence index of a model can't be read"),
     ("UPDATE models SET fidelity = ''", "models", r"JSON in models\.fidelity"),
     ("UPDATE events SET body = 'x'", "events", r"JSON in events\.body"),
 ]

@@ -178,7 +178,7 @@ def _opened(api: Api, view: SurrogateView, simulator: str, parameters: list[str]
         with prints_aside():
             return ServerPrior(api, view.name, simulator, view.spec, parameters, steps=steps)
     except ValueError as error:
-        raise CommandError(f"{simulator}: {error}") from error
+        raise CommandError(f"the simulator {simulator} can't be the prior: {error}") from error
 
 
 def _is_model(source: str) -> bool:

@@ -105,7 +105,9 @@ def open_simulator(name: str) -> Simulator:
     except UnknownEnvironment:
         raise
     except ValidationError as error:
-        raise UnknownEnvironment(f"{name} can't be specified: {first_fault(error)}") from error
+        raise UnknownEnvironment(
+            f"{name} does not fit into a specification: {first_fault(error)}; correct the environment"
+        ) from error
     except RAISED as error:
         raise UnknownEnvironment(f"{name} can't be opened: {sentence(error)}") from error
     return opened

@@ -43,7 +43,7 @@ def open_simulator(name: str) -> Simulator:
     env = make(name)
     if type(env.observation_space).__name__ in SYMBOLS:
         raise UnknownEnvironment(
-            f"{name} observes {env.observation_space}, a symbol out of several: expected numbers that change "
+            f"{name} observes {env.observation_space}, a discrete observation: expected numbers that change "
             "gradually; write a class that gives such numbers (docs/how-to/own-environment.md)"
         )
     limit = env.spec.max_episode_steps

@@ -94,7 +94,11 @@ def describe(name: str, steps: int = STEPS, seed: int = 0) -> Description:
     try:
         described = _described(name, counted, steps, np.random.default_rng(seed))
     except (UnknownEnvironment, ValidationError) as error:
-        said = f"{name} can't be specified: {first_fault(error)}" if isinstance(error, ValidationError) else str(error)
+        said = (
+            f"{name} does not fit into a specification: {first_fault(error)}"
+            if isinstance(error, ValidationError)
+            else str(error)
+        )
         took = f"; this took {counted.steps} real steps" if counted.steps else ""
         raise UnknownEnvironment(f"{said}{took}") from error
     except KeyboardInterrupt:

@@ -165,7 +165,8 @@ class Instance:
             _, over, early, _ = self._fmu.doStep(currentCommunicationPoint=time, communicationStepSize=self._step)
             if early and not over:
                 raise Refused(
-                    'expected the FMU to simulate the whole step, got an early return: set "step" in its JSON file'
+                    f"expected the FMU to simulate the whole step of {self._step:g} s, got an early return: set a "
+                    'smaller "step" (seconds of one action) in its JSON file, or export the FMU without early return'
                 )
             return bool(over)
         try:

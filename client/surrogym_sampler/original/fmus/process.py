@@ -181,7 +181,9 @@ class Process:
             if error.code == "broken":
                 self._program.end()
             said = str(error).partition(": ")[2]
-            raise RequestRefused(f"{self._archive.path.name}: {said}", error.code) from error
+            raise RequestRefused(
+                f"the FMU {self._archive.path.name} refused the request {method}: {said}", error.code
+            ) from error
 
     def _take(self, reply: Reply) -> None:
         self._values = numbers(reply, "values", len(self._reads))

@@ -68,7 +68,8 @@ def running(controller: Controller, *, single: bool = False) -> Iterator[Compile
             ) from error
         if vectors.returncode != 0:
             raise NotDeployable(
-                f"the compiled controller fails its test vectors, so it is not used: {vectors.stdout[-400:]}"
+                "the compiled controller gives other actions than the policy for its test observations, so it is not "
+                f"used: try another C compiler (variable CC), or report this: {vectors.stdout[-400:]}"
             )
         timed = subprocess.run([executable, "time"], capture_output=True, text=True, check=True)
         program = Program(shlex.join([str(executable), "lines"]), "the compiled controller")

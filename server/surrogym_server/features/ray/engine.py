@@ -189,7 +189,7 @@ class RayEngine(SessionEngine):
             await asyncio.to_thread(self._store.remove, session)
             raise UnknownSession(
                 f"session {session!r} was lost with its session host: no host of the same kind of machine is left, and "
-                "another rounds differently; open a new one"
+                "another kind rounds numbers differently; open a new session"
             )
         for host in alike:
             if not await self._lives(host):

@@ -48,7 +48,9 @@ class RayFits(Compute):
         except RayTaskError as error:  # the fit's result, which a plug-in may have made, can't be pickled
             raise PluginFailed(in_one_line(error.cause or error)) from error
         except TaskCancelledError as error:
-            raise Unavailable("the fit was ended, because this server stops") from error
+            raise Unavailable(
+                "the fit was ended, because this server stops: it is repeated after the next start"
+            ) from error
         except RayError as error:
             raise Unavailable(
                 f"the process or machine of a fit died: {in_one_line(error)}; the fit is tried again"

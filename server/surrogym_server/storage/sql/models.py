@@ -55,7 +55,10 @@ class SqlModels(port.Models):
         with self._database.read() as connection:
             row = _one(connection, name, version, models.c.version, models.c.blob, models.c.checksum)
         if checksum(row.blob) != row.checksum:
-            raise damaged(f"model {row.version} of {name!r} has changed since it was stored, as its checksum shows")
+            raise damaged(
+                f"model {row.version} of {name!r} has changed since it was stored, as its checksum shows; restore a "
+                "copy of the database"
+            )
         return bytes(row.blob)
 
     def set_aside(self, name: str, version: int, damage: str) -> bool:
@@ -117,7 +120,9 @@ def _confidence_index(fidelity: str) -> float:
         try:
             return float(json.loads(fidelity)["confidence_index"])
         except (ValueError, KeyError, TypeError) as error:
-            raise damaged(f"the fidelity of a model can't be read: {error!r}") from error
+            raise damaged(
+                f"the confidence index of a model can't be read: {error!r}; restore a copy of the database"
+            ) from error
 
 
 def _one(connection: Connection, name: str, version: int | None, *columns: sa.ColumnElement[Any]) -> Row[Any]:

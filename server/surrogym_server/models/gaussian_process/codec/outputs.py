@@ -220,8 +220,8 @@ def _require_rates(definition: EnvironmentDefinition, output: OutputModel) -> No
         )
     if not bool((1 + output.posterior.x * torch.tensor(rates, dtype=torch.float64) > 0).all()):
         raise InvalidInput(
-            f"output {output.name!r}: expected `rates`, with which its changes grow along its inputs, whose factor is "
-            f"above 0 at all samples, got {rates}; export the model again"
+            f"output {output.name!r}: expected `rates` (how its changes grow along its inputs) with 1 + rates . x "
+            f"above 0 at all samples x, got {rates}; export the model again"
         )
 
 
