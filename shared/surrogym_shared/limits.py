@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 CORNERS = 10  # with at most this many coordinates, all corners of the start ranges are checked
 FEWEST_LEFT = 2  # a machine stops only if at least this number of its episodes left a limit
-LEFT_LEVEL = 0.01  # greatest probability that a machine stops although it keeps twice the allowed probability
+LEFT_LEVEL = 0.01  # largest probability of a wrong stop, if at most twice the allowed share of rollouts leave a limit
 STARTS = 1_000  # number of random start states at which the limits are checked
 
 
@@ -114,8 +114,8 @@ def left_too_often(left: int, episodes: int, share: float, level: float) -> bool
 
 
 def must_stop(left: int, episodes: int, probability: float) -> bool:
-    """Return whether a machine must take no further episodes: at least two of so many ``left`` a limit, and these are
-    more than twice the allowed ``probability`` explains. A stop by mistake has a probability of at most 1 %."""
+    """Return whether a machine must take no further episodes: ``left`` of its ``episodes`` left a limit, at least two,
+    and more than twice the allowed ``probability`` explains. With a probability of 1 % at most, it stops by mistake."""
     return left >= FEWEST_LEFT and left_too_often(left, episodes, 2 * probability, LEFT_LEVEL)
 
 

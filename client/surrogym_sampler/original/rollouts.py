@@ -38,7 +38,7 @@ class FromReset:
         self._spec = environment.spec()
         self._at: Array | None = None
         size = len(self._spec.coordinates)
-        # number of bytes in a snapshot for the coordinates, which contain the lags
+        # number of bytes that precede the environment's in a snapshot: the coordinates, if some are lags (past values)
         self._prefix = 8 * size if size > len(read_names(self._spec)) else 0
         self.parallel = runs_in_parallel(environment)
 

@@ -42,8 +42,8 @@ def promise_of(
         port: the surrogate.
         predict: the policy; function from observations (N, D) to actions.
         seed: seed of functions and starts.
-        session: fields of ``OpenSession`` that the policy was trained with. The fields of the variant, the penalty and
-            the caution are ignored.
+        session: fields of ``OpenSession`` that the policy was trained with. The fields ``variant``,
+            ``penalty`` and ``caution``, and those of particles, are ignored.
         floor: return of an untrained policy; None if it was not measured.
     """
     left_out = {"variant", "penalty", "caution", *OF_PARTICLES}

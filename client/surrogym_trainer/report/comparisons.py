@@ -41,8 +41,8 @@ class Comparison:
 
 
 def compare(real: EvaluationDetail, other: EvaluationDetail) -> Comparison | None:
-    """Compare the mean returns of two controllers over the first starts, which both ran; None if their returns are not
-    known."""
+    """Compare the mean returns of two controllers over the first starts, as many as both ran; None if their returns
+    are not known."""
     count = min(real.episodes, other.episodes)
     if min(len(real.returns), len(other.returns)) >= count:
         mine, theirs = real.returns[:count], other.returns[:count]

@@ -37,8 +37,8 @@ class AuditedTraining:
 
     - If the audit failed, real steps are taken in states that the policy visits, as far as the budget or unused rounds
       of the closed loop allow. Then the training continues, and the policy is audited again.
-    - The same happens after a passed audit if a round of the closed loop is unused and the promised interval is wide,
-      or the model, which has learned from the audit, is no longer certain in these states.
+    - The same happens after a passed audit if a round of the closed loop is unused, and either the promised interval is
+      wide or the model, which has learned from the audit, is no longer certain in these states.
     - The training also continues if the promise after the audit is clearly lower than the one before it, or than the
       imagined return of the training, unless the user limited the virtual steps. This takes no step of the budget.
     - In all other cases the policy is handed over, even if the audit failed.

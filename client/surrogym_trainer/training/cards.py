@@ -54,8 +54,8 @@ def card_of(
 
 
 def session_of(card: PolicyCard, view: SurrogateView) -> dict[str, object]:
-    """Return the options of the session in which the policy was judged, from the policy's card. Noise that the design
-    has confirmed is added, unless the card has these options already."""
+    """Return the options of the session in which the policy was judged, from the policy's card. The
+    options for noise that the design has confirmed are added, unless the card has them."""
     judged = card.settings.get("judge") or card.settings.get("session") or {}
     noise: dict[str, object] = noise_of(view)
     return {**noise, **judged} if isinstance(judged, dict) else noise

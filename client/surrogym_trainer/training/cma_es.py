@@ -33,8 +33,8 @@ FULL_COVARIANCE = 200
 
 @dataclass(frozen=True)
 class CmaEs(PolicySearch):
-    """Policy search by CMA-ES over the parameters of a network. The result is the distribution's mean with the best
-    imagined return."""
+    """Policy search by CMA-ES over the parameters of a network. The result is the mean of the distribution in
+    the generation in which the mean has the best imagined return."""
 
     population: int = 24  # number of candidates in each generation
     starts: int = 16  # number of episodes of each candidate

@@ -177,7 +177,7 @@ def _require_fit(predict: Predict, spec: EnvironmentSpec, misfit: str) -> None:
 
 def _of_another(card: PolicyCard) -> PolicyCard:
     """Return a policy's card for an audit on another surrogate than the one of its training: without the fields that
-    only hold for the latter, such as the imagined return."""
+    hold only for the surrogate of its training, such as the imagined return."""
     empty = {"server": None, "spec": None, "imagined_return": None, "untrained": None, "visited_confidence": ()}
     return card.model_copy(update={**empty, "settings": {}})
 

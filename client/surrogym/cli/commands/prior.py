@@ -70,9 +70,9 @@ def command(
 
     The design waits after its initial queries. The command calibrates the named parameters on these real steps, learns
     a model of the simulator, and sends it to the server. From then on the design learns only what the simulator gets
-    wrong, output by output, and ignores it where that predicts better. The command follows the design until it ends,
-    and calibrates again if new real steps contradict the values. The simulator runs in this process alone, and its
-    steps are not counted as real ones.
+    wrong. It ignores the simulator for each output that it predicts better without. The command follows the design
+    until it ends, and calibrates again if new real steps contradict the values. The simulator runs in this process
+    alone, and its steps are not counted as real ones.
 
     Example: surrogym prior arm textbook:Arm --parameter mass=0.5..2 --parameter length
 

@@ -154,8 +154,8 @@ class _Boundary:
         return self.points
 
     def beside(self, chosen: NDArray[np.bool_]) -> None:
-        """Add a neighbouring boundary point for each chosen one of the K points (K,), unless an earlier call has done
-        or tried this."""
+        """Add a neighbouring boundary point for each of the K points that ``chosen`` (K,) marks, unless an earlier call
+        has done or tried this."""
         width = np.ptp(self._steps.q, axis=0)
         new = self._paired + np.flatnonzero(chosen[self._paired :])
         self._paired = len(chosen)
