@@ -51,6 +51,6 @@ class Conditions:
         return to_device(compiled, device)
 
     def __call__(self, q: Tensor) -> Tensor:
-        """Return which of the G groups of inequalities hold at coordinates q (..., C), (..., G) bool."""
+        """Return (..., G) bool: which of the G groups of inequalities hold at coordinates q (..., C)."""
         holds = self.sign * self.terms(q) >= self.threshold
         return (~holds).to(self.membership.dtype) @ self.membership == 0

@@ -313,7 +313,7 @@ class EnvironmentDefinition:
         return inside
 
     def can_be_set(self, q: Tensor) -> Tensor:
-        """Return whether the original environment can be set to states q (n, C), (n,) bool."""
+        """Return (n,) bool: whether the original environment can be set to each of n states q (n, C)."""
         low, high = torch.tensor([c.settable for c in self.coordinates], dtype=q.dtype, device=q.device).T
         inside: Tensor = ((q >= low) & (q <= high)).all(-1)
         return inside
@@ -347,7 +347,7 @@ class EnvironmentDefinition:
         return self._limits.falls_back(q, q_next)
 
     def room(self, q: Tensor) -> Tensor:
-        """Return how far each of L limited terms is from the nearer end of its range in states q (..., C), (..., L).
+        """Return the distances (..., L) of L limited terms from the nearer ends of their ranges in states q (..., C).
         The distance is negative outside the range."""
         return self._limits.room(q)
 

@@ -49,7 +49,7 @@ class Limits:
         return to_device(cls(terms, low, high, margin), device)
 
     def room(self, q: Tensor) -> Tensor:
-        """Return how far each of L limited terms is from the nearer end of its range in states q (..., C), (..., L).
+        """Return the distances (..., L) of L limited terms from the nearer ends of their ranges in states q (..., C).
         The distance is negative outside the range."""
         value = self.terms(q)
         return torch.minimum(value - self.low, self.high - value)

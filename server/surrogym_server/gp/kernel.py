@@ -106,8 +106,8 @@ class Hyperparameters:
 
 
 def covariance(hyper: Hyperparameters, a: Tensor, b: Tensor) -> Tensor:
-    """Return the prior covariance, without noise, of the function at inputs a (..., m, d) and b (..., n, d), (..., m,
-    n).
+    """Return the prior covariances (..., m, n), without noise, of the function at inputs a (..., m, d) with those at b
+    (..., n, d).
 
     Squared distances are computed from differences. The expansion |a|^2 + |b|^2 - 2 a.b has a rounding error that is
     too large if the noise is small.
@@ -119,7 +119,7 @@ def covariance(hyper: Hyperparameters, a: Tensor, b: Tensor) -> Tensor:
 
 
 def variance(hyper: Hyperparameters, x: Tensor) -> Tensor:
-    """Return the prior variance k(x, x), without noise, of the function at inputs x (m, d), (m,)."""
+    """Return the prior variances k(x, x) (m,), without noise, of the function at inputs x (m, d)."""
     prior = torch.full(x.shape[:-1], hyper.signal_variance, dtype=x.dtype, device=x.device)
     if (reflection := hyper.reflection) is not None:
         prior = prior + hyper.signal_variance * reflection.parity * (x.square() @ to_mirror(hyper)).exp()

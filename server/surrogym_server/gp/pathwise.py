@@ -97,7 +97,7 @@ class Pathwise:
         return torch.cat(parts, 1)
 
     def _waves(self, x: Tensor) -> Tensor:
-        """Return random Fourier features of the squared exponential at x (m, d), (m, 2 S)."""
+        """Return random Fourier features (m, 2 S) of the squared exponential at x (m, d)."""
         hyper = self.posterior.hyper
         phase = (x / hyper.lengthscale) @ frequencies(x.shape[1], x.device)
         return math.sqrt(hyper.signal_variance / FREQUENCIES) * torch.cat([phase.cos(), phase.sin()], 1)

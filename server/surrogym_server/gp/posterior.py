@@ -64,7 +64,7 @@ class Posterior:
     sparse: Sparse | None = None  # None if the n points are all samples; otherwise they are inducing points
 
     def mean(self, x: Tensor) -> Tensor:
-        """Return the posterior mean at x (m, d), (m,)."""
+        """Return the posterior mean (m,) at x (m, d)."""
         return covariance(self.hyper, x, self.x) @ self.weights
 
     def mean_and_variance(self, x: Tensor) -> tuple[Tensor, Tensor]:

@@ -174,6 +174,6 @@ class Evidence(Parameters):
         return inverse.T, weights, root
 
     def _pairs(self, symmetric: Tensor) -> Array:
-        """Return the P entries with i >= j of a symmetric matrix (n, n), (P,)."""
+        """Return the P entries (P,) with i >= j of a symmetric matrix (n, n)."""
         pairs: Array = symmetric.numpy()[self.rows, self.columns]
         return pairs

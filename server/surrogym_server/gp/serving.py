@@ -154,8 +154,8 @@ class Serving:
         return in_blocks(self.rows, lambda rows: (self._means(*self._covariances(rows)),), x)[0]
 
     def mean_and_std(self, x: Tensor, columns: Sequence[int]) -> tuple[Tensor, Tensor]:
-        """Return means and standard deviations without noise at x (m, width), (m, O) each. Only the standard deviations
-        of ``columns`` are computed; those of other columns are 0."""
+        """Return means (m, O), and standard deviations without noise (m, O), at x (m, width). Only the standard
+        deviations of ``columns`` are computed; those of other columns are 0."""
 
         def block(rows: Tensor) -> tuple[Tensor, Tensor]:
             z, smooth = self._covariances(rows)

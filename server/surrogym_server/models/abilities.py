@@ -293,7 +293,7 @@ class RewardPeaks(ABC):
 
     @abstractmethod
     def promise(self, q: Tensor, u: Tensor) -> Tensor:
-        """Return an optimistic score of the reward of steps from q (m, C) under u (m, F), (m,). The score is higher
+        """Return an optimistic score (m,) of the reward of each step from q (m, C) under u (m, F). The score is higher
         where the reward may be larger, given the model's uncertainty.
 
         Only the order of the scores matters. It is also meaningful among points whose rewards are nearly zero.

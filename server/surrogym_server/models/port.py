@@ -91,7 +91,7 @@ class DynamicsModel(ABC):
 
     @abstractmethod
     def means(self, q: Tensor, u: Tensor) -> Tensor:
-        """Predict the mean of every output at q (m, C) and u (m, F), (m, O).
+        """Predict the mean (m, O) of every output at q (m, C) and u (m, F).
 
         The outputs are the increments before limits are applied, and the reward with the terminal reward.
         """
@@ -107,7 +107,7 @@ class DynamicsModel(ABC):
         return self.learned_termination(q) if self.definition.learns_termination else self.terminated(q).to(q.dtype)
 
     def terminated(self, q: Tensor) -> Tensor:
-        """Return whether the model predicts that an episode ends on arriving at q (m, C), (m,) bool."""
+        """Return (m,) bool: whether the model predicts that an episode ends on arriving at q (m, C)."""
         if self.definition.learns_termination:
             return self.learned_termination(q) > 0.5
         return self.definition.terminated(q)

@@ -44,8 +44,8 @@ class OutputConfidence:
 
 
 def stds(model: DynamicsModel, q: Tensor, u: Tensor) -> Tensor:
-    """Return the standard deviation, without noise, of each of the O outputs at states q (m, C) and actions u (m, F),
-    (m, O). The last output is the reward."""
+    """Return the standard deviations (m, O), without noise, of the O outputs at states q (m, C) and actions u (m, F).
+    The last output is the reward."""
     transition = model.transition(q, u, stds=True, reward_std=True)
     require_shapes(model, transition, q, stds=True)
     assert transition.std is not None

@@ -45,7 +45,7 @@ def ending(model: DynamicsModel, samples: Samples, points: Points) -> Tensor | N
 
 
 def in_doubt(model: DynamicsModel, q_next: Tensor) -> Tensor:
-    """Return the probability that the model is wrong about whether an episode ends at q_next (m, C), (m,); 0 if
+    """Return the probability (m,) that the model is wrong about whether an episode ends at q_next (m, C); 0 if
     termination is declared."""
     probability = model.termination_probability(q_next)
     return probability.minimum(1 - probability)
@@ -83,8 +83,8 @@ def _predicted(model: DynamicsModel, points: Points, q_next: Tensor) -> Tensor |
 
 
 def unexplored(definition: EnvironmentDefinition, states: Tensor, q: Tensor) -> Tensor:
-    """Return how far states q (m, C) lie outside the range of earlier ``states`` (n, C), (m,). An unknown termination
-    may lie there.
+    """Return (m,) numbers: how far each of m states q (m, C) lies outside the range of earlier ``states`` (n, C). An
+    unknown termination may lie there.
 
     Each moving coordinate contributes its distance from its range over the earlier states, in widths of this range and
     at most 1. The result is the sum; it is 1 if there are no earlier states.

@@ -113,15 +113,15 @@ def to_repeat(model: DynamicsModel, samples: Samples, tolerances: Sequence[float
 
 
 def _confirmed(differences: Repeats, limits: Tensor) -> Tensor:
-    """Return for each output whether repeated steps show that its noise exceeds ``NEGLIGIBLE`` (0.5) times its
-    tolerance in ``limits`` (O,), (O,) bool."""
+    """Return (O,) bool: for each output, whether repeated steps show that its noise exceeds ``NEGLIGIBLE`` (0.5) times
+    its tolerance in ``limits`` (O,)."""
     bound = (NEGLIGIBLE * limits).square() * float(scipy.special.chdtri(differences.degrees, LEVEL))
     return differences.degrees * differences.std.square() > bound
 
 
 def _unexplained(model: DynamicsModel, limits: Tensor, noise: Tensor) -> Tensor:
-    """Return for each output whether its leave-one-out error exceeds 1.25 sqrt(tolerance^2 + noise^2), with its
-    tolerance in ``limits`` (O,) and its ``noise`` (O,), (O,) bool."""
+    """Return (O,) bool: for each output, whether its leave-one-out error exceeds 1.25 sqrt(tolerance^2 + noise^2), with
+    its tolerance in ``limits`` (O,) and its ``noise`` (O,)."""
     able = offers(model, LeaveOneOut)
     if able is None:
         return torch.zeros_like(noise, dtype=torch.bool)

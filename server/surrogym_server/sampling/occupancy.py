@@ -19,8 +19,8 @@ BLOCK = 2**17  # number of kernel values computed at once, so that they stay in 
 
 
 def log_occupancy(definition: EnvironmentDefinition, states: Tensor, q: Tensor, floor: float = FLOOR) -> Tensor:
-    """Return the logarithm of the input probability P_i at q (m, C), (m,): the density of the visited ``states`` (v,
-    C), relative to a uniform density over the sampling range.
+    """Return the logarithm (m,) of the input probability P_i at q (m, C): the density of the visited ``states`` (v, C),
+    relative to a uniform density over the sampling range.
 
     The density is a mixture of kernels around the visited states and a uniform density, whose share is ``floor``.
     """

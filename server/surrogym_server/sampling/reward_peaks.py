@@ -36,9 +36,9 @@ def highest(
     """Return the point (state and action) at which the reward may be highest, found by climbing from m ``points``; None
     if no query is needed.
 
-    No query is needed if the highest reward is known within the tolerance, or if rewards are not nearly zero almost
-    everywhere (see the module's docstring). As long as all samples have the reward 0, climbing is impossible; then the
-    point is the one of ``points`` that is farthest from all samples.
+    No query is needed if the highest reward is known within ``tolerance``, that of the reward, or if rewards are not
+    nearly zero almost everywhere (see the module's docstring). As long as all samples have the reward 0, climbing is
+    impossible; then the point is the one of ``points`` that is farthest from all samples.
     """
     definition = model.definition
     points = points[~_over(definition, points.q)]
@@ -64,9 +64,9 @@ def _least(samples: Samples) -> float:
 def _unknown(model: DynamicsModel, samples: Samples, points: Points, tolerance: float) -> Tensor:
     """Return for each of m points whether its reward is so uncertain that a real step is needed there, (m,) bool.
 
-    A step is needed if the reward's standard deviation is above the tolerance, or if its prediction is clearly above
-    the rewards of all samples. It is needed at every point as long as the rewards of the samples differ too little for
-    a trainer to distinguish them.
+    A step is needed if the reward's standard deviation is above its ``tolerance``, or if its prediction is clearly
+    above the rewards of all samples. It is needed at every point as long as the rewards of the samples differ too
+    little for a trainer to distinguish them.
     """
     prediction = model.transition(points.q, points.u, reward_std=True)
     assert prediction.reward_std is not None
@@ -101,7 +101,7 @@ def _climbed(definition: EnvironmentDefinition, able: RewardPeaks, points: Point
 
 
 def _over(definition: EnvironmentDefinition, q: Tensor) -> Tensor:
-    """Return whether the declared termination holds at states q (m, C), (m,) bool; false if termination is learned. A
+    """Return (m,) bool: whether the declared termination holds at states q (m, C); false if termination is learned. A
     real step from a terminated state would teach nothing."""
     return q.new_zeros(len(q), dtype=torch.bool) if definition.learns_termination else definition.terminated(q)
 

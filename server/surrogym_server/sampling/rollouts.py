@@ -220,9 +220,9 @@ def predict_paths(model: DynamicsModel, starts: Tensor, actions: Tensor) -> Path
 
 
 def _may_leave_limits(definition: EnvironmentDefinition, q: Tensor, q_next: Tensor, variance: Tensor) -> Tensor:
-    """Return which of b paths come too close to a declared limit in a step from q (b, C) to q_next (b, C), (b,) bool: a
-    state within the limit's margin, where the sampler switches to its fallback action, or a probability of being
-    outside the limit that is above the declared one.
+    """Return (b,) bool: which of b paths come too close to a declared limit in a step from q (b, C) to q_next (b, C).
+    It is too close if the step ends within the limit's margin, where the sampler switches to its fallback action, or if
+    the probability of being outside the limit is above the declared one.
 
     ``variance`` (b, M) is the predictive variance of the moving coordinates, summed along each path.
     """

@@ -286,7 +286,7 @@ def _untrusted(model: DynamicsModel, settings: VirtualSettings, moved: Moved) ->
 
 
 def _left(definition: EnvironmentDefinition, q: Tensor, moved: Moved, untrusted: Tensor | None) -> Tensor | None:
-    """Return which of N lanes end early after a step from q (N, C), (N,) bool.
+    """Return (N,) bool: which of N lanes end early after a step from q (N, C).
 
     If an outside reward is declared, a lane ends early if its next state lies outside the sampling range or if it is in
     ``untrusted`` (N,). If limits are declared, it ends early if their fallback action would take over. Return None if

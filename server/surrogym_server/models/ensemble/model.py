@@ -25,7 +25,7 @@ class Noise:
     size: Tensor  # (p,) root mean square of the predicted noise of each output over the samples
 
     def std(self, x: Tensor) -> Tensor:
-        """Return the standard deviation of the noise of p outputs at inputs x (m, d), (m, p): the root of the mean
+        """Return the standard deviations (m, p) of the noise of p outputs at inputs x (m, d): the root of the mean
         variance over the networks."""
         return bounded(self.networks(x)).exp().mean(0).sqrt()
 

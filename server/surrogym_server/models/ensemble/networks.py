@@ -37,7 +37,7 @@ class Networks:
         return (self.first, self.first_bias, self.second, self.second_bias, self.last)
 
     def __call__(self, x: Tensor) -> Tensor:
-        """Return the outputs of each of the K networks (members) at inputs x (m, d), (K, m, p)."""
+        """Return the outputs (K, m, p) of each of the K networks (members) at inputs x (m, d)."""
         quadratic = self.skip.shape[1] > x.shape[-1] + 1
         return basis(x, quadratic) @ self.skip + nonlinear(x, self.hidden)
 
@@ -50,12 +50,12 @@ def bounded(log_variance: Tensor) -> Tensor:
 
 
 def basis(x: Tensor, quadratic: bool) -> Tensor:
-    """Return the s terms of the linear part for inputs x (m, d), (m, s): [1, x], or [1, x, x^2] if ``quadratic``."""
+    """Return the s terms (m, s) of the linear part for inputs x (m, d): [1, x], or [1, x, x^2] if ``quadratic``."""
     return torch.cat([torch.ones_like(x[:, :1]), x, *([x.square()] if quadratic else [])], -1)
 
 
 def nonlinear(x: Tensor, hidden: tuple[Tensor, ...]) -> Tensor:
-    """Return the outputs of the nonlinear part of each of the K networks at inputs x (m, d), (K, m, p)."""
+    """Return the outputs (K, m, p) of the nonlinear part of each of the K networks at inputs x (m, d)."""
     first, first_bias, second, second_bias, last = hidden
     z = torch.tanh(torch.baddbmm(first_bias, x.expand(len(first), -1, -1), first))
     z = torch.tanh(torch.baddbmm(second_bias, z, second))

@@ -109,8 +109,8 @@ class GaussianProcessModel(
         return torch.cat([change, reward[:, None]], -1)
 
     def means_before_end(self, q: Tensor, u: Tensor) -> Tensor:
-        """Return the predicted mean of every output at q (m, C) and u (m, F), (m, O), as ``means`` does, but without
-        the terminal reward."""
+        """Return the predicted mean (m, O) of every output at q (m, C) and u (m, F), as ``means`` does, but without the
+        terminal reward."""
         change, _, reward = self._predictor.means(q, u)
         return torch.cat([change, reward[:, None]], -1)
 
@@ -228,7 +228,7 @@ class GaussianProcessModel(
         return self.reward.warp is not None and self.reward.warp.sign > 0
 
     def promise(self, q: Tensor, u: Tensor) -> Tensor:
-        """Return an optimistic score of the reward of steps from q (m, C) under u (m, F), (m,): the mean plus one
+        """Return an optimistic score (m,) of the reward of each step from q (m, C) under u (m, F): the mean plus one
         standard deviation of the reward's process, which predicts the reward or its logarithm."""
         steps = PredictedSteps(q, u, self._predictor.transition(q, u, None, None, None, False, False).q_next)
         mean, std = self.reward.target(process_inputs(self.definition, self.reward, steps))

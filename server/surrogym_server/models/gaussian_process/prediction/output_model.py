@@ -65,8 +65,8 @@ class OutputModel:
         return self.centre + scale * mean, scale * variance.sqrt()
 
     def amplitude(self, x: Tensor) -> Tensor:
-        """Return the amplitude by which the output's distance from ``centre`` is scaled at inputs x (m, d), (m,). It is
-        1 if the feature map has no rates (see ``gp.growth``)."""
+        """Return the amplitude (m,) by which the output's distance from ``centre`` is scaled at each of m inputs x (m,
+        d). It is 1 if the feature map has no rates (see ``gp.growth``)."""
         rates = self.feature_map.rates
         return amplitude(x, x.new_tensor(rates)) if rates else x.new_ones(x.shape[:-1])
 

@@ -114,7 +114,7 @@ class Predictor:
         return q_next, mean, spread
 
     def _by_prior(self, prior: Predictor, q: Tensor, u: Tensor) -> Tensor:
-        """Return the prior model's predictions at q (m, C) and u (m, F), (m, columns): a column for each coordinate or
+        """Return the prior model's predictions (m, columns) at q (m, C) and u (m, F): a column for each coordinate or
         observation entry, and one for the reward. Columns to which they are not added are 0."""
         change, _, reward = prior.means(q, u)
         added = change.new_zeros(len(q), self._reward_column + 1)

@@ -138,7 +138,7 @@ def _encode_stage(
     They are computed from ``raw`` (C + F + L, B): C coordinates and F action entries, which the first stage reads, and
     the predicted next values of L leading coordinates, which the second stage first writes and then reads. The third
     stage replaces the coordinates by the next coordinates ``arrived`` (C, B). ``head`` is the first matrix of the
-    tables, and ``mean`` (columns, B) has the changes that earlier stages predicted.
+    tables ``numbers`` and ``places``, and ``mean`` (columns, B) has the changes that earlier stages predicted.
     """
     size, lanes, observe = len(arrived), raw.shape[1], int(head[0, OBSERVE])
     width, begin, end = int(head[0, WIDTH]), 0, int(head[0, WIDTH])
@@ -235,7 +235,8 @@ def _predict_stage(
 def _arrive(numbers: Floats, places: Ints, head: Floats, raw: Floats, mean: Floats, arrived: Floats) -> None:
     """Compute the next coordinates, and write them to ``arrived`` (C, B): the coordinates in the first C rows of
     ``raw``, changed by the predicted changes ``mean`` (columns, B) of coordinates or observation entries, with the
-    environment's rules (such as limits) applied. ``head`` is the first matrix of the tables."""
+    environment's rules (such as limits) applied. ``head`` is the first matrix of the tables ``numbers`` and
+    ``places``."""
     size, lanes = arrived.shape
     for c in range(size):
         for b in range(lanes):
@@ -267,8 +268,8 @@ def _unwarp(warp: Floats, mean: Floats, spread: Floats) -> None:
 
 @inlined
 def _ended(numbers: Floats, places: Ints, head: Floats, arrived: Floats) -> Bools:
-    """Return whether the declared termination holds at coordinates ``arrived`` (C, B), (B,). ``head`` is the first
-    matrix of the tables."""
+    """Return (B,) bool: whether the declared termination holds at coordinates ``arrived`` (C, B). ``head`` is the first
+    matrix of the tables ``numbers`` and ``places``."""
     over = np.zeros(arrived.shape[1], dtype=np.bool_)
     if head[0, CONDITIONS] != NONE:
         holds = holding(numbers, places, int(head[0, CONDITIONS]), arrived)
@@ -430,7 +431,7 @@ class StepsOfModel(ArraySteps):
         return self._steps(q, u, noise, process, paths, stds, reward_std, NO_ROWS)
 
     def _by_prior(self, prior: StepsOfModel, q: Floats, u: Floats) -> Floats:
-        """Return the prior model's predictions at q (N, C) and u (N, F), (N, columns): a column for each coordinate or
+        """Return the prior model's predictions (N, columns) at q (N, C) and u (N, F): a column for each coordinate or
         observation entry, and one for the reward. Columns to which they are not added are 0."""
         added = np.empty((len(q), len(self.uses)))
         added[:, -1] = prior._steps(q, u, None, None, None, False, False, added).reward
