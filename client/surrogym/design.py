@@ -214,7 +214,7 @@ class Design:
 
         Args:
             steps: number of real steps.
-            visited: states that a policy visits, (v, C), at least one. The queries then improve the model there.
+            visited: states (v, C), at least one, that a policy visits. The queries then improve the model there.
 
         Raises:
             InvalidInput: the budget has fewer steps left, or the states have the wrong shape or are not finite.

@@ -98,7 +98,7 @@ class Choices:
         return log
 
     def parts(self, outputs: Array) -> list[Array]:
-        """Split an actor's A outputs for B observations, (B, A), into the logits of each action entry."""
+        """Split an actor's outputs (B, A) for B observations into the logits of each action entry."""
         return np.split(outputs, np.cumsum(self.counts)[:-1], axis=1)
 
 

@@ -45,12 +45,12 @@ def room(spec: EnvironmentSpec, coordinates: Array) -> Array:
 
 
 def past(spec: EnvironmentSpec, coordinates: Array) -> Bools:
-    """Return for each of n states with coordinates (n, C) whether it lies beyond any limit, as booleans (n,)."""
+    """Return a mask (n,) of the states with coordinates (n, C) that lie beyond any limit."""
     return np.asarray((room(spec, coordinates) < 0).any(axis=1))
 
 
 def falls_back(spec: EnvironmentSpec, before: Array, coordinates: Array) -> Bools:
-    """Return for each of n states whether the fallback acts there, as booleans (n,).
+    """Return a mask (n,) of the states in which the fallback acts.
 
     The fallback acts if the distance to a limit is below the limit's margin, now (at ``coordinates`` (n, C)) or after
     one more step with the same change as since the states one step earlier (``before`` (n, C)).
@@ -59,13 +59,13 @@ def falls_back(spec: EnvironmentSpec, before: Array, coordinates: Array) -> Bool
 
 
 def margins(spec: EnvironmentSpec) -> Array:
-    """Return the margin of each of the L limits of a specification, (L,)."""
+    """Return the margins (L,) of the L limits of a specification."""
     return np.array([limit.margin for limit in limits_of(spec).keep])
 
 
 def is_near(margin: Array, now: Array, before: Array) -> Bools:
-    """Return for each of n states whether the distance to any of L limits is below the limit's margin, now or after
-    one more step with the same change, as booleans (n,).
+    """Return a mask (n,) of the states whose distance to any of L limits is below the limit's margin, now or after one
+    more step in which the distance changes as much as in the last step.
 
     ``margin`` (L,) has the margins, ``now`` and ``before`` (n, L) the distances now and one step earlier.
 

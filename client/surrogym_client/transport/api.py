@@ -356,7 +356,7 @@ class Api:
     # Routes of models
 
     def session_coordinates(self, session: str) -> list[list[float]]:
-        """Return the coordinates of each lane of a session, (N, C)."""
+        """Return the coordinates (N, C) of the N lanes of a session."""
         return self._get(wire.SessionCoordinates, f"{routes.session(session)}/coordinates").coordinates
 
     def query_uncertainty(

@@ -14,8 +14,8 @@ from surrogym_shared.spec.actions import Action
 
 
 def decode_actions(spec: EnvironmentSpec, raw: NDArray[Any], num_envs: int) -> Array:
-    """Convert a policy's actions for N environments to those of the original environment, (N, F). Bins become
-    continuous values.
+    """Convert a policy's actions for N environments to actions (N, F) of the original environment. The numbers of
+    bins become continuous values.
 
     Raises:
         ValueError: the actions have the wrong shape, are not finite, or are not numbers of existing bins or values.

@@ -101,7 +101,7 @@ def calibrate(
         spec: the specification, which says which coordinates are angles.
         real: the real steps, at least two.
         parameters: the P parameters and their ranges. If there are none, only the error is computed.
-        own: the simulator's own values, (P,).
+        own: the simulator's own values (P,) of the parameters.
         step: takes one step of the simulator; if it raises, the step counts as very wrong.
 
     Raises:

@@ -92,8 +92,8 @@ def within_rates(controller: Controller, coordinates: Array, action: Array) -> A
 
 
 def _falls_back(guard: Guard, memory: Memory, coordinates: Array) -> Bools:
-    """Return for each of N controllers, (N,), whether it takes the fallback action at coordinates (N, C), because a
-    limit would be left soon."""
+    """Return a mask (N,) of those of N controllers that take the fallback action at coordinates (N, C), because a limit
+    would be left soon."""
     now, before = (
         np.stack([_room(limit, q) for limit in guard.limits], axis=1) for q in (coordinates, memory.coordinates)
     )
@@ -125,8 +125,8 @@ def observe(controller: Controller, coordinates: Array) -> Array:
 
 
 def act(controller: Controller, observation: Array) -> tuple[Array, Bools]:
-    """Return actions (N, F) for observations (N, D), and for each row, (N,), whether an output of the network is not
-    finite."""
+    """Return actions (N, F) for observations (N, D), and a mask (N,) of the rows in which an output of the network is
+    not finite."""
     y = scores(controller.decision, observation)
     wrong: Bools = np.logical_not(np.isfinite(y).all(1))
     y = np.where(wrong[:, None], 0.0, y)

@@ -87,8 +87,8 @@ class Compared:
 
     @property
     def surprising(self) -> Bools:
-        """Which outputs (O,) have larger errors than chance explains, in states that the policy visits. The errors are
-        compared with those that the model itself expects, without any tolerance."""
+        """Mask (O,) of the outputs with larger errors than chance explains, in states that the policy visits. The
+        errors are compared with those that the model itself expects, without any tolerance."""
         on_way = slice(len(self.errors) - self.elsewhere)
         errors, deviations = self.errors[on_way], self.deviations[on_way]
         sums = (errors**2 / (deviations**2 + self.claimed_alone**2)).sum(0)
@@ -127,7 +127,8 @@ class Consequence:
 
     @property
     def beyond(self) -> Bools:
-        """Which of the K sampled errors would move the return out of the promised interval by more than ``slack``."""
+        """Mask (K,) of the sampled errors that would move the return out of the promised interval by more than
+        ``slack``."""
         returns = self.before.median + self.changes
         outside: Bools = (returns < self.before.low - self.slack) | (returns > self.before.high + self.slack)
         return outside

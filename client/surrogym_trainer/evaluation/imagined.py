@@ -175,7 +175,7 @@ def _added(sums: NDArray[np.float64], rows: NDArray[np.floating[Any]]) -> NDArra
 
 
 def observation_statistics(port: SurrogatePort, seed: int) -> tuple[list[float], list[float]]:
-    """Return mean and standard deviation, (D,) each, of observations over the sampling range."""
+    """Return the mean (D,) and the standard deviation (D,) of observations over the sampling range."""
     lanes = Lanes(port, session_request(STATISTICS_LANES, "same_step", {"start_box": 1.0}))
     try:
         observation = np.asarray(lanes.reset(seed).observation, dtype=np.float64)

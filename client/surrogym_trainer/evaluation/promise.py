@@ -65,7 +65,7 @@ def fallback_share(fallen: NDArray[np.bool_]) -> FallbackShare:
     If no virtual episode has a fallback, or all have one, the interval ends at the exact one-sided 95 % bound.
 
     Args:
-        fallen: whether the fallback acts in each virtual episode, (starts, functions).
+        fallen: mask (starts, functions) of the virtual episodes in which the fallback acts.
     """
     share = interval(fallen.astype(np.float64))
     # share of episodes with a fallback at which, with a probability of 5 %, all ``fallen.size`` episodes have none

@@ -23,7 +23,7 @@ def declared_reward(spec: EnvironmentSpec, q: Floats, u: Floats, q_next: Floats,
 
 
 def _reward_of(spec: EnvironmentSpec, term: RewardTerm, q: Floats, u: Floats) -> Floats:
-    """Compute one term of the reward for n steps, (n,): weight * shape(of) if all its inequalities hold, else 0."""
+    """Compute one term (n,) of the reward for n steps: weight * shape(of) if all its inequalities hold, else 0."""
     of = [
         (0.0 if one.term is None else evaluate(spec, one.term, q)) + (u @ np.array(one.action) if one.action else 0.0)
         for one in term.of

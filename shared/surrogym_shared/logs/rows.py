@@ -110,7 +110,7 @@ def _matrix(
 
 
 def _numbered(column: str, cells: Floats, choices: tuple[float, ...]) -> tuple[Floats, dict[int, str]]:
-    """Convert codes of choices to the numbers of the choices from 0, (n,). Also return a reason for each cell that is
+    """Convert codes of choices to the numbers (n,) of the choices from 0. Also return a reason for each cell that is
     not a choice, by the row's index."""
     values = np.array(choices)
     same = cells[:, None] == values

@@ -237,7 +237,7 @@ def _sample_here(
             signal.signal(number, lambda *_: sampler.stop())
         with on_interrupt(lambda: _words_of_interruption(sampler.summary())), closing(environment):
             result = sampler.run()
-        result = replace(result, fallback_steps=sampler.summary().fallback_steps)  # with those of its closing
+        result = replace(result, fallback_steps=sampler.summary().fallback_steps)  # with those while it closed
     output.give(asdict(result), lambda: _words(plan.surrogate, result))
     if result.phase == "failed":
         raise typer.Exit(1)

@@ -54,7 +54,7 @@ class Seen:
 
     @property
     def ended_at_once(self) -> NDArray[np.bool_]:
-        """Which steps (n,) ended an episode at its first step; such an episode began in an impossible state."""
+        """Mask (n,) of the steps that ended an episode at once, because the episode began in an impossible state."""
         first = np.append(True, self.episodes[1:] != self.episodes[:-1])
         last = np.append(self.episodes[1:] != self.episodes[:-1], True)
         ended: NDArray[np.bool_] = first & last & self.terminated
@@ -114,7 +114,7 @@ def _common_length(lengths: Sequence[int], longest: int) -> int | None:
 
 
 def _far_from(counted: Counted, visited: Array, state: Array, rng: np.random.Generator) -> Array:
-    """Set the simulator to a position far from the visited states, and return its state, V variables (V,).
+    """Set the simulator to a position far from the visited states, and return its state (V,).
 
     Of random positions within their limits and without contacts, the one farthest from all visited states is chosen. A
     distance is the norm of the positions' differences, each as a share of its range. If all positions have contacts,

@@ -129,7 +129,7 @@ class _Shifted:
     Args:
         counted: the simulator.
         places: for each step its state of V variables (V,), action (F,), next state (V,) and results.
-        scale: observed range of each variable and of the reward (V + 1,).
+        scale: observed ranges (V + 1,) of the variables and of the reward.
         same: largest difference at which two results count as equal, as a share of ``scale``.
     """
 
@@ -225,7 +225,7 @@ def _replayed(counted: Counted, seen: Seen, scale: Array) -> float:
 
 
 def _scale(seen: Seen) -> Array:
-    """Return the observed range of each of the V variables and, as the last entry, of the reward (V + 1,)."""
+    """Return the observed ranges (V + 1,): those of the V variables and, as the last entry, that of the reward."""
     moved = np.append(moved_by(np.concatenate([seen.states, seen.next_states])), np.ptp(seen.rewards))
     return np.where(moved > 0, moved, 1.0)
 

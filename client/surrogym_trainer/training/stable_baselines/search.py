@@ -151,7 +151,7 @@ def make_learner(
         env: the virtual environment to learn in.
         settings: settings of the training.
         spec: specification of the environment.
-        statistics: mean and standard deviation of observations, (D,) each.
+        statistics: mean (D,) and standard deviation (D,) of observations.
         gamma: discount factor.
 
     Raises:
