@@ -51,7 +51,7 @@ def model_actions(action: ActionDefinition, raw: NDArray[Any]) -> Array:
 
 
 def decode_bins(action: ActionDefinition, rows: Array) -> Array:
-    """Convert n actions whose entries are numbers of equally spaced values, (n, F), to these values, (n, F)."""
+    """Convert n actions (n, F), whose entries are numbers of equally spaced values, to these values (n, F)."""
     low, high = action.limits
     values: Array = low + rows * (high - low) / (np.array(action.bins) - 1)
     return values

@@ -272,7 +272,8 @@ def _of_action(definition: EnvironmentDefinition, feature_map: FeatureMap, entry
 
 def _group(same: tuple[Feature, ...], device: torch.device) -> tuple[slice | Tensor, Tensor, Tensor, Tensor]:
     """Return the parameters of k features with the same function, such as cos: the indices of the entries that they
-    read (a slice if the indices are consecutive) or weights (C, k); then centres, scales and rates, (k,) each."""
+    read (a slice if the indices are consecutive) or weights (C, k); then their centres (k,), scales (k,) and rates
+    (k,)."""
     numbers = torch.tensor([(f.centre, f.scale, f.rate) for f in same], dtype=torch.float64, device=device)
     centre, scale, rate = numbers.T
     if same[0].weights:

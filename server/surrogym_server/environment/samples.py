@@ -57,7 +57,7 @@ def increments(definition: EnvironmentDefinition, samples: Samples) -> Tensor:
 
 
 def preceding(definition: EnvironmentDefinition, samples: Samples) -> Tensor:
-    """Return for each of n samples the row of the sample that is the step before it, (n,); -1 if there is none.
+    """Return for each of n samples the row (n,) of the sample that is the step before it; -1 if there is none.
 
     This is the previous row, if its step did not terminate and the sample begins at the moving coordinates at which
     the step ended.
@@ -70,14 +70,14 @@ def preceding(definition: EnvironmentDefinition, samples: Samples) -> Tensor:
 
 
 def saturated(definition: EnvironmentDefinition, q_next: Tensor) -> Tensor:
-    """Return which of n steps, which ended at q_next (n, C), reached a declared bound of any coordinate, (n,) bool. The
+    """Return (n,) bool: which of n steps, which ended at q_next (n, C), reached a declared bound of any coordinate. The
     change in such a step is shorter than the dynamics alone would give."""
     return (limit_sides(definition, q_next) != 0).any(-1)
 
 
 def limit_sides(definition: EnvironmentDefinition, q_next: Tensor) -> Tensor:
-    """Return for each coordinate of n states q_next (n, C) 1 at its upper bound, -1 at its lower bound, otherwise 0,
-    (n, C)."""
+    """Return a number (n, C) for each coordinate of n states q_next (n, C): 1 at its upper bound, -1 at its lower
+    bound, otherwise 0."""
     low, high = definition.bounds
     slack = 1e-9 * torch.where(torch.isfinite(high - low), high - low, 1.0)
     return (q_next >= high - slack).to(q_next.dtype) - (q_next <= low + slack).to(q_next.dtype)

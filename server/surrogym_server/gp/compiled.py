@@ -129,7 +129,7 @@ def _smooth(own: Floats, inverse: Floats, points: Floats) -> Floats:
 
 @inlined
 def _covariances(head: Floats, rows: Floats, own: Floats, smooth: Floats) -> Floats:
-    """Return the prior covariances of the inputs ``own`` (d, B) with the n training points, (n, B).
+    """Return the prior covariances (n, B) of the n training points with the inputs ``own`` (d, B).
 
     Args:
         head: scalars of the process, such as its scale: its matrix HEAD (1, 11).
@@ -272,7 +272,7 @@ def _add_residuals(
 def predict(
     numbers: Floats, places: Ints, at: int, x: Floats, wanted: bool, paths: Floats, mean: Floats, std: Floats
 ) -> None:
-    """Predict one output at inputs x (d, B), each a column, and write the results to ``mean`` and ``std``, (B,) each.
+    """Predict one output at inputs x (d, B), each a column, and write the results to ``mean`` (B,) and ``std`` (B,).
 
     Args:
         numbers, places: tables of matrices, see ``compiled.tables``.

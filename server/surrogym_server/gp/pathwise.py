@@ -50,8 +50,8 @@ class Pathwise:
         return torch.cat([prior, -torch.cholesky_solve(at_points.T, posterior.factor).T], 1)
 
     def residual(self, x: Tensor, weights: Tensor) -> Tensor:
-        """Return, for each of N inputs x (N, d), by how much the posterior sample in the same row of ``weights`` (N,
-        size) exceeds the posterior mean, (N,)."""
+        """Return the residuals (N,) at N inputs x (N, d): by how much the posterior sample in the same row of
+        ``weights`` (N, size) exceeds the posterior mean."""
         k = covariance(self.posterior.hyper, x, self.posterior.x)
         return (torch.cat([self._prior(x), k], 1) * weights).sum(1)
 

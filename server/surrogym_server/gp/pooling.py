@@ -238,8 +238,8 @@ def _may_read(may: Tensor, inputs: Inputs) -> bool:
 
 
 def _errors(process: Posterior, x: Tensor, y: Tensor, choices: Sequence[Inputs]) -> Tensor:
-    """Return, for each of t choices of d columns of x (n, D), the mean squared error with which the process predicts
-    targets y (n,) from these columns, (t,)."""
+    """Return the mean squared errors (t,) with which the process predicts targets y (n,) from each of t choices of d
+    columns of x (n, D)."""
     points = torch.cat([x[:, list(inputs)] for inputs in choices])
     return (process.mean(points).view(len(choices), len(y)) - y).square().mean(1)
 

@@ -149,8 +149,8 @@ class Serving:
         return max(MIN_ROWS, BLOCK // max(1, self.exponents.shape[1]))
 
     def mean(self, x: Tensor) -> Tensor:
-        """Return the predicted means at m points x (m, width) with the ``width`` inputs of the model, in O columns, (m,
-        O)."""
+        """Return the predicted means (m, O), in O columns, at m points x (m, width) with the ``width`` inputs of the
+        model."""
         return in_blocks(self.rows, lambda rows: (self._means(*self._covariances(rows)),), x)[0]
 
     def mean_and_std(self, x: Tensor, columns: Sequence[int]) -> tuple[Tensor, Tensor]:
@@ -169,8 +169,8 @@ class Serving:
         return mean, std
 
     def _covariances(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Return z = [x, x^2, 1], (m, D), and the squared exponentials of inputs x (m, width) with the S points of all
-        processes, (m, S)."""
+        """Return z = [x, x^2, 1] (m, D), and the squared exponentials (m, S) of inputs x (m, width) with the S points
+        of all processes."""
         z = torch.cat([x, x * x, x.new_ones(len(x), 1)], -1)
         exponent = z @ self.exponents
         for process in self.processes.values():
@@ -206,8 +206,8 @@ def _process(output: Output, posterior: Posterior, span: slice, polynomial: Tens
 
 
 def _points(posterior: Posterior) -> Tensor:
-    """Return the points with which inputs have squared exponentials: the n points of the process, (n, d), followed by
-    their mirror images if there is a reflection, (2 n, d)."""
+    """Return the points with which inputs have squared exponentials: the n points of the process (n, d), or with a
+    reflection these and then their mirror images (2 n, d)."""
     if (reflection := posterior.hyper.reflection) is None:
         return posterior.x
     return torch.cat([posterior.x, posterior.x * reflection.signs])

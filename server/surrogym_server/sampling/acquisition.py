@@ -36,8 +36,8 @@ GROUP = "surrogym.acquisitions"
 
 @dataclass(frozen=True)
 class CandidateView:
-    """Properties of m candidate steps (states and actions) from which an acquisition rates them, with respect to one
-    output of the model."""
+    """Properties of m candidate steps (states and actions), such as the model's standard deviations there, from which
+    an acquisition rates them with respect to one output of the model."""
 
     model: DynamicsModel
     points: Points  # the m candidates: states and actions
@@ -59,7 +59,8 @@ class CandidateView:
 
 @dataclass(frozen=True)
 class PathView:
-    """Properties of b predicted paths of T steps from which an acquisition rates them, with respect to one output."""
+    """Properties of b predicted paths of T steps, such as the information that their steps give, from which an
+    acquisition rates them with respect to one output of the model."""
 
     tolerance: float  # error that is too small to matter, in the output's unit
     # (b, T) weight of each step, at least 0: 0 outside the sampling range, and smaller where the path is uncertain.

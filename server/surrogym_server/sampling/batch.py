@@ -83,7 +83,8 @@ def candidate_view(
     tolerance: float,
     distance: Tensor,
 ) -> CandidateView:
-    """Return the properties of the candidates that an acquisition uses, for one output.
+    """Return the properties of the candidates, such as standard deviations, from which an acquisition rates them with
+    respect to one output.
 
     Args:
         model: the model from which the outlook was computed.

@@ -52,8 +52,8 @@ def in_doubt(model: DynamicsModel, q_next: Tensor) -> Tensor:
 
 
 def edge_in_doubt(model: DynamicsModel, q: Tensor, q_next: Tensor) -> Tensor:
-    """Return the probability, for steps from q (m, C) to q_next (m, C), that the model is wrong about whether the step
-    lies inside a region at whose edge the reward jumps, (m,). If there are several regions, it is the largest
+    """Return the probability (m,), for steps from q (m, C) to q_next (m, C), that the model is wrong about whether the
+    step lies inside a region at whose edge the reward jumps. If there are several regions, it is the largest
     probability."""
     doubt = q.new_zeros(len(q))
     for of_one in _edge_doubts(model, q, q_next):

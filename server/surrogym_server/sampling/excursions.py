@@ -74,6 +74,7 @@ def _reach(model: DynamicsModel, samples: Tensor, starts: Tensor, sequences: Seq
 
 
 def _state_distances(definition: EnvironmentDefinition, a: Tensor, b: Tensor) -> Tensor:
-    """Return the distances of states a (m, C) and b (n, C), in standard deviations of the sampling range, (m, n)."""
+    """Return the distances (m, n) of states a (m, C) from states b (n, C), in standard deviations of the sampling
+    range."""
     still = (Points(q, q.new_zeros(len(q), definition.action.size)) for q in (a, b))
     return distances(definition, *still)

@@ -130,8 +130,8 @@ def _unexplained(model: DynamicsModel, limits: Tensor, noise: Tensor) -> Tensor:
 
 
 def _refuted(differences: Repeats, model_noise: Tensor) -> Tensor:
-    """Return for each output whether repeated steps show that most of the noise that the model has learned,
-    ``model_noise`` (O,), is misfit of the model, (O,) bool."""
+    """Return (O,) bool: for each output, whether repeated steps show that most of the noise that the model has learned,
+    ``model_noise`` (O,), is misfit of the model."""
     bound = (model_noise / AT_MOST).square() * float(scipy.special.chdtri(differences.degrees, 1 - LEVEL))
     return differences.degrees * differences.std.square() <= bound
 

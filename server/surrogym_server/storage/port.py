@@ -227,7 +227,7 @@ class Designs(ABC):
         """End the lease of a fit without a result. Does nothing if the lease has ended.
 
         With an ``error``, the phase becomes ``failed``, and the next fit is due once the surrogate has changed since
-        the begin of this fit. With None, as at a shutdown, the fit stays due.
+        this fit began. With None, as at a shutdown, the fit stays due.
         """
 
 
@@ -258,7 +258,7 @@ class Queries(ABC):
     def claim(self, name: str, sampler: str, limit: int, seconds: float) -> list[LeasedQuery]:
         """Lease up to ``limit`` pending queries to a sampler for ``seconds``, oldest first.
 
-        Expired leases are ended before. If the surrogate is paused, the result is empty.
+        First, expired leases are ended. If the surrogate is paused, the result is empty.
         """
 
     @abstractmethod

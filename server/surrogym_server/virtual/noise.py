@@ -33,8 +33,8 @@ class Purpose(IntEnum):
 
 
 def uniform_noise(lanes: LaneState, purpose: Purpose, size: int) -> Tensor:
-    """Return ``size`` uniform random numbers in (0, 1) for each of N lanes, (N, size). They depend on the lane's state
-    and the purpose alone."""
+    """Return ``size`` uniform random numbers between 0 and 1 for each of N lanes, as an array (N, size). They depend on
+    the lane's state and the purpose alone."""
     return uniforms(_words(lanes, purpose, 1, size)).flatten(-2)[:, 0, :size]
 
 

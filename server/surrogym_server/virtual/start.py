@@ -46,7 +46,7 @@ def start_coordinates(
 
 
 def _one_of(states: Tensor, p: Tensor) -> Tensor:
-    """Return rows of ``states`` (k, C), one for each of N numbers p (N,) in [0, 1), (N, C). A number p selects the row
+    """Return N rows (N, C) of ``states`` (k, C), one for each of N numbers p (N,) in [0, 1). A number p selects the row
     with the index floor(k p)."""
     return states[(p * len(states)).long().clamp_(max=len(states) - 1)]
 

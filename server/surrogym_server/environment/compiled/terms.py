@@ -80,7 +80,7 @@ def evaluate(numbers: Floats, places: Ints, at: int, q: Floats) -> Floats:
 
 @compiled
 def holding(numbers: Floats, places: Ints, at: int, q: Floats) -> NDArray[np.bool_]:
-    """Return which of G groups of inequalities hold for the coordinates q (C, B) of B lanes, (G, B) bool. ``at`` is the
+    """Return (G, B) bool: which of G groups of inequalities hold for the coordinates q (C, B) of B lanes. ``at`` is the
     index, in the tables ``numbers`` and ``places``, of the first matrix of the conditions."""
     head, rules = matrix(numbers, places, at + TERMS), matrix(numbers, places, at + RULES)
     values = evaluate(numbers, places, int(head[0, 0]), q)

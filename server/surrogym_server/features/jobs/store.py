@@ -127,7 +127,7 @@ class Jobs:
             seconds: duration of the lease.
             reference: whether the worker has a reference controller, which some jobs need.
 
-        Expired leases are ended before. A new lease clears the progress of an earlier one.
+        First, expired leases are ended. A new lease clears the progress of an earlier one.
         """
         with self._database.read() as connection:  # a read first, so that waiting workers don't block writers
             own = jobs.c.surrogate_id == find(connection, name)

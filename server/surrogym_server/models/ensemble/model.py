@@ -41,8 +41,8 @@ class Regression:
     noise: Noise | None = None  # learned noise of transition outputs; None for rewards, whose noise is not learned
 
     def __call__(self, x: Tensor) -> Tensor:
-        """Return the predictions of p outputs by each of K networks at inputs x (m, d), in the outputs' units, (K, m,
-        p)."""
+        """Return the predictions (K, m, p) of p outputs by each of K networks at inputs x (m, d), in the outputs'
+        units."""
         return self.centre + self.scale * self.networks(x)
 
     def shaken(self, x: Tensor, process: Tensor) -> Tensor:
@@ -91,7 +91,7 @@ class NetworkEnsembleModel(SteppedInBlocks, LearnedNoise):
         return torch.cat([change, reward[:, None]], -1)
 
     def learned_termination(self, q: Tensor) -> Tensor:
-        """Return the probability of termination at q (m, C), as a mean over the networks, (m,). If all samples have the
+        """Return the probability (m,) of termination at q (m, C), as a mean over the networks. If all samples have the
         same label, the result is this label, 0 or 1."""
         if isinstance(self.ending, Networks):
             return self.ending(self._inputs.of_end(q))[..., 0].sigmoid().mean(0)

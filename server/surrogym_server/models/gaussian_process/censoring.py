@@ -15,8 +15,8 @@ from surrogym_server.environment.samples import saturated
 def usable(
     definition: EnvironmentDefinition, column: int, q_next: Tensor, feature_map: FeatureMap, *, past_limits: bool
 ) -> Tensor:
-    """Return for each of m samples, with next states q_next (m, C), whether a transition output learns from it, (m,)
-    bool. It does not learn from samples whose result a limit may have changed.
+    """Return (m,) bool: for each of m samples, with next states q_next (m, C), whether a transition output learns from
+    it. It does not learn from samples whose result a limit may have changed.
 
     Args:
         definition: the environment.
@@ -35,8 +35,8 @@ def usable(
 
 
 def stopped(definition: EnvironmentDefinition, index: int, q_next: Tensor) -> Tensor:
-    """Return for each of n samples, with next states q_next (n, C), whether it reached a bound that may have changed
-    the result of the coordinate ``index``, (n,) bool: a bound of this coordinate, or a wall, at which another
+    """Return (n,) bool: for each of n samples, with next states q_next (n, C), whether it reached a bound that may have
+    changed the result of the coordinate ``index``. Such a bound is one of this coordinate, or a wall, at which another
     coordinate, such as a speed, becomes 0.
 
     A limit of another coordinate that is no wall, such as the pressure limit of a relief valve, does not count.
@@ -48,8 +48,8 @@ def stopped(definition: EnvironmentDefinition, index: int, q_next: Tensor) -> Te
 
 
 def saturates(definition: EnvironmentDefinition, index: int, q_next: Tensor) -> Tensor:
-    """Return for each of n samples, with next states q_next (n, C), whether it reached a bound of the coordinate
-    ``index`` or of another coordinate, (n,) bool. Leading coordinates (see ``features.leading``) don't count as other
+    """Return (n,) bool: for each of n samples, with next states q_next (n, C), whether it reached a bound of the
+    coordinate ``index`` or of another coordinate. Leading coordinates (see ``features.leading``) don't count as other
     coordinates, because their clipped next values can be inputs of the output."""
     others = q_next.clone()
     others[:, leading(definition)] = math.nan

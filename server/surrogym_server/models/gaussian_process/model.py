@@ -250,8 +250,8 @@ class GaussianProcessModel(
         return step_source(self.definition, tables_of(self._predictor, self.ending))
 
     def _learns(self, column: int, q_next: Tensor) -> Tensor:
-        """Return for each of m steps to q_next (m, C) whether the output with index ``column`` would learn from it,
-        (m,) bool."""
+        """Return (m,) bool: for each of m steps to q_next (m, C), whether the output with index ``column`` would learn
+        from it."""
         if column == len(self.transitions):
             return ~self.terminated(q_next)
         output = self.transitions[column]

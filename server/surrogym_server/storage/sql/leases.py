@@ -148,8 +148,8 @@ def give_back(
     """Make queries whose lease has ended pending again, or set them aside after their last attempt or a refusal.
 
     A lease that ended before a real step does not count as an attempt. If a person makes a query pending again that was
-    set aside, it gets all attempts again. ``error`` is stored with the queries. The caller must have stored the
-    ``outcome`` of the leases before.
+    set aside, it gets all attempts again. ``error`` is stored with the queries. The caller must have stored
+    ``outcome``, which says how the leases ended, with the leases before.
     """
     failures = (
         sa.select(sa.func.count())

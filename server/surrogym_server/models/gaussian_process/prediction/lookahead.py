@@ -123,8 +123,8 @@ def process_inputs(definition: EnvironmentDefinition, output: OutputModel, steps
 
 
 def slope_at(output: OutputModel, x: Tensor) -> Tensor | None:
-    """Return the derivative of an output with respect to its process at inputs x (m, d), divided by the output's scale,
-    (m,); None if it is 1 everywhere."""
+    """Return the derivative (m,) of an output with respect to its process at inputs x (m, d), divided by the output's
+    scale; None if it is 1 everywhere."""
     if output.warp is not None:
         return output.warp.slope(*output.target(x))
     return output.amplitude(x) if output.feature_map.rates else None

@@ -44,20 +44,20 @@ class OutputModel:
     size_with_prior: float | None = None
 
     def mean(self, x: Tensor) -> Tensor:
-        """Return the posterior mean at features x (m, d), in the output's unit, (m,)."""
+        """Return the posterior mean (m,) at features x (m, d), in the output's unit."""
         if self.posterior is None:
             return x.new_full(x.shape[:-1], self.centre)
         mean = self.centre + self.scale * self.amplitude(x) * self.posterior.mean(x)
         return mean if self.warp is None else self.warp.value(mean)
 
     def mean_and_std(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Return posterior mean and standard deviation without noise at features x (m, d), in the output's unit, (m,)
-        each."""
+        """Return the posterior mean (m,) and the standard deviation without noise (m,) at features x (m, d), in the
+        output's unit."""
         return paid(self.warp, *self.target(x))
 
     def target(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Return posterior mean and standard deviation without noise at features x (m, d), in the unit of the targets
-        (logarithms of the output if there is a ``warp``), (m,) each."""
+        """Return the posterior mean (m,) and the standard deviation without noise (m,) at features x (m, d), in the
+        unit of the targets (logarithms of the output if there is a ``warp``)."""
         if self.posterior is None:
             return x.new_full(x.shape[:-1], self.centre), x.new_zeros(x.shape[:-1])
         mean, variance = self.posterior.mean_and_variance(x)
@@ -71,7 +71,7 @@ class OutputModel:
         return amplitude(x, x.new_tensor(rates)) if rates else x.new_ones(x.shape[:-1])
 
     def standardised(self, target: Tensor, x: Tensor) -> Tensor:
-        """Return the targets (m,) at inputs x (m, d) in the standardised unit of the process, (m,)."""
+        """Return the standardised targets (m,) of the process, given the targets ``target`` (m,) at inputs x (m, d)."""
         return (target - self.centre) / (self.scale * self.amplitude(x))
 
     @property

@@ -49,7 +49,7 @@ class Axes:
         return 3 * len(self.names)
 
     def __call__(self, q: Tensor) -> Tensor:
-        """Return the values of states q (m, C) on all axes, (m, A)."""
+        """Return the values (m, A) of states q (m, C) on all A axes."""
         value = self.terms(q)
         return torch.cat([value, -value, value.abs()], -1)
 
@@ -82,8 +82,8 @@ class Thresholds:
     complement: bool = False  # if true, the region consists of the states for which no rule holds
 
     def probability(self, q: Tensor) -> Tensor:
-        """Return the probability that states q (m, C) lie inside, (m,). Each threshold is uniformly distributed over
-        the gap between the nearest samples outside and inside."""
+        """Return the probability (m,) that states q (m, C) lie inside. Each threshold is uniformly distributed over the
+        gap between the nearest samples outside and inside."""
         return self.at(self._axes(q))
 
     def at(self, values: Tensor) -> Tensor:
@@ -138,7 +138,7 @@ class Classifier:
     process: OutputModel
 
     def probability(self, q: Tensor) -> Tensor:
-        """Return the probability that states q (m, C) lie inside, (m,): that the process is above 0 there."""
+        """Return the probability (m,) that states q (m, C) lie inside: that the process is above 0 there."""
         u = q.new_zeros(len(q), self.definition.action.size)
         mean, std = self.process.mean_and_std(encode(self.definition, self.process.feature_map, q, u))
         return likely(mean, std)
@@ -161,7 +161,7 @@ class Region:
     scores: tuple[tuple[str, float], ...]  # name of every form that was compared, and its leave-one-out log probability
 
     def probability(self, q: Tensor) -> Tensor:
-        """Return the probability that states q (m, C) lie inside the region, (m,)."""
+        """Return the probability (m,) that states q (m, C) lie inside the region."""
         mixed = torch.stack([weight * form.probability(q) for weight, form in self.forms]).sum(0)
         return mixed.clamp(0, 1)  # because of rounding, the weighted sum may exceed 1
 
