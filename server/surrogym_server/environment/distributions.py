@@ -21,7 +21,7 @@ class UniformDefinition:
     high: float
 
     def quantile(self, p: Tensor) -> Tensor:
-        """Return the value below which a share p of the distribution lies."""
+        """Return the value below which a share p of the distribution lies, for each entry of p, of any shape."""
         return self.low + (self.high - self.low) * p
 
     def log_density(self, value: Tensor) -> Tensor:
@@ -39,14 +39,15 @@ class NormalDefinition:
     high: float
 
     def quantile(self, p: Tensor) -> Tensor:
-        """Return the value below which a share p of the distribution lies."""
+        """Return the value below which a share p of the distribution lies, for each entry of p, of any shape."""
         edges = torch.tensor([self.low, self.high], dtype=p.dtype, device=p.device)
         below, above = torch.special.ndtr((edges - self.mean) / self.std)
         value: Tensor = self.mean + self.std * torch.special.ndtri(below + (above - below) * p)
         return torch.clamp(value, self.low, self.high)
 
     def log_density(self, value: Tensor) -> Tensor:
-        """Return the log density at values within the limits, less the log density at the mean."""
+        """Return the log density at each entry of ``value``, of any shape and within the limits, less the log density
+        at the mean."""
         return -0.5 * ((value - self.mean) / self.std).square()
 
 

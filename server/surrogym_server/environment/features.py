@@ -135,7 +135,7 @@ def distances(definition: EnvironmentDefinition, a: Points, b: Points) -> Tensor
 def encode(
     definition: EnvironmentDefinition, feature_map: FeatureMap, q: Tensor, u: Tensor, lead: Tensor | None = None
 ) -> Tensor:
-    """Return the d features of a feature map, (..., d), for coordinates q (..., C) and actions u (..., F).
+    """Return the d features (..., d) of a feature map for coordinates q (..., C) and actions u (..., F).
 
     ``lead`` (..., L) are the next values of the L leading coordinates (see ``leading``), needed if the map reads them.
     """
@@ -179,8 +179,8 @@ class Encoder:
         return sum(lead or feature.function != "lead" for feature in self.columns)
 
     def __call__(self, q: Tensor, u: Tensor) -> Tensor:
-        """Return all features of coordinates q (..., C) and actions u (..., F), except those of the lead (the next
-        values of leading coordinates)."""
+        """Return all d features (..., d) of coordinates q (..., C) and actions u (..., F), except those of the lead
+        (the next values of leading coordinates)."""
         raw = torch.cat([q, u], -1)
         values = [self._values(*group, raw) for group in self.groups if group[0] != "lead"]
         return torch.cat(values, -1) if values else raw[..., :0]

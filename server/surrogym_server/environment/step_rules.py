@@ -71,7 +71,8 @@ def with_lags(definition: EnvironmentDefinition, q: Tensor, u: Tensor, q_next: T
 
 
 def _repeated(definition: EnvironmentDefinition, index: int, q: Tensor, u: Tensor, q_next: Tensor) -> Tensor:
-    """Return the value of the coordinate ``index``, which is a lag (it repeats a past value), after m steps, (m,)."""
+    """Return the value (m,) of the coordinate ``index``, which is a lag (it repeats a past value), after each of m
+    steps from q (m, C) under u (m, F) to q_next (m, C)."""
     lag = definition.coordinates[index].lag
     assert lag is not None
     match lag.kind:

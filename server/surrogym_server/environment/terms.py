@@ -42,7 +42,7 @@ class TermSet:
     high: Tensor | None  # (T,) each term is lowered to this value if it is above; None if no term is clipped
 
     def __call__(self, q: Tensor) -> Tensor:
-        """Return the values of all terms at q (..., C), shape (..., T)."""
+        """Return the values (..., T) of all T terms at q (..., C)."""
         basis = q
         if self.frequencies.shape[1]:
             phase = q @ self.frequencies

@@ -42,7 +42,7 @@ class Joint:
         return cls(posterior.hyper, x, whitened, x.new_zeros(0, len(x)), latent, noise)
 
     def between(self, a: slice, b: slice) -> Tensor:
-        """Return the posterior covariance of the points in slice a with those in slice b, (|a|, |b|)."""
+        """Return the posterior covariances (|a|, |b|) of the points in slice a with those in slice b."""
         prior = covariance(self.hyper, self.x[a], self.x[b])
         explained = self.whitened[:, a].T @ self.whitened[:, b] + self.observed[:, a].T @ self.observed[:, b]
         return prior - explained

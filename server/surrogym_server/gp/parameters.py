@@ -79,7 +79,8 @@ class Parameters:
         return values[: self.d], float(values[self.d]), linear, quadratic, float(values[-1])
 
     def standardised(self, theta: Array) -> Array:
-        """Return how far each free parameter is from its prior's mean, in the prior's standard deviations.
+        """Return for each free parameter in theta how far it is from its prior's mean, in the prior's standard
+        deviations.
 
         The negative log density of the priors is half the sum of the squares of this result, plus ``prior_constant``,
         plus log(2 pi) / 2 for each free parameter.

@@ -214,8 +214,8 @@ def _points(posterior: Posterior) -> Tensor:
 
 
 def _weights(posterior: Posterior) -> Tensor:
-    """Return the weights of the points in the posterior mean, followed by those of their mirror images if there is a
-    reflection."""
+    """Return the weights of the n points in the posterior mean (n,), or with a reflection these and then those of the
+    mirror images (2 n,)."""
     if (reflection := posterior.hyper.reflection) is None:
         return posterior.weights
     return torch.cat([posterior.weights, reflection.parity * posterior.weights])

@@ -360,7 +360,7 @@ def _exponential(a: Array, b: Array) -> Array:
 
 
 def _factor(matrix: Array) -> Array | None:
-    """Return the lower Cholesky factor of a symmetric matrix; None if it is not positive definite."""
+    """Return the lower Cholesky factor (m, m) of a symmetric matrix (m, m); None if it is not positive definite."""
     lower, info = scipy.linalg.lapack.dpotrf(matrix, lower=1, clean=1)
     return None if info else np.ascontiguousarray(lower)
 

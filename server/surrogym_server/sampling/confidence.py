@@ -54,15 +54,15 @@ def stds(model: DynamicsModel, q: Tensor, u: Tensor) -> Tensor:
 
 
 def certainty(std: Tensor, tolerance: Tensor | float) -> Tensor:
-    """Return the certainty C_m = Phi(tau / sigma) (eq. 9) for standard deviations sigma = ``std`` and tolerances tau; 1
-    if sigma is 0."""
+    """Return the certainty C_m = Phi(tau / sigma) (eq. 9) for standard deviations sigma = ``std``, of any shape, and
+    tolerances tau = ``tolerance``; 1 if sigma is 0."""
     index: Tensor = torch.special.ndtr(tolerance / std)
     return index
 
 
 def log_model_uncertainty(std: Tensor, tolerance: Tensor | float) -> Tensor:
     """Return the logarithm of the model uncertainty (eq. 10), log U_m = log Phi(-tau / sigma), for standard deviations
-    sigma = ``std`` and tolerances tau. It is finite also if sigma is 0."""
+    sigma = ``std``, of any shape, and tolerances tau = ``tolerance``. It is finite also if sigma is 0."""
     log_uncertainty: Tensor = torch.special.log_ndtr(-(tolerance / std).clamp_max(SUREST))
     return log_uncertainty
 

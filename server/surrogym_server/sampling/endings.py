@@ -62,8 +62,9 @@ def edge_in_doubt(model: DynamicsModel, q: Tensor, q_next: Tensor) -> Tensor:
 
 
 def _edges(model: DynamicsModel, points: Points, q_next: Tensor) -> Tensor | None:
-    """Return for each candidate whether it is among those at which it is most doubtful on which side of an edge, where
-    the reward jumps, the step lies, (m,) bool. The first doubtful edge is used. None if no edge is doubtful."""
+    """Return (m,) bool: which of m candidates, steps from ``points`` to q_next (m, C), are the most doubtful at an edge
+    where the reward jumps. The probability that the model is wrong about their side of the edge is at least half the
+    largest one. The first doubtful edge is used. The result is None if no edge is doubtful."""
     for doubt in _edge_doubts(model, points.q, q_next):
         if float(doubt.mean()) > DOUBT:
             return doubt >= 0.5 * doubt.max()

@@ -143,8 +143,8 @@ def widened_by(noise: Tensor, tolerances: Sequence[float]) -> tuple[float, ...]:
 
 
 def _possible(model: DynamicsModel, limits: Tensor) -> Tensor:
-    """Return the largest noise of each output, (O,), with which the samples are at least as likely as with the noise
-    that the model has learned."""
+    """Return the largest noise (O,) of each output with which the samples are at least as likely as with the noise that
+    the model has learned."""
     able = offers(model, LearnedNoise)
     return torch.zeros_like(limits) if able is None else torch.tensor(able.possible_noise, dtype=limits.dtype)
 

@@ -66,7 +66,8 @@ def _region(inputs: Tensor, doubt: Tensor, names: Sequence[str]) -> Region | Non
 
 def _ranges(values: Tensor, share: Tensor, name: str) -> list[tuple[float, Region]]:
     """Return two candidate regions of one input, each with its gain (share of the model uncertainty less share of the
-    points in it): the range with the greatest gain, and the complement of the range with the smallest gain."""
+    points in it): the range with the greatest gain, and the complement of the range with the smallest gain. ``values``
+    (m,) are the input's values at m points, and ``share`` (m,) the shares of the model uncertainty at these points."""
     ordered, order = values.sort(stable=True)
     # True at the last of equal values. Ranges end only there, so that none separates points with equal values.
     last = torch.cat([ordered[1:] != ordered[:-1], torch.tensor([True])])

@@ -201,7 +201,8 @@ def random_sequences(definition: EnvironmentDefinition, count: int, length: int,
 
 
 def predict_paths(model: DynamicsModel, starts: Tensor, actions: Tensor) -> Paths:
-    """Predict a path from each start (b, C) under its action sequence (b, T, F), with the mean result of every step."""
+    """Predict a path from each of b starts (b, C) under its sequence of T actions (b, T, F), with the mean result of
+    every step."""
     definition = model.definition
     spread = starts.new_tensor([scaling(definition.coordinates[i].sampling)[1] for i in definition.moving])
     q, running, going = starts, starts.new_ones(len(starts)), starts.new_ones(len(starts))

@@ -153,7 +153,7 @@ def _compiled_transition(
 
 
 def penalised(reward: Tensor, penalty: float, std: Tensor) -> Tensor:
-    """Return rewards (m,) less ``penalty`` times their standard deviations (m,), eq. 14."""
+    """Return the rewards (m,) less ``penalty`` times their standard deviations ``std`` (m,), eq. 14."""
     return reward - penalty * std
 
 

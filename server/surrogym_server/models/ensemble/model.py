@@ -144,7 +144,8 @@ class NetworkEnsembleModel(SteppedInBlocks, LearnedNoise):
         return q_next, _of_member(rewards, member), spread, doubt
 
     def _rewards(self, q: Tensor, u: Tensor, q_next: Tensor) -> Tensor:
-        """Return the reward that each of the K networks predicts for m steps, (K, m)."""
+        """Return the rewards (K, m) that each of the K networks predicts for m steps from q (m, C) under u (m, F) to
+        q_next (m, C)."""
         if (declared := self.definition.declared_reward) is not None:
             return declared(q_next if declared.after else q, u).expand(self.transitions.networks.members, -1)
         assert self.reward is not None

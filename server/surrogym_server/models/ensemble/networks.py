@@ -43,8 +43,8 @@ class Networks:
 
 
 def bounded(log_variance: Tensor) -> Tensor:
-    """Return log variances of noise, softly limited so that standard deviations are between ``LEAST_NOISE`` and
-    ``MOST_NOISE``."""
+    """Return log variances of noise, of any shape, softly limited so that standard deviations are between
+    ``LEAST_NOISE`` and ``MOST_NOISE``."""
     low, high = 2 * math.log(LEAST_NOISE), 2 * math.log(MOST_NOISE)
     return low + softplus(high - softplus(high - log_variance) - low)
 

@@ -100,7 +100,7 @@ class SteppedInBlocks(DynamicsModel, FunctionDraws):
 
 def drawn_member(noise: Tensor, members: int) -> Tensor:
     """Return random indices of networks, from 0 to ``members`` - 1 with equal probability, as floats. Each is computed
-    from one of the standard normal numbers ``noise``."""
+    from the standard normal number at the same place of ``noise``."""
     numbers: Tensor = (members * torch.special.ndtr(noise)).floor().clamp_max(members - 1)
     return numbers
 

@@ -137,7 +137,7 @@ def _present(connection: Connection) -> list[str]:
 
 
 def _upgrade(connection: Connection) -> None:
-    from alembic import command  # imported here, because the import takes a fifteenth of the time in which a server starts
+    from alembic import command  # imported here, because it takes a fifteenth of the time in which a server starts
     from alembic.config import Config
     from alembic.util import CommandError
 

@@ -169,7 +169,8 @@ def _concluded(
     fallen: Bools,
 ) -> int:
     """Complete a step from the predictions ``moved``: write states, rewards and ends of episodes of the lanes that the
-    mask ``moving`` (N,) selects to ``changed``. Return the number of lanes whose episode ended."""
+    mask ``moving`` (N,) selects to ``changed``. Return the number of lanes whose episode ended. ``fallen`` is the
+    result of ``_fallen``."""
     trust, limit, outside = settings.trust, settings.time_limit, model.definition.outside_reward
     scales = model.scales.numpy() if settings.doubts else np.zeros(0)
     return conclude(

@@ -117,7 +117,7 @@ class ProcessAlongPaths(PathOutlook):
 
 
 def process_inputs(definition: EnvironmentDefinition, output: OutputModel, steps: PredictedSteps) -> Tensor:
-    """Return the inputs (..., d) of one output's process at predicted steps."""
+    """Return the d inputs (..., d) of one output's process at predicted steps, with the same leading dimensions."""
     state = steps.q_next if output.feature_map.after else steps.q
     return encode(definition, output.feature_map, state, steps.u, steps.q_next[..., leading(definition)])
 

@@ -197,6 +197,7 @@ def jumped(jumps: Sequence[Jump], q: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def likely(mean: Tensor, std: Tensor) -> Tensor:
-    """Return the probability (m,) that a normal variable with this mean and standard deviation is above 0."""
+    """Return the probability (m,) that a normal variable is above 0, for each mean (m,) and standard deviation ``std``
+    (m,)."""
     probability: Tensor = torch.special.ndtr(mean / std.clamp_min(1e-9))
     return probability
