@@ -27,7 +27,7 @@ class RemoteEnv(gymnasium.Env[Observation, Any]):
     ``reset(seed=s)`` starts episode 0 of seed s, and ``reset()`` starts the next episode. The server applies the time
     limit, after which an episode is ``truncated``. ``info`` has ``model_version`` and, after a step, ``reward_mean``
     (the reward before the penalty) and, if requested, ``deviation`` (O,) of the O model outputs. In a session with a
-    trust region, ``untrusted`` is whether leaving the region truncated it. With declared limits or an outside reward,
+    trust region, ``untrusted`` is whether leaving it truncated the episode. With declared limits or an outside reward,
     ``left`` is whether the episode ended at a limit or outside of the sampling range. If the server loses the
     session, the episode is truncated with the reason in ``info["surrogym_session_lost"]``, and the next reset begins in
     a new session.

@@ -353,7 +353,7 @@ class Api:
         body = wire.Improve(queries=queries, checkpoint=checkpoint, idempotency_key=idempotency_key or new_key())
         return self._post(wire.ImprovedSurrogate, f"{routes.surrogate(name)}/improve", body)
 
-    # Routes of models
+    # Routes of models, and of the states of sessions
 
     def session_coordinates(self, session: str) -> list[list[float]]:
         """Return the coordinates (N, C) of the N lanes of a session."""

@@ -7,7 +7,7 @@ sums such errors up. So the signed errors e (n,) of an output are compared under
   the predicted deviations of its function on the diagonal, and F (n, 1 + P) the standardised inputs with a constant,
   divided by sqrt(1 + P);
 - ``shifted``: e ~ N(0, s^2 (V + t^2 A)), where A is 1 1' (the same error everywhere) or F F' (an error that depends on
-  where the step is), and t has one of the sizes ``SIZES``, all as likely.
+  where the step is), and t has one of the sizes ``SIZES``, all equally likely.
 
 The scale s is that of the errors in states that the policy visits, where they may be much smaller than over the whole
 range. It is unknown, with the conjugate prior of ``DEGREES`` degrees of freedom at c, and integrated out.

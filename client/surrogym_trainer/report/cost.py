@@ -40,7 +40,7 @@ def cost(known: Known) -> str:
 
 
 def purposes(known: Known) -> list[tuple[str, int]]:
-    """Return the number of real steps by purpose, each step once. Steps of logs are left out."""
+    """Return the number of real steps by purpose; each step is counted once. Steps of logs are left out."""
     ledger = known.view.ledger
     return [
         ("learning the model: the first ones, spread over the declared ranges", ledger.initial),

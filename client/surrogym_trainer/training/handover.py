@@ -52,7 +52,7 @@ MOST_AUDITS = 3  # largest number of audits in one training
 WAY_LANES = 16  # an audit chooses its states from this number of virtual episodes of the policy
 # at most this number of steps of each virtual episode is compared with the log from which the model was learned
 MOST_OF_A_WAY = 200
-ELSEWHERE = 4  # if the design is ready, an audit takes one of this number of steps in a gap between the samples
+ELSEWHERE = 4  # of each group of this many steps of an audit, one is in a gap between samples, if the design is ready
 # the steps of an audit in gaps between the samples are chosen from this number of points of the sampling range
 ANYWHERE = 1_024
 # a promise is not trusted if the lower half of its interval is wider than this share of the gain over an untrained

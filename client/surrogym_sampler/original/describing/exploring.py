@@ -73,8 +73,8 @@ def explore(counted: Counted, steps: int, rng: np.random.Generator) -> Seen:
 
     Half of the episodes start from resets. If the state can be set, the others start at rest from positions within the
     limits that are far from all positions so far. Random actions lead away from states of high energy, such as an
-    upright pole, and don't return there. But from these states something falls fastest, which the ranges of speeds have
-    to cover.
+    upright pole, and don't return there. But the largest speeds occur in falls from such states, and the ranges of
+    speeds have to include them.
     """
     simulator = counted.simulator
     require_variables(counted.name, simulator.variables)
