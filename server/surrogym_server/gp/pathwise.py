@@ -106,7 +106,7 @@ class Pathwise:
 @cache
 @torch.inference_mode(False)
 def frequencies(d: int, device: torch.device) -> Tensor:
-    """Return the frequencies of the random Fourier features of the squared exponential, (d, S), in units of 1 / length
-    scale. They are standard normal numbers from a fixed seed."""
+    """Return the S frequencies (d, S) of the random Fourier features of the squared exponential for d inputs, in units
+    of 1 / length scale. They are standard normal numbers from a fixed seed."""
     values = np.random.Generator(np.random.Philox(key=d)).standard_normal((d, FREQUENCIES))
     return torch.from_numpy(values).to(device)

@@ -78,8 +78,8 @@ class Posterior:
         return torch.cat(means), torch.cat(variances)
 
     def joint_covariance(self, x: Tensor) -> Tensor:
-        """Return the posterior covariances, without noise, of m points with each other, for each of b sets of points x
-        (b, m, d): (b, m, m)."""
+        """Return the posterior covariances (b, m, m), without noise, of m points with each other, for each of b sets of
+        points x (b, m, d)."""
         sets, points, _ = x.shape
         k = covariance(self.hyper, x.flatten(0, 1), self.x)
         v = torch.linalg.solve_triangular(self.factor, k.T, upper=False).reshape(-1, sets, points).transpose(0, 1)

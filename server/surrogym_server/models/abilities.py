@@ -3,8 +3,8 @@
 To use an ability, code calls ``offers`` and has a fallback for models without it. The ability's docstring states the
 fallback.
 
-Letters of shapes are those of ``models.port``, and r reference points, b paths of T steps, N sampled functions of W
-weights.
+Letters of shapes are those of ``models.port``. Further letters stand for r reference points, b paths of T steps, and N
+sampled functions of W weights.
 """
 
 from __future__ import annotations

@@ -22,8 +22,8 @@ DOUBT = 0.005
 
 
 def ending(model: DynamicsModel, samples: Samples, points: Points) -> Tensor | None:
-    """Return which of m candidates are reserved for the next query, because it should show where episodes end or where
-    the reward jumps, (m,) bool; None if this is known well enough.
+    """Return (m,) bool: which of m candidates are reserved for the next query, because it should show where episodes
+    end or where the reward jumps. Return None if this is known well enough.
 
     Several groups are tried, and the first that is not empty is reserved. With a declared termination: the points at
     which the model predicts an end, as long as no sample has ended an episode; then the points at which a jump of the

@@ -34,7 +34,7 @@ class Judgement:
     next queries."""
 
     confidences: tuple[OutputConfidence, ...]  # (O,) how well the model knows each output
-    # (O,) tolerance of each output for which its confidence was computed: sqrt(tolerance^2 + noise^2), confirmed noise.
+    # (O,) tolerances with which the confidences were computed: sqrt(tolerance^2 + noise^2), with the confirmed noise.
     widened_tolerances: tuple[float, ...]
     verdict: Verdict  # verdict that follows from this model alone, without regard to earlier rounds
     candidates: Candidates  # points from which the next queries are chosen

@@ -150,7 +150,8 @@ def _possible(model: DynamicsModel, limits: Tensor) -> Tensor:
 
 
 def _model_noise(model: DynamicsModel, tolerances: Sequence[float]) -> tuple[Tensor, Tensor]:
-    """Return the standard deviation of the noise that a model has learned, and the tolerances, as tensors (O,)."""
+    """Return two tensors: the standard deviation (O,) of each output's noise that a model has learned, and the
+    ``tolerances`` (O,)."""
     limits = torch.tensor(list(tolerances), dtype=torch.float64)
     able = offers(model, LearnedNoise)
     if able is None:

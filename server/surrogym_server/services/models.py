@@ -143,8 +143,8 @@ class ModelService:
             return Said(version, model.definition.outputs, predict_points(model, q, u))
 
     def query_uncertainty(self, name: str, q: Array, u: Array, version: int | None) -> Said[UncertaintyResult]:
-        """Return the model's uncertainty at coordinates q (n, C) under actions u (n, F), weighted by the latest
-        occupancy. Raises the errors of ``predict``."""
+        """Return the model's uncertainty at coordinates q (n, C) under actions u (n, F). The input probability is
+        computed from the latest occupancy (states that policies visited). Raises the errors of ``predict``."""
         version, model = self._model(name, version)
         q, u = check_points(model.definition, q, u)
         tolerances = np.array(self._storage.models.get(name, version).tolerances)

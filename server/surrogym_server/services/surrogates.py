@@ -28,7 +28,7 @@ Plan = Callable[[EnvironmentDefinition, int], tuple[Query, ...]]
 Complete = Callable[[dict[str, Any]], dict[str, Any]]
 
 ABSENT = object()
-READS = 3  # if a fit is stored while a surrogate's status is read, it is read again, at most this many times in total
+READS = 3  # a surrogate's status is read at most this many times, as it is read again if a fit was stored meanwhile
 SHOWN = 120  # a value of a specification is cut to this many characters in an error message
 
 

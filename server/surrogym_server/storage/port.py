@@ -75,7 +75,8 @@ class Surrogates(ABC):
 
     @abstractmethod
     def standing(self, name: str) -> Standing:
-        """Return the id, phase and pause of a surrogate, which frequent requests read. Raises ``UnknownSurrogate``."""
+        """Return the fields of a surrogate that frequent requests read: its id, its phase, and whether it is paused.
+        Raises ``UnknownSurrogate``."""
 
     @abstractmethod
     def name_of(self, id: int) -> str:

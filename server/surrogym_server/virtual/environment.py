@@ -385,8 +385,8 @@ def _array(values: Tensor) -> NDArray[Any]:
 
 
 def chosen_lanes(mask: Bools | None, lanes: LaneState) -> Chosen:
-    """Return a selection of the lanes that ``mask`` (N,) selects, or of all lanes if ``mask`` is None. Raises
-    ``InvalidInput`` for a mask of another length."""
+    """Convert a mask (N,) of lanes to a selection of these lanes that can index tensors; a mask of None selects all
+    lanes. Raises ``InvalidInput`` for a mask of another length."""
     if mask is None:
         return EVERY
     if len(mask) != len(lanes):

@@ -1,7 +1,8 @@
 """Connections, transactions and the clock of a database, for SQLite and PostgreSQL.
 
 Transactions that write to one surrogate run one after the other. On SQLite, ``BEGIN IMMEDIATE`` admits one writer; on
-PostgreSQL, a write locks the surrogate's row first. Claims and renewals of queries lock less.
+PostgreSQL, a write locks the surrogate's row first. Claims and renewals of queries lock the surrogate against deletion
+at most, so other writers need not wait.
 """
 
 from __future__ import annotations

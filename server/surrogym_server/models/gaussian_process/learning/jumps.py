@@ -58,7 +58,7 @@ def with_jumps(
         gain, edge, process, outside = max(splits, key=lambda split: split[0])
         regions.append((edge, rest & ~outside))
         total, rest = total + gain, outside
-        # Compared for every number of jumps, because the first of two jumps may gain little by itself.
+        # Each number of jumps is compared with no jump, because the first of two jumps may gain little by itself.
         if total > max(MARGIN * int(going.sum()), best[0] + WORTH):
             best = (total, process, len(regions))
     _, process, count = best
