@@ -67,4 +67,7 @@ def compile_c(command: Sequence[str], flags: Sequence[str], sources: Sequence[st
         ) from error
     if process.returncode:
         message = process.stderr[:SHOWN].strip() or f"exit status {process.returncode}"
-        raise CannotCompile(f"the C compiler {command[0]} refused the sources: {message}")
+        raise CannotCompile(
+            f"the C compiler {command[0]} refused the sources: {message}; set the variable CC to another one, or "
+            "report this"
+        )

@@ -176,7 +176,10 @@ class SurrogateFile:
 def _split(data: bytes) -> tuple[Header, bytes]:
     """Split a safetensors file into header and arrays."""
     if len(data) > MAX_FILE_BYTES:
-        raise NotASurrogateFile(f"expected a surrogate's file of at most {MAX_FILE_BYTES} bytes, got more")
+        raise NotASurrogateFile(
+            f"expected a surrogate's file of at most {MAX_FILE_BYTES} bytes, got more: "
+            "export a surrogate with fewer samples"
+        )
     length = int.from_bytes(data[:LENGTH_BYTES], "little")
     end = LENGTH_BYTES + length
     if len(data) < LENGTH_BYTES or end > len(data) or length > MAX_HEADER_BYTES:

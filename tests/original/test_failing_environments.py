@@ -106,7 +106,7 @@ def test_a_failure_between_steps_of_describe_reports_the_real_steps(registered: 
     name = registered("Fails-v0", space={"_get_obs": shown_once, "stepped": False})
     with pytest.raises(StepFailed, match=r"Fails-v0 failed after \d+ real steps: OSError: no picture") as failed:
         describe(name, STEPS)
-    assert int(str(failed.value).split()[3]) > STEPS
+    assert int(str(failed.value).split()[5]) > STEPS
 
 
 def test_the_function_describe_returns_its_result_although_the_environment_fails_to_close(registered: Register) -> None:

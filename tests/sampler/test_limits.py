@@ -86,9 +86,12 @@ def test_a_server_that_returns_more_queries_than_requested_causes_no_real_step(s
     [
         (
             {"coordinates": [1e6]},
-            r"coordinate 'x' of the query: expected a value in the environment's range \[-1, 1\], got 1e\+06",
+            r"coordinate 'x' of the query: expected a value in the environment's range \[-1, 1\], got 1e\+06: .*",
         ),
-        ({"action": [500.0]}, r"action 0 of the query: expected a value in the environment's range \[-1, 1\], got 500"),
+        (
+            {"action": [500.0]},
+            r"action 0 of the query: expected a value in the environment's range \[-1, 1\], got 500: .*",
+        ),
         ({"coordinates": [0.0, 0.0]}, "coordinates of the query: expected 1 numbers, .* got 2: .*"),
     ],
 )

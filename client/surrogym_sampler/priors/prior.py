@@ -241,7 +241,8 @@ def _require_steps(environment: OriginalEnvironment, spec: EnvironmentSpec) -> N
             why = f"{type(error).__name__}: {str(error)[:200]}"
     raise UnknownEnvironment(
         f"expected a simulator that steps from states in its sampling ranges to {len(spec.coordinates)} finite "
-        f"coordinates, got a simulator that failed in all {TRIALS} trials: {why}"
+        f"coordinates, got a simulator that failed in all {TRIALS} trials: {why}; "
+        "correct the simulator, or narrow the sampling ranges"
     )
 
 

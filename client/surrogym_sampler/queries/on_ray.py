@@ -113,7 +113,10 @@ class SamplerActor:
         """Answer queries until the plan's settings end the sampler, or ``stop`` is called."""
         plan = self._plan
         if (here := version("surrogym")) != plan.version:
-            wrong = f"expected surrogym {plan.version} on every machine of the cluster, got {here} on {platform.node()}"
+            wrong = (
+                f"expected surrogym {plan.version} on every machine of the cluster, got {here} on {platform.node()}: "
+                "install the same version there"
+            )
             return Ended(self.look(), wrong)
         try:
             with (

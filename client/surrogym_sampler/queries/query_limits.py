@@ -99,7 +99,7 @@ def _check_values(what: str, names: Sequence[str], values: Sequence[float], rang
         if not is_within((value, value), allowed):
             raise QueryRefused(
                 f"{name} of the query: expected a value in the environment's range [{allowed[0]:g}, {allowed[1]:g}], "
-                f"got {value:g}"
+                f"got {value:g}: register the environment under another name"
             )
 
 

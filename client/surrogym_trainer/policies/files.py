@@ -151,7 +151,11 @@ def read_learner(path: Path, algorithm: str, trust: bool, changes: dict[str, Any
             given = [f"{name}={value!r}" for name, value in changes.items() if name not in ("env", "seed")]
             raise UnusablePolicy(f"{path} does not fit {', '.join([*given, 'this surrogate'])}: {error}") from error
         fitting = [other for other in FAMILIES if other != algorithm.upper() and _fits(other, path, trust)]
-        meant = f"expected --algorithm {' or '.join(fitting)}" if fitting else str(error)
+        meant = (
+            f"expected --algorithm {' or '.join(fitting)}"
+            if fitting
+            else f"{error}; give its --algorithm, or another file"
+        )
         raise UnusablePolicy(f"{path} is not a policy of {algorithm}: {meant}") from error
 
 

@@ -54,7 +54,10 @@ class Gate:
             raise Unauthenticated("expected the header 'Authorization: Bearer <token>', got none: set SURROGYM_TOKEN")
         role = self.role_of(token)
         if role not in (*allowed, "admin"):
-            raise Forbidden(f"expected a token with role {' or '.join((*allowed, 'admin'))}, got one with role {role}")
+            raise Forbidden(
+                f"expected a token with role {' or '.join((*allowed, 'admin'))}, got one with role {role}: "
+                "use another token, or ask the server's admin"
+            )
 
 
 def bearer_token(scope: Scope) -> str | None:

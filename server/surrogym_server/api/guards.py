@@ -45,7 +45,10 @@ class BodyLimit:
             if received > limit:
                 raise HTTPException(413, f"expected a body of at most {limit} bytes, got more: send less at a time")
             if self._together > self._max_together:
-                detail = f"expected bodies of at most {self._max_together} bytes in all requests at once, got more"
+                detail = (
+                    f"expected bodies of at most {self._max_together} bytes in all requests at once, got more: try "
+                    "again later"
+                )
                 raise HTTPException(429, detail, {"retry-after": RETRY_AFTER_SECONDS})
             return message
 

@@ -63,7 +63,7 @@ class Patient(HttpToolsProtocol):
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
         if len(self.connections) > self.most:
-            self._refuse(Code.UNAVAILABLE, f"expected at most {self.most} connections, got one more")
+            self._refuse(Code.UNAVAILABLE, f"expected at most {self.most} connections, got one more: close some")
         else:
             self._wait()
 

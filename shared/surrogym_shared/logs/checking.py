@@ -180,7 +180,7 @@ def _require_choices(spec: EnvironmentSpec, roles: Roles, values: Floats) -> Non
             if len(declared) != count:
                 raise UnusableLog(
                     f"action {name}: expected {count} choices in discrete, as in the specification, got "
-                    f"{list(declared)}"
+                    f"{list(declared)}: correct the mapping file (--map)"
                 )
             continue
         present = set(np.unique(column[np.isfinite(column)]).tolist())

@@ -135,7 +135,7 @@ class _Target:
         while True:
             view, present = self.api.surrogate(name), self.calls.get(name)
             if view.phase == "failed":
-                raise CommandError(f"the design of {name!r} failed: {view.error}")
+                raise CommandError(f"the design of {name!r} failed: {view.error}; surrogym status {name} shows more")
             if present.about is None and not present.awaited:
                 raise CommandError(f"another command removed the prior of {name!r}: run this command again to set it")
             is_new = view.samples > used and view.samples >= LEAST

@@ -84,7 +84,9 @@ def command(
             else:
                 alarm = None
         if not watcher.compared + watcher.left_out:
-            raise CommandError(f"expected real steps in {log}, got none")
+            raise CommandError(
+                f"expected real steps in {log}, got none: give a log with two or more rows of an episode"
+            )
         stored = None if alarm is None else _withdrawn(watcher, version, alarm)
     named = f"{surrogate}@{version}"
     result = {

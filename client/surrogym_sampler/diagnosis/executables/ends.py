@@ -25,7 +25,10 @@ def without_input_the_fallback_of_limits_acts(subject: Subject) -> None:
     if subject.spec.limits is None:
         raise LeftOut("the program's specification declares no limits")
     if not any(_in_motion(subject, seed) for seed in range(SEEDS)):
-        raise LeftOut(f"all {SEEDS} test episodes ended within {ACTIONS} random steps, before the input could be ended")
+        raise LeftOut(
+            f"all {SEEDS} test episodes ended within {ACTIONS} random steps, so the end of the input could not be "
+            "tested within an episode"
+        )
     seconds = rest_seconds(subject.spec) + subject.seconds
     subject.program.end_input()
     subject.program.surplus(seconds)

@@ -98,4 +98,6 @@ class Counted:
         except UnknownEnvironment:
             raise
         except RAISED as error:
-            raise StepFailed(f"{self.name} failed after {steps} real steps: {sentence(error)}") from error
+            raise StepFailed(
+                f"the environment {self.name} failed after {steps} real steps: {sentence(error)}"
+            ) from error

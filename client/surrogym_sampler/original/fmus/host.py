@@ -76,7 +76,7 @@ class Host:
                 fields["only_once"],
             )
         except Exception as error:  # fmpy raises a plain Exception, ctypes an AttributeError
-            raise Refused(f"the FMU's native code can't be loaded: {error}") from error
+            raise Refused(f"the FMU's native code can't be loaded: {error}; export the FMU for this machine") from error
         return {}
 
     def _initialise(self, fields: Fields) -> Fields:

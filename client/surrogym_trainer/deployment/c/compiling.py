@@ -64,7 +64,8 @@ def running(controller: Controller, *, single: bool = False) -> Iterator[Compile
             vectors = subprocess.run([executable], capture_output=True, text=True, check=False)
         except OSError as error:
             raise CannotCompile(
-                f"expected a C compiler for this machine, got one whose program can't run here: {error.strerror}"
+                f"expected a C compiler for this machine, got one whose program can't run here: {error.strerror}; "
+                "set the variable CC to another one"
             ) from error
         if vectors.returncode != 0:
             raise NotDeployable(

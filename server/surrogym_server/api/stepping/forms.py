@@ -61,7 +61,10 @@ def frame_of(operation: Operation, content: bytes) -> frames.Request:
     request = frames.read_request(content)
     if not isinstance(request, FRAMES[operation]):
         expected = " or ".join(str(kind.__struct_config__.tag) for kind in FRAMES[operation])
-        raise frames.FrameError(f"expected a frame with op {expected}, got op {request.__struct_config__.tag}")
+        raise frames.FrameError(
+            f"expected a frame whose op is {expected}, got op {request.__struct_config__.tag}: "
+            "send it to the address of its op"
+        )
     return request
 
 

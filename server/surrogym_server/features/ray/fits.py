@@ -81,6 +81,9 @@ def _done_there(function: Function, job: DesignJob, expected: Mapping[str, str])
     of packages than those in ``expected``."""
     for name, here in versions().items():
         if here != expected[name]:
-            wrong = f"expected {name} {expected[name]} on every machine of the cluster, got {here} on {platform.node()}"
+            wrong = (
+                f"expected {name} {expected[name]} on every machine of the cluster, got {here} on {platform.node()}: "
+                "install the same version there"
+            )
             return Failure(PluginFailed, wrong, "")
     return done(function, job)

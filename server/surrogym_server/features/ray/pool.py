@@ -191,7 +191,8 @@ def _require_same(wanted: HostSettings, found: Sequence[HostInfo]) -> None:
         for name, theirs in host.versions.items():
             if theirs != mine.get(name):
                 raise InvalidInput(
-                    f"engine ray: expected {name} {theirs}, which the session hosts run, got {name} {mine.get(name)}"
+                    f"engine ray: expected {name} {theirs}, which the session hosts run, got {name} {mine.get(name)}: "
+                    "install the same version here"
                 )
         for field in (field for field in fields(HostSettings) if field.compare):
             theirs, ours = getattr(host.settings, field.name), getattr(wanted, field.name)

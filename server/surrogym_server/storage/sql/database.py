@@ -235,7 +235,9 @@ class Database:
         except UnicodeDecodeError as error:  # the driver can't decode a damaged name in SQLite's message
             raise self._damaged(error.object.decode(errors="replace"), pages=True) from error
         except sa.exc.TimeoutError as error:
-            raise Unavailable(f"the database can't be used now: {error}") from error
+            raise Unavailable(
+                f"the database can't be used now, because all its connections are busy ({error}): try again later"
+            ) from error
         except sa.exc.DBAPIError as error:
             if means_damage(error):
                 raise self._damaged(_reason(error), pages=are_broken_pages(error)) from error

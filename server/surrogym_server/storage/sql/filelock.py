@@ -215,7 +215,10 @@ def _open(path: Path) -> int:
     try:
         return os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
     except OSError as error:
-        raise Unavailable(f"expected a file to read and write as the database, got {path}: {error.strerror}") from None
+        raise Unavailable(
+            f"expected a file to read and write as the database, got {path}: {error.strerror}; "
+            "correct its permissions, or choose another path"
+        ) from None
 
 
 def _displaced(path: Path, way_out: str) -> Unavailable:

@@ -81,7 +81,10 @@ class CountedSamples:
         newest, by_purpose = earlier.newest, dict(earlier.by_purpose)
         for _, purpose, count, last in since:
             if purpose not in COUNTED:
-                raise damaged(f"expected one of {list(COUNTED)} in samples.purpose, got {purpose!r}")
+                raise damaged(
+                    f"expected one of {list(COUNTED)} in samples.purpose, got {purpose!r}; restore a copy of "
+                    "the database"
+                )
             by_purpose[purpose] = by_purpose.get(purpose, 0) + int(count)
             newest = max(newest, int(last))
         if len(self._counts) > MOST_KEPT:

@@ -347,7 +347,9 @@ def _environment(spec: str) -> str:
     try:
         return _NAMED.decode(spec).environment
     except msgspec.DecodeError as error:
-        raise damaged(f"expected JSON in surrogates.spec, got {reprlib.repr(spec)}: {error}") from error
+        raise damaged(
+            f"expected JSON in surrogates.spec, got {reprlib.repr(spec)}: {error}; restore a copy of the database"
+        ) from error
 
 
 LARGE = {models: 8, policies: 8}  # tables with large rows, and the number of rows to remove in one transaction

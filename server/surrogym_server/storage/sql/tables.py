@@ -52,7 +52,8 @@ class Floats(sa.types.TypeDecorator[Vector]):
             return None if value is None else struct.unpack(f"<{len(value) // 8}d", value)
         except (TypeError, struct.error) as error:
             raise damaged(
-                f"expected a vector of float64 in a column of the database, got other bytes: {error}"
+                f"expected a vector of float64 in a column of the database, got other bytes: {error}; "
+                "restore a copy of it"
             ) from error
 
 
@@ -73,7 +74,9 @@ class Json(sa.types.TypeDecorator[Any]):
         try:
             return None if value is None else json.loads(value)
         except (TypeError, ValueError) as error:
-            raise damaged(f"expected JSON in {self.place}, got {reprlib.repr(value)}: {error}") from error
+            raise damaged(
+                f"expected JSON in {self.place}, got {reprlib.repr(value)}: {error}; restore a copy of the database"
+            ) from error
 
 
 class Word(sa.types.TypeDecorator[str]):
@@ -92,7 +95,10 @@ class Word(sa.types.TypeDecorator[str]):
 
     def process_result_value(self, value: str | None, dialect: Dialect) -> str | None:  # noqa: ARG002
         if value is not None and value not in self.words:
-            raise damaged(f"expected one of {list(self.words)} in {self.place}, got {reprlib.repr(value)}")
+            raise damaged(
+                f"expected one of {list(self.words)} in {self.place}, got {reprlib.repr(value)}; "
+                "restore a copy of the database"
+            )
         return value
 
 
@@ -121,7 +127,9 @@ class Checked(sa.types.TypeDecorator[Any]):
 
     def process_result_value(self, value: Any, dialect: Dialect) -> Any:  # noqa: ARG002
         if value is not None and not isinstance(value, self.types):
-            raise damaged(f"expected {self.expected} in {self.place}, got {reprlib.repr(value)}")
+            raise damaged(
+                f"expected {self.expected} in {self.place}, got {reprlib.repr(value)}; restore a copy of the database"
+            )
         return value
 
 

@@ -164,7 +164,10 @@ def test_a_text_message_on_the_stream_is_refused(stream: ClientConnection):
 
 def test_a_reset_frame_sent_to_the_step_route_is_refused(client: httpx.Client, session: str):
     reply = post(client, session, frames.reset_request(1, None, None), what="step")
-    assert (reply.status_code, reply.json()["detail"]) == (422, "expected a frame with op step, got op reset")
+    assert (reply.status_code, reply.json()["detail"]) == (
+        422,
+        "expected a frame whose op is step, got op reset: send it to the address of its op",
+    )
 
 
 def test_a_step_with_an_unknown_content_type_is_refused(client: httpx.Client, session: str):
