@@ -217,16 +217,17 @@ def _check_fallback(spec: EnvironmentSpec, declared: Limits) -> None:
     )
     for number, (term, (low, high)) in enumerate(zip(declared.fallback, _action_ranges(spec), strict=True)):
         for part in term.parts:
-            require_known(f"limits: fallback {number}", part.weights, spec.coordinate_names)
+            require_known(f"limits: entry {number} of the fallback", part.weights, spec.coordinate_names)
         constant = all(part.function == "one" for part in term.parts)
         # Value of the fallback at one state; at every state if the term is constant.
         value = float(evaluate(spec, term, np.zeros((1, len(spec.coordinates))))[0])
         whole = isinstance(spec.action, BoxAction) or (constant and value.is_integer())
         got = f"{value:g}" if constant else "a term of the state"
-        require(whole, f"limits: expected the number of a discrete action as fallback {number}, got {got}")
+        require(whole, f"limits: entry {number} of the fallback: expected the number of a discrete action, got {got}")
         require(
             not constant or low <= value <= high,
-            f"limits: fallback {number} leaves the action's range: expected {low:g} to {high:g}, got {value:g}",
+            f"limits: entry {number} of the fallback leaves the action's range: expected {low:g} to {high:g}, "
+            f"got {value:g}",
         )
 
 

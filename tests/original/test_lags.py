@@ -134,7 +134,7 @@ def test_an_environment_class_that_returns_lags_itself_is_refused():
     ("history", "message"),
     [
         ({"changes": 1}, r"expected the largest change in one step of \['x'\], got none"),
-        ({"changes": -1}, "expected 0 or more lags, got -1 and 0"),
+        ({"changes": -1}, "expected 0 or more for changes and actions, got -1 and 0"),
         ({"changes": 1, "largest": {"y": 1.0}}, r"history: largest names unknown \['y'\]: expected some of \['x'\]"),
         ({"actions": 20}, "looks 20 steps back: expected fewer than an episode's 20"),
     ],

@@ -306,7 +306,8 @@ def _body(response: httpx.Response) -> bytes:
     except ValidationError:
         if response.status_code in _GATEWAY_STATUSES:
             raise httpx.RemoteProtocolError(
-                f"expected an answer of the server, got status {response.status_code} from a gateway in front of it"
+                f"expected an answer of the server, got status {response.status_code} from a gateway in front of it: "
+                "try again later"
             ) from None
         raise ProtocolMismatch(
             f"expected a Surrogym server at {response.url}, got an answer with status {response.status_code} and "

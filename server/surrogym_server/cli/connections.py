@@ -16,7 +16,7 @@ MAX_HEAD_BYTES = 64 * 1024
 HEAD_TOO_LARGE = 431
 HEAD = (
     f"expected at most {MAX_HEADERS} headers and {MAX_HEAD_BYTES} bytes of target, headers and trailers of a request, "
-    "got more"
+    "got more: send shorter ones"
 )
 MAX_PIPELINED = 16  # largest number of unanswered requests on one connection
 SPARE_FILES = 128  # file descriptors kept free for the database, pipes and other open files besides connections
@@ -92,7 +92,11 @@ class Patient(HttpToolsProtocol):
     def on_headers_complete(self) -> None:
         self._head_complete, self._unparsed = True, 0
         if len(self.pipeline) >= MAX_PIPELINED:
-            self._stop(f"expected at most {MAX_PIPELINED} unanswered requests on one connection, got one more", 429)
+            self._stop(
+                f"expected at most {MAX_PIPELINED} unanswered requests on one connection, got one more: "
+                "wait for answers",
+                429,
+            )
         super().on_headers_complete()
 
     def on_body(self, body: bytes) -> None:
@@ -141,7 +145,10 @@ class Patient(HttpToolsProtocol):
         if answering and (self.cycle.response_started or self.pipeline):
             self.transport.close()
         else:
-            self._refuse(Code.REQUEST_TIMEOUT, f"expected a whole request within {self.seconds:g} s")
+            self._refuse(
+                Code.REQUEST_TIMEOUT,
+                f"expected a whole request within {self.seconds:g} s, got a part or nothing: send it again",
+            )
 
     def _start_asgi_task(self, cycle: RequestResponseCycle, app: Any) -> None:
         self._working = cycle

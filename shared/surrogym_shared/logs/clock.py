@@ -231,8 +231,8 @@ def ticks_of(rows: Rows, episode: Ints, left_out: Mapping[int, str]) -> Ticks | 
     if odd.mean() > IRREGULAR:
         raise UnusableLog(
             f"{rows.roles.time}: expected times that grow from row to row, or the same number of rows at each time, "
-            f"got {size[inner].min()} to {size[inner].max()} rows at a time: rows may be missing; give finer times, or "
-            "leave out the column with a mapping file (--map) if no row is missing"
+            f"got {size[inner].min()} to {size[inner].max()} rows at one time: rows may be missing; give finer times, "
+            "or leave out the column with a mapping file (--map) if no row is missing"
         )
     irregular = np.zeros(len(rows), dtype=np.bool_)
     irregular[order] = odd[moment]

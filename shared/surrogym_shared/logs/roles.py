@@ -177,8 +177,8 @@ def _ask(table: Table, roles: Roles, plain: Sequence[str]) -> None:
     hint = json.dumps(proposed, ensure_ascii=False)
     example = f" such as {hint}" if len(hint) <= LONGEST_HINT and state else ""
     raise UnusableLog(
-        f"expected a known name for each reward, end, episode and time, got other ones: {words}. Say what each column "
-        f"is in a mapping file (--map map.json),{example} with the column among the states if it is one"
+        f"expected known names of the columns for reward, end, episode and time, got unknown ones: {words}. Say what "
+        f"each column is in a mapping file (--map map.json),{example} with the column among the states if it is a state"
     )
 
 

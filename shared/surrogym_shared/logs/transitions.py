@@ -139,7 +139,7 @@ def _backwards(
                 latest[int(episode[row])] = row
         elif row not in rejected:
             reasons[row] = (
-                f"{rows.roles.time}: expected a time after {rows.time[before]:g} of line {rows.lines[before]}, "
+                f"{rows.roles.time}: expected a time after {rows.time[before]:g}, that of line {rows.lines[before]}, "
                 f"got {time:g}"
             )
     return reasons

@@ -36,7 +36,11 @@ class BoxAction(Frozen):
         for i, (low, high) in enumerate(zip(self.low, self.high, strict=True)):
             require_range(f"action {i}", low, high)
         if self.bins is not None:
-            require(len(self.bins) == len(self.low), f"expected {len(self.low)} bins, got {len(self.bins)}")
+            require(
+                len(self.bins) == len(self.low),
+                f"action: expected {len(self.low)} entries in bins, one for each entry of the action, got "
+                f"{len(self.bins)}",
+            )
         if self.rate is not None:
             require(
                 len(self.rate) == len(self.low),

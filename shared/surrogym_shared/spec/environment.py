@@ -300,7 +300,7 @@ class EnvironmentSpec(Frozen):
         )
         require(
             self.preset.takes_declared_rewards,
-            f"preset {self.preset.name!r} learns its reward: expected a reward of kind 'learned'",
+            f"preset {self.preset.name!r} learns its reward: expected a reward of kind 'learned', got 'declared'",
         )
 
     def _require_stoppable(self, name: str, stopped: str) -> None:

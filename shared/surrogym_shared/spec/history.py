@@ -44,12 +44,17 @@ def with_history(
     """
     largest = dict(largest or {})
     moving = [c for c in spec.coordinates if c.moves]
-    require(changes >= 0 and actions >= 0, f"history: expected 0 or more lags, got {changes} and {actions}")
+    require(
+        changes >= 0 and actions >= 0,
+        f"history: expected 0 or more for changes and actions, got {changes} and {actions}",
+    )
     require_known("history: largest", largest, [c.name for c in moving])
     at_start = dict(at_start or {}) if changes else {}
     require_known("history: at_start", at_start, largest)
     lacking = [c.name for c in moving if c.name not in largest] if changes else []
-    require(not lacking, f"history: expected the largest change in one step of {lacking}, got none")
+    require(
+        not lacking, f"history: expected the largest change in one step of {lacking}, got none: add it to 'largest'"
+    )
     lags = [lag for c in moving for lag in _of_changes(c, changes, largest.get(c.name, 0.0))]
     lags += [lag for entry in range(spec.action.size) for lag in _of_actions(spec, entry, actions)]
     starts: dict[str, StartDistribution] = {lag.name: Fixed(value=_at_rest(lag)) for lag in lags}

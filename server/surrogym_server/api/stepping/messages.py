@@ -75,7 +75,7 @@ class PromptMessages(WebSocketsSansIOProtocol):
             return
         whole = self._frames.split(data)
         if len(whole) > MAX_FRAMES or len(self.frames) > MAX_FRAMES:
-            self._end(f"expected at most {MAX_FRAMES} frames in one message and in one read, got more")
+            self._end(f"expected at most {MAX_FRAMES} frames in one message and in one read, got more: send fewer")
             return
         for frame, extent in whole:
             self._oversized = extent is None
@@ -140,11 +140,12 @@ class PromptMessages(WebSocketsSansIOProtocol):
             self._timer.cancel()
             self._timer = None
         elif self._timer is None and unfinished:
-            late = f"expected a whole message within {self._seconds:g} s"
+            late = f"expected a whole message within {self._seconds:g} s, got a part of it: send it again"
             self._timer = self.loop.call_later(self._seconds, self._end, late)
         if self._together.bytes > self._together.most:
             self._end(
-                f"expected unfinished messages of at most {self._together.most} bytes in all streams together, got more"
+                f"expected unfinished messages of at most {self._together.most} bytes in all streams together, got "
+                "more: try again later"
             )
 
     def _end(self, reason: str) -> None:
