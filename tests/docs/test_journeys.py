@@ -92,7 +92,7 @@ OTHERWISE = {
     "docs/how-to/trust.md": "tests/training/test_handover.py audits beside a sampler that stays",
 }
 BLOCK = re.compile(r"^```(python|console)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
-SAVED = re.compile(r"[Ss]ave (?:this|it) as `(\S+\.py)`")
+SAVED = re.compile(r"[Ss]ave\s+(?:this|it)\s+as\s+`(\S+\.py)`")
 
 
 @pytest.mark.timeout(900)  # on a machine that others use as well
@@ -114,7 +114,7 @@ def steps(text: str) -> Iterator[tuple[Literal["file", "program", "command"], st
         yield "file", "pendulum"
     for block in BLOCK.finditer(text):
         language, code = block.groups()
-        saved = SAVED.search(text[: block.start()].rstrip().rpartition("\n")[2])
+        saved = SAVED.search(text[: block.start()].rstrip().rpartition("\n\n")[2])
         if language == "console":
             yield from (("command", line) for line in code.replace("\\\n", " ").splitlines() if line.strip())
         elif saved is not None:
