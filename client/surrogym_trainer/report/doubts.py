@@ -39,7 +39,7 @@ def untested(known: Known) -> list[str]:
     if not _other_starts(policy):
         found.append("Starts outside the declared ones.")
     if not _other_machines(policy):
-        found.append("Another unit of the machine, or a worn one: masses, lengths and limits were as they are.")
+        found.append("Another unit of the machine, or a worn one: its physical parameters were as they are.")
     limit = known.view.spec.time_limit
     if limit is not None:
         found.append(f"Episodes longer than {limit} steps.")
