@@ -212,7 +212,7 @@ def _read_head(content: bytes) -> _Head:
     except ValidationError as error:
         from surrogym_shared.faults import first_fault  # imported here, because only an error needs it
 
-        raise ValueError(f"{HEAD}: {first_fault(error)}") from error
+        raise ValueError(f"its entry {HEAD} is invalid: {first_fault(error)}") from error
 
 
 def _require_chain(head: _Head, headers: Mapping[str, Header]) -> None:

@@ -170,7 +170,7 @@ class SurrogateFile:
             try:
                 return cls.from_bytes(file.read(MAX_FILE_BYTES + 1))
             except NotASurrogateFile as error:
-                raise NotASurrogateFile(f"{path}: {error}") from error.__cause__
+                raise NotASurrogateFile(f"{path} can't be used: {error}") from error.__cause__
 
 
 def _split(data: bytes) -> tuple[Header, bytes]:

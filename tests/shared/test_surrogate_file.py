@@ -123,7 +123,9 @@ def test_a_surrogate_file_with_deeply_nested_json_is_refused():
 def test_a_surrogate_file_beyond_the_size_limits_is_refused(monkeypatch, tmp_path):
     monkeypatch.setattr(surrogate_file, "MAX_FILE_BYTES", len(DATA) - 1)
     (tmp_path / "large.surrogate").write_bytes(DATA)
-    with pytest.raises(NotASurrogateFile, match=r"large\.surrogate: expected a surrogate.s file of at most"):
+    with pytest.raises(
+        NotASurrogateFile, match=r"large\.surrogate can't be used: expected a surrogate.s file of at most"
+    ):
         SurrogateFile.load(tmp_path / "large.surrogate")
 
 

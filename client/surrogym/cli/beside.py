@@ -98,7 +98,7 @@ def _baseline(opener: Callable[[], Episode], compare: Compare) -> Predict:
     try:
         return baseline(episode.spec, compare)
     except ValueError as error:
-        raise CommandError(f"--compare: {error}") from error
+        raise CommandError(f"--compare: this controller can't be used here: {error}") from error
     finally:
         episode.close()
 

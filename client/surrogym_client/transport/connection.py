@@ -256,7 +256,7 @@ def token_in(path: Path) -> str:
     except OSError as error:
         raise UnusableToken(f"the token file {str(path)!r} can't be read: {error.strerror}") from error
     except ValueError as error:
-        raise UnusableToken(f"the token file {str(path)!r}: {error}") from None
+        raise UnusableToken(f"the token file {str(path)!r} can't be used: {error}") from None
     if len(tokens) != 1:
         raise UnusableToken(f"the token file {str(path)!r}: expected one token, got {len(tokens)}")
     return next(iter(tokens))

@@ -428,7 +428,7 @@ class RolloutSession(Request):
             came = "a policy without steps" if self.steps is None else "steps with actions"
             raise ValueError(f"rollout: expected steps with a policy, and no steps with actions, got {came}")
         if self.policy is None and (self.noise or self.until is not None):
-            raise ValueError("rollout: expected noise and until only with a policy, got noise or until with actions")
+            raise ValueError("rollout: expected 'noise' and 'until' only with a policy, got one of them with actions")
         return self
 
 

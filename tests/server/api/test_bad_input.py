@@ -339,7 +339,7 @@ def with_layers(count: int, units: int) -> dict[str, Any]:
         ({}, "expected either actions or a policy, got neither"),
         ({**ROLL, "actions": [[[0.0], [0.0]]]}, "expected either actions or a policy, got both"),
         ({"policy": POLICY}, "got a policy without steps"),
-        ({"actions": [[[0.0], [0.0]]], "noise": {"seed": 0}}, "expected noise and until only with a policy"),
+        ({"actions": [[[0.0], [0.0]]], "noise": {"seed": 0}}, "expected 'noise' and 'until' only with a policy"),
         ({**ROLL, "steps": 0}, "steps"),
         ({**ROLL, "until": [True]}, "until: expected 2 entries, one for each lane, got 1"),
         ({**ROLL, "noise": {"seed": -1}}, "seed"),

@@ -204,5 +204,7 @@ class _words:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
         if isinstance(error, FMICallException):
-            message = f"the FMU answered {error.function} with status {STATUS.get(error.status, error.status)}"
-            raise (Broken if error.status == fmi2Fatal else Refused)(f"{message}, during {self._during}") from error
+            status = STATUS.get(error.status, error.status)
+            raise (Broken if error.status == fmi2Fatal else Refused)(
+                f"the FMU answered {error.function} with status {status}, during {self._during}"
+            ) from error
