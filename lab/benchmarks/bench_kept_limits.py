@@ -23,6 +23,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -44,11 +45,12 @@ from support.changing import Array, Machine, Parameters
 from surrogym_lab.reproduce.rows import read_records, write_records
 from surrogym_sampler import original
 from surrogym_sampler.original.episodes import open_episode
+from surrogym_sampler.original.limits.guard import Guard
 from surrogym_sampler.original.loading import Respecified
 from surrogym_sampler.original.rollouts import answering, keeping_limits
 from surrogym_server.local import LocalSurrogate
 from surrogym_shared.limits import past
-from surrogym_shared.spec import EnvironmentSpec, Limit, Limits, Term
+from surrogym_shared.spec import EnvironmentSpec, Limit, Limits, Term, limits
 from surrogym_trainer.evaluation.evaluator import Evaluation, EvaluationSettings, evaluate
 from surrogym_trainer.evaluation.promise import promise_of
 from surrogym_trainer.policies import load_policy
@@ -282,6 +284,10 @@ def main() -> None:
     torch.set_num_threads(1)
     path: Path = options.out / "limits.csv"
     path.parent.mkdir(parents=True, exist_ok=True)
+    if options.time:
+        for machine in options.machines:
+            print(machine, "guard, ms: median {:.3f}, 99th percentile {:.3f}".format(*guard_times(machine)))
+        return
     rows = read_records(path, Row)
     done = {(row.machine, row.limits, row.seed) for row in rows}
     for seed in range(options.first_seed, options.first_seed + options.seeds):
@@ -292,6 +298,22 @@ def main() -> None:
                     write_records(path, Row, rows)
                     print(rows[-1])
     print(table(rows))
+
+
+def guard_times(machine: str) -> tuple[float, float]:
+    """Median and 99th percentile of the milliseconds that the guard takes in a step, at random states."""
+    spec, _ = specifications(PLANTS[machine], 0)
+    low, high = np.array([limits(c.sampling) for c in spec.coordinates]).T
+    states = np.random.default_rng(0).uniform(low, high, (20_000, len(low)))
+    guard, action, times = Guard(spec), np.zeros(spec.action.size), []
+    guard.begin(states[0])
+    for state in states:
+        begun = time.perf_counter()
+        guard.choose(action)
+        guard.reached(state)
+        times.append(1e3 * (time.perf_counter() - begun))
+    median, late = np.quantile(times, [0.5, 0.99]).tolist()
+    return median, late
 
 
 def specifications(plant: Plant, seed: int) -> tuple[EnvironmentSpec, EnvironmentSpec]:
@@ -403,6 +425,7 @@ def _options() -> argparse.Namespace:
     made.add_argument("--machines", nargs="+", choices=list(PLANTS), default=list(PLANTS))
     made.add_argument("--first-seed", type=int, default=0)
     made.add_argument("--seeds", type=int, default=1)
+    made.add_argument("--time", action="store_true", help="only measure the time that the guard takes in a step")
     made.add_argument("--no-policy", action="store_true", help="designs alone")
     made.add_argument("--with-limits-only", action="store_true", help="no rows without limits")
     made.add_argument("--out", type=Path, default=OUT)
