@@ -254,12 +254,15 @@ class HttpSurrogate:
         if (missing := window.since(behind)) is None:
             raise self._given_up(
                 live,
-                f"the new process needs the requests from number {behind} on again, which this client no longer keeps",
+                f"the process that took the session over needs the requests from number {behind} on again, which this "
+                "client no longer keeps",
             )
         for sent in missing:
             answer, _ = self._sent(live, sent)
             if digest_of(answer) != sent.digest:
-                raise self._given_up(live, f"the new process answers the repeated request {sent.seq} differently")
+                raise self._given_up(
+                    live, f"the process that took it over answers the repeated request {sent.seq} differently"
+                )
 
     def _given_up(self, live: _Live, what: str) -> SurrogymClientError:
         with suppress(SurrogymClientError):

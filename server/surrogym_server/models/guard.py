@@ -89,7 +89,9 @@ def require_sound(model: DynamicsModel, q: Tensor, u: Tensor) -> None:
         ends = model.learned_termination(q)
         require_numbers(definition, "learned termination", ends, q.shape[:1])
         if bool(((ends < 0) | (ends > 1)).any()):
-            raise _wrong(definition, "learned termination: expected probabilities from 0 to 1", f"{_worst(ends):g}")
+            raise _wrong(
+                definition, "expected `learned_termination` to return probabilities from 0 to 1", f"{_worst(ends):g}"
+            )
     try:
         json.dumps([model.description, list(model.structures)], allow_nan=False)
     except (TypeError, ValueError) as error:

@@ -110,16 +110,17 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
     defaults = frozen_tolerances(definition, samples, state.defaults)
     tolerances = definition.tolerances_or(defaults.values)
 
-    # Lines 5, 6, 13, and the test of line 14: the CI of each output over the Monte Carlo set, the candidates for
-    # queries, and a verdict on this model alone: "ready", "continue", "over_budget", or "from_log" if the budget is 0.
-    # Unless the stopping rule is "confidence" (preset "paper"), ready needs more than the CI (see ``judging.judge``).
+    # Lines 5, 6, 13, and the test of line 14. The judgement has the CI of each output over the Monte Carlo set; the
+    # candidates for queries: part of that set, states that policies visited, and a peak of the reward; and a verdict on
+    # this model alone: "ready", "continue", "over_budget", or "from_log" if the budget is 0 and it is not ready. Unless
+    # the stopping rule is "confidence" (preset "paper"), ready needs more than the CI (see ``judging.judge``).
     # Tolerances are widened by confirmed noise here, because no error of a prediction can be expected below the noise.
     judgement = judge_model(fit.model, samples, tolerances, request, state)
 
-    # The verdict on the design. A ready design stays ready until a person changes budget or target or reduces a
-    # tolerance, or errors contradict the model. A design that ended without being ready takes no further steps until
-    # its conditions change ("unsure" if budget is left), and becomes ready if its model satisfies the stopping rule.
-    # ``request.cost`` leaves out steps of logs and audits.
+    # The verdict on the design. It is ready whenever its model satisfies the stopping rule. Otherwise a design that was
+    # ready stays so, unless budget or target have changed, a tolerance became smaller, or prediction errors of new
+    # samples contradict the model. A design that has ended and is not ready takes no further steps until its conditions
+    # change, the cost included; it is "unsure" if budget is left. ``request.cost`` leaves out steps of logs and audits.
     conditions = Conditions(request.cost(len(samples)), request.budget, request.target, tolerances)
     verdict = verdict_with_history(judgement, state, request, conditions)
 
@@ -151,8 +152,9 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
         verdict = _verdict_with(queries, round)
 
     # The state that the next round needs. A design with extra queries has not ended, unless it is ready. A design that
-    # has ended continues if its conditions change. ``predictions``, to which ``engine.design_job`` adds those of new
-    # samples by the previous round's model before each round, are only scored and reported.
+    # has ended continues if its conditions change. ``predictions`` is only scored and
+    # reported. ``engine.design_job`` adds predictions of new samples by the previous round's model before each round,
+    # and passes their errors as ``request.surprises``, which the verdict above reads.
     ended = verdict == "ready" or (verdict != "continue" and not queries)
     following = DesignState(
         round=state.round + 1,
@@ -171,7 +173,8 @@ def _verdict_with(queries: tuple[Query, ...], round: Round) -> Verdict:
     be answered, otherwise "unsure", or "over_budget" if the budget is spent.
 
     If no query was chosen, the rest of the budget is too small, less the steps of queries that were set aside; or each
-    candidate is close to an earlier query or would teach nothing, because a lag (past value) is not known there.
+    candidate is close to an earlier query or would teach nothing, because its step is predicted to end at a bound or
+    to end the episode.
     """
     if queries or round.request.open:
         return "continue"
@@ -182,9 +185,10 @@ def _lacks_excursion(definition: EnvironmentDefinition, conditions: Conditions, 
     """Return whether a design whose model satisfies the stopping rule still has to be tested by an excursion (see
     ``sampling.excursions``).
 
-    It has to if the stopping rule is ``tested_confidence``, if the environment has snapshots, if the design has not
-    ended as ready before, and if no excursion was planned yet or none was answered: the design has taken no real step
-    since the last excursion was planned. Samples of logs and audits don't count, because they may be anywhere.
+    It has to if the stopping rule is ``tested_confidence``, if the environment has snapshots, if the design did not
+    end as ready in the previous round, and if no excursion was planned yet or none was answered: the design has taken
+    no real step since the last excursion was planned. Samples of logs and audits don't count, because they may be
+    anywhere.
     """
     if not definition.snapshots or definition.design.stopping != "tested_confidence" or state.ended_as == "ready":
         return False

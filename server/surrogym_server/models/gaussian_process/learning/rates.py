@@ -59,8 +59,11 @@ def output_with_rates(
 
 
 def inputs_of(output: OutputModel, inputs: Mapping[FeatureMap, Tensor]) -> Tensor:
-    """Return the inputs of an output's process, (n, d). ``inputs`` contains the features of n samples for each feature
-    map without rates. If the output has rates, its features are transformed by ``bend``."""
+    """Return the inputs (n, d) of an output's process at n samples.
+
+    A feature map may have rates: numbers (d,) that say how much faster the output changes where an input is large.
+    ``inputs`` has the features before rates are applied, by feature map; ``bend`` applies them.
+    """
     x, rates = inputs[replace(output.feature_map, rates=())], output.feature_map.rates
     return bend(x, torch.tensor(rates, dtype=x.dtype)) if rates else x
 
