@@ -126,7 +126,7 @@ def test_an_outlier_in_the_log_is_reported_in_the_draft(tmp_path: Path):
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
-        ({"action": np.ones(50)}, "expected an action '0' that varies, got 1 in every row"),
+        ({"action": np.ones(50)}, "expected an action '0' that varies, got only 1"),
         ({"x": np.ones(50), "next_x": np.ones(50)}, "expected at least one state that changes"),
     ],
 )

@@ -181,7 +181,9 @@ class JsonForm:
     def read_policy(self, content: bytes, shape: Shape) -> tuple[int, PolicyRollout]:
         body = _ROLLOUT.decode(content)
         if not body.steps or body.action is None:
-            raise FrameError("expected a reply with steps and actions, got one without them")
+            raise FrameError(
+                "expected steps and actions in the reply, got one alone: upgrade the older of client and server"
+            )
         log = None if body.log_probability is None else np.array(body.log_probability, dtype=np.float64)
         steps = [_step_result(step, shape) for step in body.steps]
         return body.seq, PolicyRollout.of(steps, np.array(body.action, dtype=np.float64), log)

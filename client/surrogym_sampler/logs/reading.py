@@ -298,8 +298,8 @@ def _episodes(path: Path, data: Any, width: int) -> list[dict[str, Cells]]:
         rows = {name: len(array) for name, array in arrays.items()}
         if len(set(rows.values())) > 1:
             raise UnusableLog(
-                f"expected an action, a reward and an end for each step in episode {number} of {path}, got {rows} "
-                "values: record the episode again"
+                f"expected an action, a reward, an end and a next observation for each step in episode {number} of "
+                f"{path}, got {rows} values: record the episode again"
             )
     return episodes
 

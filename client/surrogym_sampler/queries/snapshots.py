@@ -134,8 +134,9 @@ class SnapshotFolder:
             raise SnapshotGone(f"snapshot {name} can't be read: {error}; the design chooses another query") from error
         if (form, made_by, list(coordinates)) != (FORM, self._environment, self._names):
             raise SnapshotGone(
-                f"expected a snapshot of {self._environment!r} in file version {FORM}, got {name} of {made_by!r} in "
-                f"file version {form}: give each environment a --snapshots folder of its own"
+                f"expected a snapshot of {self._environment!r} with the coordinates {self._names} in file version "
+                f"{FORM}, got {name} of {made_by!r} with {list(coordinates)} in file version {form}: give each "
+                "environment a --snapshots folder of its own"
             )
         if hashlib.sha256(state).hexdigest() != digest:
             raise SnapshotGone(

@@ -23,11 +23,8 @@ def write(out: Path, page: str) -> int:
     Raises:
         NoPdf: Chromium is not installed, or it failed; nothing was written.
     """
-    if out.suffix.lower() == ".pdf":
-        content = as_pdf(page)
-        out.write_bytes(content)
-        return len(content)
-    return out.write_text(page, encoding="utf-8")
+    content = as_pdf(page) if out.suffix.lower() == ".pdf" else page.encode()
+    return out.write_bytes(content)
 
 
 def as_pdf(page: str) -> bytes:

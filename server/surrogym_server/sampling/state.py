@@ -48,7 +48,7 @@ class DesignState:
     # Predictions of the latest samples by models that had not learned from them. They are only scored and reported.
     predictions: Predictions = ()
     # Number of real steps that counted towards the budget when the last excursion was planned to test a model that
-    # satisfies the stopping rule; 0 if none was planned.
+    # satisfies the stopping rule; 0 if none was planned since the model last failed the rule.
     tested_at: float = 0
 
     def to_json(self) -> dict[str, Any]:

@@ -292,7 +292,7 @@ def _amounts(roles: Roles, values: Floats) -> BoxAction:
         most = float(values[:, index].max()) if ends[1] is None else ends[1]
         if least == most:
             raise UnusableLog(
-                f"expected an action {name!r} that varies, got {least:g} in every row: nothing can be learned of it; "
+                f"expected an action {name!r} that varies, got only {least:g}: nothing can be learned of it; "
                 "leave it out with a mapping file (--map)"
             )
         _require_range(f"the action {name!r}", least, most)

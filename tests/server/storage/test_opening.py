@@ -265,7 +265,7 @@ def test_reading_is_refused_if_the_database_file_was_replaced(tmp_path: Path) ->
     storage.close()
 
 
-def test_a_read_only_database_file_is_refused(tmp_path: Path) -> None:
+def test_a_folder_in_the_place_of_the_database_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "surrogym.db").mkdir()
     with pytest.raises(Unavailable, match=r"expected a file to read and write .*surrogym\.db"):
         open_storage(f"sqlite:///{tmp_path}/surrogym.db")

@@ -101,7 +101,9 @@ class Subject:
             result = self.ask(method, **fields)
         except RequestRefused as error:
             return error
-        raise Mismatch(f"expected an error for the request {method}, got the result {result}")
+        raise Mismatch(
+            f"expected the program to refuse the request {method}, got the result {result}: let it answer with an error"
+        )
 
     def reset(self, seed: int | None) -> Array:
         """Reset the program with a seed, and return the coordinates (C,) of the start."""

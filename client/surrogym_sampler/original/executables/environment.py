@@ -186,7 +186,7 @@ def open_executable(
             program.grant(rest_seconds(chosen))
     except StepFailed as error:
         program.end()
-        raise UnknownEnvironment(f"expected a specification from {command!r}, got none: {error}") from error
+        raise UnknownEnvironment(f"expected a specification from the program {command!r}, got none: {error}") from error
     except BaseException:
         program.end()
         raise
