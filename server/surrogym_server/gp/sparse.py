@@ -45,7 +45,7 @@ class Censored:
     or -1."""
 
     x: Tensor  # (k, d) inputs of the points
-    y: Tensor  # (k,) the bounds
+    y: Tensor  # (k,) known bound of the function's value at each of k points
     side: Tensor  # (k,) 1 if y is a lower bound of f(x), -1 if it is an upper bound
 
     def log_probability(self, posterior: Posterior) -> float:

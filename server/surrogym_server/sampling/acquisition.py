@@ -46,7 +46,8 @@ class CandidateView:
     # (m,) standard deviation without noise, in the output's unit, as if all earlier queries had been answered.
     std: Tensor
     distance: Tensor  # (m,) distance to the nearest query so far, in standard deviations of the sampling range
-    # (m,) logarithm of the input probability P_i (eq. 11); 0 unless the acquisition sets ``reads_probability``.
+    # (m,) logarithm of how likely a policy is to visit each candidate, the paper's input probability (eq. 11); 0 unless
+    # the acquisition sets ``reads_probability``.
     log_probability: Tensor
     _reduction: Callable[[], Tensor]
 

@@ -18,7 +18,7 @@ from surrogym_sampler.original.errors import StepFailed
 from surrogym_sampler.original.protocol import Array
 from surrogym_sampler.original.simulator import Taken
 
-PLACES = 4  # number of explored states in each test
+PLACES = 4  # number of states, out of those that random steps reached, at which a property of a simulator is tested
 EXACT = 1e-6  # a difference below this share of a variable's observed range counts as rounding
 # Setting a state works if a step after it differs from the one that an episode took there by at most this share of each
 # variable's observed range.

@@ -96,7 +96,7 @@ class ProcessAlongPaths(PathOutlook):
 
     definition: EnvironmentDefinition
     output: OutputModel
-    x: Tensor  # (b, T, d) inputs of the output's process
+    x: Tensor  # (b, T, d) inputs of the output's process at each of T steps of b paths
     learns: Tensor  # (b, T) bool, true for each step of a path that would teach the output something
 
     @property
