@@ -14,7 +14,9 @@ import typer
 from support.controllers import network
 from support.limited import DIARY, SPEC, NamedCart
 from support.programs import FALLS_BACK, KEEPS_LIMITS, program
+from support.rated import CHANGE
 from surrogym.cli.commands import sample
+from surrogym_client.transport import Api
 from surrogym_shared.wire import Query
 
 CART = ("--env", "support.limited:PatientCart")
@@ -46,6 +48,18 @@ def test_the_suggested_sampling_command_has_the_file_that_declares_the_limits(
     assert suggested[-2:] == ["--spec", str(file)]
     assert on_server(*suggested[:-2], "--max-queries", "1").code != 0
     assert on_server(*suggested, "--max-queries", "1").code == 0
+
+
+def test_sampling_keeps_the_rate_of_an_action_and_stores_the_applied_actions(
+    on_server: Any, server_process: Any, name: str
+) -> None:
+    rated = ("--env", "support.rated:RatedRail")
+    assert on_server("register", name, *rated).code == 0
+    assert on_server("sample", name, *rated, "--max-queries", "2").code == 0
+    with Api(server_process.url) as api:
+        samples = list(api.samples(name))
+    assert len(samples) > 2
+    assert max(abs(one.action[0] - one.coordinates[-1]) for one in samples) <= CHANGE + 1e-6
 
 
 def test_a_query_the_user_does_not_approve_takes_no_real_step(

@@ -10,6 +10,7 @@ import pytest
 
 from support.compilers import NEEDS_C
 from support.controllers import network
+from support.rated import RatedRail
 from surrogym_sampler.original.episodes import RolloutEpisode
 from surrogym_sampler.original.rollouts import answering
 from surrogym_trainer.deployment.controller import Choices
@@ -42,6 +43,16 @@ def test_a_deployed_controller_with_lagged_inputs_earns_its_policys_returns(tmp_
     assert (checked.steps, checked.faults, checked.different) == (250, 0, 0)
     np.testing.assert_allclose(checked.returns, checked.policy_returns, rtol=1e-6)
     assert len(set(checked.returns)) == 5
+
+
+def test_a_deployed_controller_with_a_rate_decides_as_its_policy_under_the_rate(tmp_path: Path):
+    episode = RolloutEpisode(answering(RatedRail()))
+    path = network(tmp_path, episode.spec, (8,), 3.0)
+    controller = controller_of(path)
+    with TARGETS["c"].running(controller) as running:
+        checked = Comparison(controller, running, load_policy(path), episode).over(range(3), [].append)
+    assert (checked.faults, checked.different) == (0, 0)
+    np.testing.assert_allclose(checked.returns, checked.policy_returns, rtol=1e-6)
 
 
 def test_a_measurement_outside_its_range_counts_as_a_fault(tmp_path: Path):

@@ -49,6 +49,8 @@ class IsolatedEnvironment:
         StepFailed: the environment raised an error, hung or died; the message says which.
     """
 
+    keeps_rates = True  # by the environment in the child process
+
     def __init__(self, factory: Factory, step_limit: float = 30.0, fallback: str | None = None) -> None:
         self._factory = factory
         self._fallback = fallback

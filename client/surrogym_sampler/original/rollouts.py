@@ -33,6 +33,8 @@ class FromReset:
     earlier actions.
     """
 
+    keeps_rates = True  # whether actions are changed so that they keep the declared rates
+
     def __init__(self, environment: ResettableEnvironment) -> None:
         self._environment = environment
         self._spec = environment.spec()
@@ -173,7 +175,7 @@ def answering(environment: object) -> Environment:
             "expected an object with spec, step_from and close, or with spec, reset, step, coordinates and close, "
             f"got a {type(environment).__name__} without {_missing(environment)}"
         )
-    if rates(environment.spec()) and not isinstance(environment, FromReset):
+    if rates(environment.spec()) and not getattr(environment, "keeps_rates", False):
         raise UnknownEnvironment(
             "the action has a rate, which Surrogym keeps only in an environment with reset, step and coordinates: "
             f"expected these methods, got a {type(environment).__name__} without: write them, or remove the rate"

@@ -14,6 +14,7 @@ import numpy as np
 from surrogym_sampler.original.actions import decode_actions
 from surrogym_sampler.original.episode import Episode, Moment
 from surrogym_sampler.original.protocol import LONGEST_EPISODE
+from surrogym_shared.rates import within_rates
 from surrogym_trainer.deployment.controller import LIMITED, Array, Controller
 from surrogym_trainer.policies.predict import Predict
 
@@ -104,7 +105,7 @@ class Comparison:
         for _ in range(self._episode.spec.time_limit or LONGEST_EPISODE):
             action = decode_actions(self._episode.spec, self._policy(moment.observation[None].astype(np.float32)), 1)[0]
             if deployed:
-                action = self._decided(moment, action)
+                action = self._decided(moment, within_rates(self._episode.spec, moment.coordinates, action))
             self.begun += 1
             moment = self._episode.step(action)
             total += moment.reward

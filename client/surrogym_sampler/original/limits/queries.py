@@ -73,6 +73,8 @@ class GuardedRollouts:
     the machine to rest, and the episode ends. Returned steps have the action that was applied.
     """
 
+    keeps_rates = True  # by the environment that it wraps
+
     def __init__(self, environment: RolloutEnvironment, program: Program | None = None) -> None:
         self._environment: Any = environment  # Any, because the methods save, restore and resume are optional
         self._spec = environment.spec()
