@@ -6,7 +6,7 @@ original environment, virtual environments and deployed controllers all compute 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,13 +36,13 @@ def rates(spec: EnvironmentSpec) -> tuple[Rate, ...]:
     return tuple(_rates(spec))
 
 
-def within_rates(spec: EnvironmentSpec, coordinates: Array, action: Array) -> Array:
-    """Return the action that keeps the rates and is nearest to ``action`` (F,), after a step that led to coordinates
-    (C,)."""
+def within_rates(rates: Sequence[Rate], coordinates: Array, action: Array) -> Array:
+    """Return the actions (..., F) that keep the rates and are nearest to ``action`` (..., F), after steps that led to
+    coordinates (..., C), which contain the last action."""
     kept = np.array(action, dtype=np.float64)
-    for rate in _rates(spec):
-        last = coordinates[rate.last]
-        kept[rate.entry] = np.clip(kept[rate.entry], last - rate.change, last + rate.change)
+    for rate in rates:
+        last = coordinates[..., rate.last]
+        kept[..., rate.entry] = np.clip(kept[..., rate.entry], last - rate.change, last + rate.change)
     return kept
 
 

@@ -23,12 +23,12 @@ def state(last: float) -> np.ndarray:
     ("last", "asked", "kept"), [(0.0, 2.0, 1.0), (0.0, -0.4, -0.4), (1.5, -2.0, 0.5), (-2.0, 2.0, -1.0)]
 )
 def test_an_action_entry_with_a_rate_changes_by_at_most_rate_times_period_and_others_freely(last, asked, kept):
-    np.testing.assert_allclose(within_rates(RATED, state(last), np.array([asked, 9.0])), [kept, 9.0])
+    np.testing.assert_allclose(within_rates(rates(RATED), state(last), np.array([asked, 9.0])), [kept, 9.0])
 
 
 def test_a_specification_without_rates_of_action_change_leaves_actions_unchanged():
     assert rates(plant(actions=1)) == ()
-    np.testing.assert_array_equal(within_rates(plant(), np.zeros(3), np.array([2.0, 9.0])), [2.0, 9.0])
+    np.testing.assert_array_equal(within_rates(rates(plant()), np.zeros(3), np.array([2.0, 9.0])), [2.0, 9.0])
 
 
 def changed(**fields) -> dict:

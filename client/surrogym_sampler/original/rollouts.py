@@ -38,6 +38,7 @@ class FromReset:
     def __init__(self, environment: ResettableEnvironment) -> None:
         self._environment = environment
         self._spec = environment.spec()
+        self._rates = rates(self._spec)
         self._at: Array | None = None
         size = len(self._spec.coordinates)
         # number of bytes that precede the environment's in a snapshot: the coordinates, if some are lags (past values)
@@ -76,7 +77,7 @@ class FromReset:
                 "environment first"
             )
         before, self._at = self._at, None
-        native = native_action(self._spec.action, within_rates(self._spec, before, action))
+        native = native_action(self._spec.action, within_rates(self._rates, before, action))
         observation, reward, terminated, truncated, _ = self._environment.step(native)
         taken = np.atleast_1d(np.asarray(native, dtype=np.float64))
         reached = followed(self._spec, before, taken, self._read(observation))

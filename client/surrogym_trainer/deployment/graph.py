@@ -15,9 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from surrogym_shared.rates import within_rates
 from surrogym_trainer.deployment.c.files import prefix_of
 from surrogym_trainer.deployment.controller import Array, Controller, Guard, Observed, Remembered
-from surrogym_trainer.deployment.reference import begin, decide, observe, within_rates
+from surrogym_trainer.deployment.reference import begin, decide, observe
 from surrogym_trainer.deployment.running import Running
 from surrogym_trainer.policies.onnx_files import INPUT, OUTPUT
 
@@ -118,7 +119,8 @@ class RunningGraph(Running):
         self._memory, action, (status,) = decide(self._controller, self._memory, measurement[None], age)
         if status == 0:
             shown = observe(self._controller, self._memory.coordinates).astype(np.float32)
-            action = within_rates(self._controller, self._memory.coordinates, self._act(shown).astype(np.float64))
+            asked = self._act(shown).astype(np.float64)
+            action = within_rates(self._controller.rates, self._memory.coordinates, asked)
             self._memory = replace(self._memory, action=action.astype(np.float32).astype(np.float64))
         return int(status), action[0]
 

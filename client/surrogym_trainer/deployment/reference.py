@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surrogym_shared.limits import is_near
+from surrogym_shared.rates import within_rates
 from surrogym_trainer.deployment.controller import (
     LATE,
     LIMITED,
@@ -76,19 +77,9 @@ def decide(controller: Controller, memory: Memory, measurements: Array, age: Arr
         acts = measured & _falls_back(controller.guard, memory, coordinates)
         safe = np.stack([_entry(term, coordinates) for term in controller.guard.fallback], axis=1)
         action, status = np.where(acts[:, None], safe, action), np.where(acts, LIMITED, status)
-    action = within_rates(controller, coordinates, action)
+    action = within_rates(controller.rates, coordinates, action)
     remembered = action.astype(np.float32).astype(np.float64)
     return Decided(Memory(coordinates, remembered, np.ones_like(wrong), measured), action, status)
-
-
-def within_rates(controller: Controller, coordinates: Array, action: Array) -> Array:
-    """Return the actions (N, F) that are nearest to ``action`` (N, F) and do not change faster than the controller's
-    rates allow. Coordinates (N, C) contain each controller's last action as lags."""
-    kept = action.copy()
-    for rate in controller.rates:
-        last = coordinates[:, rate.last]
-        kept[:, rate.entry] = np.clip(kept[:, rate.entry], last - rate.change, last + rate.change)
-    return kept
 
 
 def _falls_back(guard: Guard, memory: Memory, coordinates: Array) -> Bools:

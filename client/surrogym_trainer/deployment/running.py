@@ -74,7 +74,7 @@ class Comparison:
         self.ended = 0  # number of episodes that have ended, of controller and policy together
         self._running, self._policy, self._episode = running, policy, episode
         self._places = [m.place for m in controller.measurements]
-        self._width = controller.high - controller.low
+        self._width, self._rates = controller.high - controller.low, controller.rates
         self._differences: list[float] = []
         self._faults = 0
 
@@ -105,7 +105,7 @@ class Comparison:
         for _ in range(self._episode.spec.time_limit or LONGEST_EPISODE):
             action = decode_actions(self._episode.spec, self._policy(moment.observation[None].astype(np.float32)), 1)[0]
             if deployed:
-                action = self._decided(moment, within_rates(self._episode.spec, moment.coordinates, action))
+                action = self._decided(moment, within_rates(self._rates, moment.coordinates, action))
             self.begun += 1
             moment = self._episode.step(action)
             total += moment.reward
