@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from itertools import chain, islice
 
-from surrogym_server.storage.announcements import Alone, Announcements
+from surrogym_server.storage.port import Alone, Announcements
 
 # At most this many listeners are woken in one iteration of the event loop. In between it can answer other requests.
 AT_ONCE = 50

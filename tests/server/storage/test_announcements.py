@@ -11,7 +11,7 @@ import pytest
 
 from support.postgresql import Postgresql
 from surrogym_server.storage.port import Storage
-from surrogym_server.storage.sql import announcements, open_storage
+from surrogym_server.storage.sql import events, open_storage
 
 PATIENCE = 60.0
 LISTENING = "FROM pg_stat_activity WHERE starts_with(query, 'LISTEN') AND datname = current_database()"
@@ -84,7 +84,7 @@ def test_after_a_lost_connection_a_server_is_told_that_announcements_may_be_miss
 
 @pytest.mark.postgresql
 def test_announcements_in_quick_succession_are_merged_and_none_is_lost(other, monkeypatch) -> None:
-    monkeypatch.setattr(announcements, "GAP_SECONDS", 3_600.0)
+    monkeypatch.setattr(events, "GAP_SECONDS", 3_600.0)
     (first, _), (_, heard) = other(), other()
     first.announcements.announce("a")
     assert heard.get(timeout=PATIENCE) == "a"

@@ -11,7 +11,7 @@ import sqlalchemy as sa
 
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import NewDesign, NewSample, SavedSession
-from surrogym_server.storage.sql import memory
+from surrogym_server.storage.sql import events
 from surrogym_server.storage.sql.rows import append_event, hold
 
 
@@ -120,7 +120,7 @@ def test_finding_the_newest_event_takes_a_constant_number_of_statements(
 def test_the_oldest_events_are_deleted_in_transactions_of_limited_size(
     storage: Storage, make: Callable[..., str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(memory, "BATCH", 20)
+    monkeypatch.setattr(events, "BATCH", 20)
     name, another = make(), make(name="another")
     append(storage, name, 90)
     before, other = storage.events.list(name), storage.events.list(another)

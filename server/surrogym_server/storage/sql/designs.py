@@ -1,4 +1,5 @@
-"""Implementation of ``Designs``: leases of fits, and the storage of a fit's result."""
+"""Implementations of ``Designs``, ``Priors`` and ``Occupancy``: leases of fits, the storage of a fit's result, and the
+prior model and the visited states that a fit reads."""
 
 from __future__ import annotations
 
@@ -7,26 +8,31 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection, Row
 
-from surrogym_server.errors import BeyondBudget, LeaseExpired, UnknownSurrogate
+from surrogym_server.errors import BeyondBudget, LeaseExpired, TooLarge, UnknownSurrogate
 from surrogym_server.storage import port
 from surrogym_server.storage.records import (
+    JSON,
     OPEN_STATUSES,
+    Array,
     FitLease,
     Granted,
     NewDesign,
+    OccupancyRecord,
+    PriorRecord,
     SurrogateRecord,
     fingerprint,
 )
 from surrogym_server.storage.sql import surrogates as surrogate_rows
-from surrogym_server.storage.sql.database import NOW, Database, constant
+from surrogym_server.storage.sql.database import NOW, Database, conflict_insert, constant, damaged
 from surrogym_server.storage.sql.models import insert_model
-from surrogym_server.storage.sql.queries import IS_INCOMPLETE, begin_initial, queue_initial
-from surrogym_server.storage.sql.rows import append_event, hold, insert_queries, recall, remember, touch
+from surrogym_server.storage.sql.queries import IS_INCOMPLETE, begin_initial, insert_queries, queue_initial
+from surrogym_server.storage.sql.rows import append_event, checksum, find, hold, recall, remember, touch
 from surrogym_server.storage.sql.surrogates import NO_RIGHT
-from surrogym_server.storage.sql.tables import priors, queries, samples, surrogates
+from surrogym_server.storage.sql.tables import occupancies, priors, queries, samples, surrogates
 from surrogym_shared.nouns import Query
 from surrogym_shared.states import Phase
 
@@ -225,3 +231,109 @@ def _finish(connection: Connection, surrogate: Row[Any], lease: FitLease, design
 
 def _phase_after(surrogate: Row[Any], error: str | None) -> Phase:
     return "failed" if error is not None else surrogate_rows.resting_phase(surrogate.round)
+
+
+class SqlPriors(port.Priors):
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def get(self, name: str) -> PriorRecord | None:
+        with self._database.read() as connection:
+            row = connection.execute(
+                sa.select(priors.c.created_at, priors.c.about, priors.c.blob.is_(None).label("awaited")).where(
+                    priors.c.surrogate_id == find(connection, name)
+                )
+            ).one_or_none()
+        return None if row is None else PriorRecord(row.created_at, row.about, awaited=bool(row.awaited))
+
+    def blob(self, name: str) -> bytes | None:
+        with self._database.read() as connection:
+            own = priors.c.surrogate_id == find(connection, name)
+            row = connection.execute(sa.select(priors.c.blob, priors.c.checksum).where(own)).one_or_none()
+        if row is None or row.blob is None:
+            return None
+        if checksum(row.blob) != row.checksum:
+            raise damaged(
+                f"the prior of {name!r} has changed since it was stored, as its checksum shows: store the prior again"
+            )
+        return bytes(row.blob)
+
+    def put(self, name: str, blob: bytes, about: JSON) -> None:
+        with self._database.write() as connection:
+            self._store(connection, name, blob, about)
+
+    def wait(self, name: str) -> None:
+        with self._database.write() as connection:
+            own = priors.c.surrogate_id == hold(connection, name).id
+            if connection.execute(sa.select(priors.c.surrogate_id).where(own)).first() is None:
+                self._store(connection, name, None, {})
+
+    def drop(self, name: str) -> bool:
+        with self._database.write() as connection:
+            surrogate = hold(connection, name)
+            own = priors.c.surrogate_id == surrogate.id
+            if not connection.execute(sa.delete(priors).where(own)).rowcount:
+                return False
+            _plan_anew(connection, name)
+            return True
+
+    def _store(self, connection: Connection, name: str, blob: bytes | None, about: JSON) -> None:
+        surrogate = hold(connection, name)
+        columns = {"created_at": surrogate.now, "about": about, "blob": blob, "checksum": checksum(blob or b"")}
+        insert = conflict_insert(connection, priors).values(surrogate_id=surrogate.id, **columns)
+        connection.execute(insert.on_conflict_do_update(index_elements=["surrogate_id"], set_=columns))
+        if blob is not None:
+            _plan_anew(connection, name)
+
+
+def _plan_anew(connection: Connection, name: str) -> None:
+    """Withdraw queries that were chosen with another prior and without a real step so far, and make a fit due."""
+    surrogate, before = hold(connection, name), surrogate_rows.read(connection, name)
+    touch(connection, surrogate, **surrogate_rows.withdraw_unbegun(connection, surrogate, before, None))
+    append_event(connection, surrogate, "phase", phase=before.phase, error=before.error)
+
+
+MAX_CHECKPOINTS = 1_000  # largest number of occupancies (named sets of visited states) stored for a surrogate
+
+
+class SqlOccupancy(port.Occupancy):
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def put(self, name: str, checkpoint: str, states: Array) -> None:
+        with self._database.write() as connection:
+            surrogate = hold(connection, name)
+            own = (occupancies.c.surrogate_id == surrogate.id, occupancies.c.checkpoint == checkpoint)
+            connection.execute(sa.delete(occupancies).where(*own))
+            others = sa.select(sa.func.count()).where(occupancies.c.surrogate_id == surrogate.id)
+            if connection.execute(others).scalar_one() >= MAX_CHECKPOINTS:
+                raise TooLarge(
+                    f"expected at most {MAX_CHECKPOINTS} names for visited states (checkpoints) of {name!r}, got "
+                    "one more: submit the states under one of the earlier names"
+                )
+            connection.execute(
+                sa.insert(occupancies).values(
+                    surrogate_id=surrogate.id,
+                    checkpoint=checkpoint,
+                    round=surrogate.round,
+                    created_at=surrogate.now,
+                    columns=states.shape[1],
+                    states=states.ravel(),
+                )
+            )
+
+    def get(self, name: str, checkpoint: str) -> OccupancyRecord | None:
+        return self._newest(name, occupancies.c.checkpoint == checkpoint)
+
+    def latest(self, name: str) -> OccupancyRecord | None:
+        return self._newest(name, sa.true())
+
+    def _newest(self, name: str, condition: sa.ColumnElement[bool]) -> OccupancyRecord | None:
+        with self._database.read() as connection:
+            own = occupancies.c.surrogate_id == find(connection, name)
+            newest = sa.select(occupancies).where(own, condition).order_by(occupancies.c.id.desc()).limit(1)
+            row = connection.execute(newest).one_or_none()
+        if row is None:
+            return None
+        states = np.array(row.states).reshape(-1, row.columns)
+        return OccupancyRecord(row.checkpoint, row.round, row.created_at, states)

@@ -1,8 +1,10 @@
-"""Implementations of ``Models`` and ``PolicyNames``: models by version, versions and aliases of policies."""
+"""Implementations of ``Models``, ``PolicyNames`` and ``Sessions``: models by version, versions and aliases of policies,
+and saved sessions."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from typing import Any
 
 import msgspec
@@ -12,10 +14,11 @@ from sqlalchemy.engine import Connection, Row
 from surrogym_server.errors import NoModel, UnknownModel, UnknownPolicy
 from surrogym_server.storage import port
 from surrogym_server.storage.port import LATEST
-from surrogym_server.storage.records import ModelRecord, NewModel
-from surrogym_server.storage.sql.database import Database, damaged
+from surrogym_server.storage.records import ModelRecord, NewModel, SavedSession
+from surrogym_server.storage.sql.database import Database, conflict_insert, damaged
 from surrogym_server.storage.sql.rows import NAMELESS, Span, append_event, checksum, find, hold, touch, within
 from surrogym_server.storage.sql.tables import models, policies, policy_aliases, policy_evaluations
+from surrogym_server.storage.sql.tables import sessions as saved
 
 COLUMNS = [
     getattr(models.c, name)
@@ -187,3 +190,22 @@ def unknown_policy(name: str, which: object) -> UnknownPolicy:
         f"expected a version or an alias of the policies of {name!r}, got {which}, which does not exist: surrogym "
         "policies lists them"
     )
+
+
+class SqlSessions(port.Sessions):
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def save(self, sessions: Sequence[SavedSession]) -> None:
+        rows = [{"id": one.id, "surrogate": one.surrogate, "data": one.data} for one in sessions]
+        if not rows:
+            return
+        with self._database.write() as connection:
+            insert = conflict_insert(connection, saved)
+            values = {"surrogate": insert.excluded.surrogate, "data": insert.excluded.data}
+            connection.execute(insert.on_conflict_do_update(index_elements=["id"], set_=values), rows)
+
+    def take(self) -> list[SavedSession]:
+        with self._database.write() as connection:
+            rows = connection.execute(sa.delete(saved).returning(*saved.c)).all()
+        return [SavedSession(row.id, row.surrogate, bytes(row.data)) for row in rows]

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
-from itertools import chain
 from typing import Any
 
 import sqlalchemy as sa
@@ -12,9 +10,8 @@ from sqlalchemy.engine import Connection, Row
 
 from surrogym_server.errors import IdempotencyConflict, UnknownSurrogate
 from surrogym_server.storage.sql.database import NOW
-from surrogym_server.storage.sql.tables import events, queries, requests, surrogates
-from surrogym_shared.nouns import Query
-from surrogym_shared.states import EventKind, Purpose
+from surrogym_server.storage.sql.tables import events, requests, surrogates
+from surrogym_shared.states import EventKind
 
 Span = tuple[int, int]  # first and last id of a range of surrogates
 
@@ -111,49 +108,6 @@ def remember(
     if key is not None:
         row = {"surrogate_id": surrogate.id, "operation": operation, "key": key, "fingerprint": body, "result": result}
         connection.execute(NEW_REQUEST, row)
-
-
-def insert_queries(
-    connection: Connection,
-    surrogate: Row[Any],
-    new_queries: Sequence[Query],
-    purpose: Purpose,
-    round: int,
-    *,
-    extra: bool = False,
-) -> list[int]:
-    """Insert queries as pending, and return their ids in the same order.
-
-    ``round`` is the number of the design's round that chose them. ``extra`` marks queries that were only chosen because
-    ``improve`` requested them.
-    """
-    if not new_queries:
-        return []
-    common = {"surrogate_id": surrogate.id, "purpose": purpose, "round": round, "status": "pending", "attempts": 0}
-    common["extra"] = extra
-    rows = [common | _columns(query) for query in new_queries]
-    insert = sa.insert(queries).returning(queries.c.id, sort_by_parameter_order=True)
-    ids = [int(id) for id in connection.execute(insert, rows).scalars()]
-    append_event(connection, surrogate, "queries", count=len(ids), purpose=purpose, round=round)
-    return ids
-
-
-def _columns(query: Query) -> dict[str, Any]:
-    """Convert a query to the columns of its row. The actions (T, F) become one vector (T * F,)."""
-    return {
-        "kind": query.kind,
-        "coordinates": query.coordinates,
-        "action": tuple(chain.from_iterable(query.actions)),
-        "steps": query.steps,
-        "snapshot": query.snapshot,
-    }
-
-
-def query_in(row: Row[Any]) -> dict[str, Any]:
-    """Convert a row with columns ``coordinates``, ``action``, ``steps`` and ``snapshot`` to fields of a ``Query``."""
-    size = max(1, len(row.action) // row.steps)
-    actions = tuple(row.action[first : first + size] for first in range(0, len(row.action), size))
-    return {"coordinates": row.coordinates, "actions": actions, "snapshot": row.snapshot}
 
 
 # The functions below work for any table of leases with the columns ``expires`` and ``seconds``, by the database's

@@ -13,18 +13,14 @@ import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
 from surrogym_server.errors import Damaged, Unavailable
-from surrogym_server.storage.announcements import Alone
-from surrogym_server.storage.port import Storage, T
+from surrogym_server.storage.port import Alone, Storage, T
 from surrogym_server.storage.records import Synchronous
-from surrogym_server.storage.sql.announcements import NotifiedAnnouncements
 from surrogym_server.storage.sql.database import Database, connect, damaged, never_connected
-from surrogym_server.storage.sql.designs import SqlDesigns
-from surrogym_server.storage.sql.ledger import CountedSamples, SqlLedger
-from surrogym_server.storage.sql.memory import SqlEvents, SqlOccupancy, SqlSessions
-from surrogym_server.storage.sql.models import SqlModels, SqlPolicyNames
-from surrogym_server.storage.sql.priors import SqlPriors
+from surrogym_server.storage.sql.designs import SqlDesigns, SqlOccupancy, SqlPriors
+from surrogym_server.storage.sql.events import NotifiedAnnouncements, SqlEvents
+from surrogym_server.storage.sql.models import SqlModels, SqlPolicyNames, SqlSessions
 from surrogym_server.storage.sql.queries import SqlQueries, SqlSnapshots
-from surrogym_server.storage.sql.samples import SqlSamples
+from surrogym_server.storage.sql.samples import CountedSamples, SqlLedger, SqlSamples
 from surrogym_server.storage.sql.surrogates import SqlSurrogates
 from surrogym_server.storage.sql.tables import metadata
 

@@ -27,10 +27,8 @@ from surrogym_server.storage.records import (
     SurrogateSummary,
 )
 from surrogym_server.storage.sql.database import BATCH, NOW, Database, conflict_insert, damaged
-from surrogym_server.storage.sql.leases import is_unbegun, requeue_set_aside
-from surrogym_server.storage.sql.ledger import MOST_KEPT, CountedSamples, SampleCounts, ledgers
 from surrogym_server.storage.sql.models import newest_of
-from surrogym_server.storage.sql.queries import begin_initial, end_initial, queue_initial
+from surrogym_server.storage.sql.queries import begin_initial, end_initial, is_unbegun, queue_initial, requeue_set_aside
 from surrogym_server.storage.sql.rows import (
     IS_THERE,
     NAMED,
@@ -41,6 +39,7 @@ from surrogym_server.storage.sql.rows import (
     touch,
     unknown_surrogate,
 )
+from surrogym_server.storage.sql.samples import MOST_KEPT, CountedSamples, SampleCounts, ledgers
 from surrogym_server.storage.sql.tables import metadata, models, policies, queries, samples, surrogates
 from surrogym_shared.states import Phase
 

@@ -1,19 +1,74 @@
-"""Announcements by LISTEN and NOTIFY of PostgreSQL, with one thread that sends and one that listens."""
+"""Implementations of ``Events`` and ``Announcements``. The announcements use LISTEN and NOTIFY of PostgreSQL, with one
+thread that sends and one that listens."""
 
 from __future__ import annotations
 
 import logging
 import threading
+from collections.abc import Sequence
 from contextlib import closing
 from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
+import sqlalchemy as sa
+
 from surrogym_server.errors import Unavailable
-from surrogym_server.storage.announcements import Announcements, Hear
-from surrogym_server.storage.sql.database import Database
+from surrogym_server.storage import port
+from surrogym_server.storage.port import Announcements, Hear
+from surrogym_server.storage.records import EventRecord
+from surrogym_server.storage.sql.database import BATCH, Database
+from surrogym_server.storage.sql.rows import find
+from surrogym_server.storage.sql.tables import events, surrogates
 
 if TYPE_CHECKING:
     from psycopg import Connection
+
+NEWEST = sa.select(
+    surrogates.c.name,
+    sa.select(sa.func.max(events.c.id)).where(events.c.surrogate_id == surrogates.c.id).scalar_subquery(),
+).where(surrogates.c.name.in_(sa.bindparam("names", expanding=True)))
+
+
+class SqlEvents(port.Events):
+    def __init__(self, database: Database) -> None:
+        self._database = database
+        self._pruned = 0  # id of the newest event of all surrogates at the last call of ``prune``
+
+    def newest(self, names: Sequence[str]) -> dict[str, int]:
+        with self._database.read() as connection:
+            return {name: id or 0 for name, id in connection.execute(NEWEST, {"names": [*names]})}
+
+    def list(self, name: str, after: int = 0, limit: int = 1_000) -> list[EventRecord]:
+        with self._database.read() as connection:
+            own = events.c.surrogate_id == find(connection, name)
+            rows = connection.execute(
+                sa.select(events.c.id, events.c.kind, events.c.created_at, events.c.body)
+                .where(own, events.c.id > after)
+                .order_by(events.c.id)
+                .limit(limit)
+            )
+            return [EventRecord(**row._mapping) for row in rows]
+
+    def prune(self, keep: int) -> int:
+        with self._database.read() as connection:
+            newest = connection.execute(sa.select(sa.func.max(events.c.id))).scalar() or 0
+            changed = sa.select(events.c.surrogate_id).where(events.c.id > self._pruned).distinct()
+            owners = [*connection.execute(changed).scalars()]
+        removed = sum(self._prune(owner, keep) for owner in owners)
+        self._pruned = newest
+        return removed
+
+    def _prune(self, owner: int, keep: int) -> int:
+        own = events.c.surrogate_id == owner
+        with self._database.read() as connection:
+            beyond = sa.select(events.c.id).where(own).order_by(events.c.id.desc()).offset(keep).limit(1)
+            last = connection.execute(beyond).scalar()
+        if last is None:
+            return 0
+        oldest = sa.select(events.c.id).where(own, events.c.id <= last).order_by(events.c.id).limit(BATCH)
+        remove = sa.delete(events).where(events.c.id.in_(oldest))
+        return self._database.write_in_batches(lambda connection: connection.execute(remove).rowcount)
+
 
 logger = logging.getLogger(__name__)
 
