@@ -54,7 +54,8 @@ class KeyedGenerator:
             "bit_generator": "Philox",
             "state": {"counter": _words(0, 0, key.step // key.hold, 0), "key": _words(key.seed, 0)},
             "buffer": _words(0, 0, 0, 0),
-            # Marks the generator's buffer of random numbers as used up, so none of an earlier key is left.
+            # Mark the generator's buffer of random numbers as empty, so that no number drawn under an earlier key is
+            # returned.
             "buffer_pos": 4,
             "has_uint32": 0,
             "uinteger": 0,

@@ -9,9 +9,9 @@ from typing import Annotated
 from pydantic import Field
 
 SHOWN = 40  # a message shows at most this many characters of a wrong value
-# Largest size of a number, and smallest width of a range, so that products stay finite.
+# A specification may have numbers up to this size, and ranges down to this width, so that products of them stay finite.
 LARGEST, NARROWEST = 1e12, 1e-12
-RESOLUTION = 1e-9  # smallest width of a range, as a share of its numbers: in a narrower range rounding errors dominate
+RESOLUTION = 1e-9  # smallest width of a range, as a share of its larger end: below it, rounding errors dominate
 
 Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST, allow_inf_nan=False, strict=True)]
 Width = Annotated[float, Field(ge=NARROWEST, le=LARGEST, allow_inf_nan=False, strict=True)]

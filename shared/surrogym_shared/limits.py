@@ -20,10 +20,12 @@ from surrogym_shared.terms import evaluate
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
-CORNERS = 10  # with at most this many coordinates, all corners of the start ranges are checked
-FEWEST_LEFT = 2  # a machine stops only if at least this number of its episodes left a limit
-LEFT_LEVEL = 0.01  # largest probability of a wrong stop, if at most twice the allowed share of rollouts leave a limit
-STARTS = 1_000  # number of random start states at which the limits are checked
+CORNERS = 10  # with at most this many coordinates, limits are also checked at all corners of the ranges of start states
+FEWEST_LEFT = 2  # a machine is stopped only if at least this number of its episodes left a declared limit
+# A machine is stopped if too many of its episodes left a limit. If the true share is at most twice the allowed one, it
+# is stopped by mistake with at most this probability.
+LEFT_LEVEL = 0.01
+STARTS = 1_000  # number of random start states at which limits are checked
 
 
 def limits_of(spec: EnvironmentSpec) -> Limits:
@@ -73,14 +75,16 @@ def is_near(margin: Array, now: Array, before: Array) -> Bools:
     another form, and must agree with it: ``surrogym_server.environment.safety`` for tensors,
     ``surrogym_trainer.deployment.c.source`` in C, and ``surrogym_trainer.deployment.st.source`` in structured text.
     """
-    with np.errstate(invalid="ignore"):  # a limit without ends has an infinite distance, and inf - inf is NaN
+    # A limit without ends has infinite distances: inf - inf gives NaN, which fmin ignores.
+    with np.errstate(invalid="ignore"):
         return np.asarray((np.fmin(now, 2 * now - before) < margin).any(axis=-1))
 
 
 def fallback_action(spec: EnvironmentSpec, coordinates: Array) -> Array:
     """Return the action (F,), with F entries, that the fallback takes in a state with coordinates (C,)."""
     terms = limits_of(spec).fallback
-    assert not isinstance(terms, NamedFallback)  # a program at the machine, which is not called here
+    # A named fallback is a program at the machine; it gives its actions itself.
+    assert not isinstance(terms, NamedFallback)
     return clipped_action(spec, [float(evaluate(spec, term, coordinates[None])[0]) for term in terms])
 
 
@@ -219,7 +223,7 @@ def _check_fallback(spec: EnvironmentSpec, declared: Limits) -> None:
         for part in term.parts:
             require_known(f"limits: entry {number} of the fallback", part.weights, spec.coordinate_names)
         constant = all(part.function == "one" for part in term.parts)
-        # Value of the fallback at one state; at every state if the term is constant.
+        # Value of the fallback's term at the state 0; if the term is constant, its value at every state.
         value = float(evaluate(spec, term, np.zeros((1, len(spec.coordinates))))[0])
         whole = isinstance(spec.action, BoxAction) or (constant and value.is_integer())
         got = f"{value:g}" if constant else "a term of the state"

@@ -68,14 +68,17 @@ class PolicyRollout:
     reward: Floats  # (T, N) reward in T steps of N lanes, less the penalty for uncertainty
     terminated: Bools  # (T, N) whether each of T steps ended the episode of a lane in a terminal state
     truncated: Bools  # (T, N) whether each of T steps ended the episode of a lane for another reason
-    final_steps: Ints  # (K,) for each of K ended episodes, the index of its last step, in ascending order
+    final_steps: Ints  # (K,) index of the last step of each of the K episodes that ended, in ascending order
     final_lanes: Ints  # (K,) lane of each of the K ended episodes
     final_observation: Floats  # (K, D) last observation, of D entries, of each of the K ended episodes
     model_version: Ints  # (T, N) version of the model that each of N lanes' episodes ran under in each of T steps
     reward_mean: Floats  # (T, N) reward in T steps of N lanes without the penalty for uncertainty
-    # (T, N) whether a lane was truncated because the model is too uncertain there; None in a session without ``trust``.
+    # (T, N) whether a lane's episode ended in this step because the model is too uncertain there; None in a session
+    # without the option ``trust``.
     untrusted: Bools | None = None
-    left: Bools | None = None  # (T, N) ``left`` of each step, or None
+    # (T, N) whether a lane's episode ended in this step outside the sampling range, or where the fallback of declared
+    # limits acts; None if neither an outside reward nor limits are declared.
+    left: Bools | None = None
 
     def __len__(self) -> int:
         return len(self.reward)

@@ -55,7 +55,7 @@ class Preset:
             by_steps: whether a query is one step from a state to which the environment is set, or from a saved state.
         """
         if self.name == "paper":
-            return 10 * (observations + actions)  # as in section 3.1 of the paper
+            return 10 * (observations + actions)  # the paper's number of initial real steps, in section 3.1
         return max(4, coordinates + actions) if by_steps else 4 * (coordinates + actions)
 
     def budget(self, initial: int, coordinates: int, actions: int, by_steps: bool) -> int:

@@ -20,7 +20,7 @@ def open_to_others(path: Path) -> str | None:
         return None
     mode = stat.S_IMODE(status)
     if stat.S_ISDIR(status):
-        return None  # a folder can't be read as a file, which raises an error later
+        return None  # the path is a folder; reading it as a file raises an error later
     if os.name != "posix" or not mode & OTHERS:
         return None
     return f"{path} may be read by other users of this machine (mode {mode:o}): chmod 600 {path} prevents this"

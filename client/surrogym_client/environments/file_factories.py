@@ -10,7 +10,8 @@ from surrogym_client.environments.env import RemoteEnv
 from surrogym_client.environments.vector import RemoteVectorEnv
 from surrogym_shared.port import SurrogatePort
 
-# Group of entry points by which the server's package offers to step a surrogate in this process.
+# Group of entry points in which the server's package registers a function that opens a surrogate's file in this
+# process.
 ENTRY_POINTS = "surrogym.ports"
 
 

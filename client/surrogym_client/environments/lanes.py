@@ -97,8 +97,10 @@ class Lanes:
         self._start = self._observation  # (N, D) first observations of the lanes in the present session
         self._version: Ints = np.array(self.view.model_version, dtype=np.int64)
         self._running = _none(lanes)
-        self._cut = _none(lanes)  # lanes whose episode was lost with a session, and is not yet reported as truncated
-        self._held = _none(lanes)  # lanes that a new session has reset already, before the step that reports the reset
+        # (N,) whether a lane's episode was lost with an earlier session, and is not reported as truncated yet.
+        self._cut = _none(lanes)
+        # (N,) whether a lane was reset when a new session was opened, and the step that reports the reset has not come.
+        self._held = _none(lanes)
 
     @property
     def num_envs(self) -> int:

@@ -63,7 +63,9 @@ def drawn_with(name: str) -> list[tuple[str, str]]:
 
 def read_of(spec: EnvironmentSpec, name: str) -> Read | None:
     """Return a function that computes a coordinate from an observation; None if no entry shows the coordinate."""
-    found: dict[str, tuple[int, float, float]] = {}  # an entry's index, factor and offset, by its function, as "sin"
+    # By the function of an observation entry, such as "sin": the entry's index, and the factor and offset of the
+    # function.
+    found: dict[str, tuple[int, float, float]] = {}
     for index, entry in enumerate(spec.observation):
         parts = [part for part in entry.term.parts if part.function != "one"]
         if len(parts) != 1 or not _of_alone(parts[0], name):

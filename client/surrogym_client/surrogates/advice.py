@@ -12,11 +12,14 @@ from surrogym_shared.environments import is_name
 from surrogym_shared.wire import DoubtfulRegion, ModelView, OutputFidelity, ReachedLimit, SurrogateView
 
 NEARLY = 0.9  # the target counts as nearly reached if the confidence index has reached this share of it
-MOST_STEPS = 10.0  # a forecast of more real steps than this multiple of the present samples is not given
-NOTICEABLE = 0.9  # real steps help if they lower the leave-one-out error to less than this share of the earlier one
+# No number of further real steps is forecast if it exceeds this multiple of the present number of samples.
+MOST_STEPS = 10.0
+# Further real steps help if they lower the leave-one-out error to less than this share of its earlier value.
+NOTICEABLE = 0.9
 FEWEST_MODELS = 4  # the speed of learning is estimated from at least this number of successive models
 NOISY_SLACK = 1.25  # if an output has confirmed noise, its leave-one-out error may be this multiple of its tolerance
-# For the confidence index, the server widens a tolerance by this many standard deviations of the noise.
+# To estimate which tolerance is within reach, an output's tolerance is widened by this many standard deviations of its
+# noise. The server widens it by one.
 NOISE_BAND = 1.5
 MOSTLY_NOISE = 0.8  # if noise has this share of the squared leave-one-out error, more real steps hardly help
 # An output's tolerance is a share of the spread of its initial samples. If it is below this share of the leave-one-out

@@ -301,7 +301,8 @@ class Api:
         """
         batches = _batches(samples)
         keys: list[str | None] = [None] * len(batches)
-        if idempotency_key or any(sample.query_id is None for sample in samples):  # else leases identify the samples
+        # Samples of queries need no key: the lease of the query shows whether they were sent before.
+        if idempotency_key or any(sample.query_id is None for sample in samples):
             key = idempotency_key or new_key()
             keys = [key] if len(batches) == 1 else [f"{key}/{number}" for number in range(len(batches))]
         added: list[wire.AddedSamples] = []

@@ -284,7 +284,7 @@ def _checked(url: str) -> str:
 def _new_client(url: str, token: str | None) -> httpx.Client:
     headers = {"Authorization": f"Bearer {token}"} if token else {}
     limits = httpx.Limits(keepalive_expiry=_KEEPALIVE_SECONDS)
-    trusted = httpx.create_ssl_context()  # with SSL_CERT_FILE, also for loopback hosts
+    trusted = httpx.create_ssl_context()  # also for loopback hosts, reads SSL_CERT_FILE
     return httpx.Client(headers=headers, limits=limits, verify=trusted, trust_env=not _is_loopback(url))
 
 

@@ -246,7 +246,8 @@ class HttpSurrogate:
                 if behind is None or behind >= sent.seq or returns == _RETURNS:
                     raise
                 returns += 1
-                with suppress(SeqConflict):  # the server restored a checkpoint again, so try again
+                # If the server restores an older checkpoint meanwhile, resend the requests once more.
+                with suppress(SeqConflict):
                     self._send_again(live, window, behind)
 
     def _send_again(self, live: _Live, window: ResendBuffer, behind: int) -> None:

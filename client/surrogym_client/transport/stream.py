@@ -74,7 +74,7 @@ class Stream:
         with self._turn:
             try:
                 connected = self._socket or self._connect()
-                if seconds != connected.gettimeout():  # else spare the system call settimeout
+                if seconds != connected.gettimeout():  # an equal time-out needs no system call
                     connected.settimeout(seconds)
                 key = secrets.token_bytes(KEY_BYTES)
                 with suppress(ConnectionError):  # a server that refuses a large message stops reading, and answers

@@ -19,10 +19,11 @@ from surrogym_sampler.original.protocol import Array, OriginalEnvironment, RealS
 from surrogym_sampler.original.simulator import Simulated
 from surrogym_shared.spec import BoxAction, EnvironmentSpec, limits
 
-PLACES = 3  # number of states to set, and of steps in each test episode
+PLACES = 3  # number of states to which the environment is set in a test, and of steps in a test episode
 EXACT = 1e-6  # a difference below this share of a coordinate's sampling range counts as rounding
 CLOSE = 1e-2  # a state counts as set if it is read back with an error of at most this share of a coordinate's range
-FEW = 3.0  # two steps count as equal if they differ by at most this multiple of the noise measured in a few steps
+# Two steps count as equal if they differ by at most this multiple of the noise that a few repeated steps have shown.
+FEW = 3.0
 
 
 class CheckFailed(StepFailed):

@@ -87,7 +87,7 @@ def _registries() -> Iterator[Registry[Any]]:
     for group, place in REGISTRIES.items():
         module, _, name = place.partition(":")
         if entry_points(group=group):
-            # Without the registry's own package, which is optional, nothing would use the plug-ins.
+            # If the package of the registry is not installed, nothing uses its plug-ins, so the registry is skipped.
             with suppress(ImportError):
                 yield getattr(import_module(module), name)
 

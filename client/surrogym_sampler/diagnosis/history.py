@@ -24,13 +24,16 @@ from surrogym_shared.spec import EnvironmentSpec
 
 Bools = NDArray[np.bool_]
 
-LONGEST = 5  # largest number of earlier changes, and of earlier actions, in the histories that are compared
+# The test compares histories (states with lags) of up to this number of earlier changes, and of earlier actions.
+LONGEST = 5
 EPISODE = 20  # largest number of steps in an episode of the test
 HELD = 4  # largest number of steps for which a random action is held
 RIDGE = 1e-6  # ridge term of the linear regression, relative to the variance of its inputs
-ENOUGH = 0.05  # a history is good enough if its error is below this share of the standard deviation of the changes
-SLACK = 1.2  # a history is also good enough if its error is below this multiple of the smallest error of all histories
-# If the error exceeds this share of the changes' standard deviation, the regression says nothing about histories.
+ENOUGH = 0.05  # a history suffices if its prediction error is below this share of the standard deviation of the changes
+# A history also suffices if its prediction error is below this multiple of the smallest one of all histories.
+SLACK = 1.2
+# If even the chosen history has a prediction error above this share of the changes' standard deviation, the test can't
+# tell which history is needed.
 EXPLAINED = 0.5
 WIDER = 1.5  # the declared largest change of a coordinate is this multiple of its largest observed change
 

@@ -49,7 +49,7 @@ class IsolatedEnvironment:
         StepFailed: the environment raised an error, hung or died; the message says which.
     """
 
-    keeps_rates = True  # by the environment in the child process
+    keeps_rates = True  # the environment in the child process keeps actions within the declared rates
 
     def __init__(self, factory: Factory, step_limit: float = 30.0, fallback: str | None = None) -> None:
         self._factory = factory

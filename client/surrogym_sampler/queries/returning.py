@@ -203,7 +203,8 @@ def snapshots_of(
     assert isinstance(environment, Resettable)  # check_environment has checked that save and restore exist
     with tempfile.TemporaryDirectory(prefix="surrogym-snapshots-") as ended:
         kept = SnapshotFolder((settings.snapshots or Path(ended)) / surrogate, spec, settings.bounds)
-        # a snapshot written after this line may belong to a sample that the server has not received yet
+        # The folder is read before the server is asked. A snapshot that is written in between may belong to a sample
+        # that the server has not received yet, so it must not be dropped.
         before = kept.names()
         known = {one.name for one in api.snapshots(surrogate)}
         kept.drop_first(set(before) - known)

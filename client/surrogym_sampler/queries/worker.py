@@ -259,7 +259,7 @@ class Sampler:
     def _step(self, query: Query) -> _Answer:
         taken: list[NewSample] = []
         error, for_good = "", False
-        outcome: Outcome = "failed"  # counts only if no real step is taken
+        outcome: Outcome = "failed"  # used only if the query gives no sample; samples count as an answer
         try:
             check_query(self._own, query)
             if self._approve is not None and not self._approve(query):

@@ -30,12 +30,14 @@ SHIFT_ALARM = 0.05
 UNDECIDED = 0.05
 # an audit fails if the model wrongly predicted, in at least this number of steps, whether the step ends its episode
 MISPLACED_ENDS = 2
-# a return or a new promise may leave the promised interval by this share of the policy's gain over an untrained policy
+# an audit passes although a return, or the promise of the new model, lies outside the promised interval by up to this
+# share of the policy's gain over an untrained policy
 SLACK = 0.1
-# two states are far apart if a coordinate differs by more than this number of its standard deviations over the policy's
-# states
+# two states are far apart if a coordinate differs by more than this multiple of the coordinate's standard deviation
+# over the states that the policy visits
 FAR = 1.0
-# an audit does not support a promise if more than this share of the policy's states is far from every step of the audit
+# an audit does not support a promise if more than this share of the states that the policy visits is far from every
+# step of the audit
 MOST_UNTESTED = 0.2
 QUANTILES = 200  # to widen a promise, its distribution is represented by this number of quantiles
 # if the lower half of a promised interval is wider than this share of the gain over an untrained policy, more real

@@ -20,7 +20,8 @@ from surrogym_trainer.evaluation.imagined import imagine
 from surrogym_trainer.evaluation.systematic import Inputs, Region, Systematic, region
 from surrogym_trainer.policies.predict import Predict
 
-# the effect on the return is computed for this number of errors that are drawn from their posterior distribution
+# If all steps of an audit share an error, its effect on the return is computed for this number of errors, which are
+# drawn from the error's posterior distribution.
 DRAWS = 64
 STARTS = 4  # for each drawn error, the return is the mean over this number of virtual episodes
 # an output is reported only if the probability that its errors have a part that all steps share exceeds this

@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 Progress = Callable[[float, int], None]
 
 FIRST_SEED = 10_000
-FEW_EQUAL = 3  # once this number of episodes has ended and all are equal, a remark says so
+FEW_EQUAL = 3  # once this number of episodes has ended, a remark warns if all are equal in every number
 EXPLORING = 1  # second part of the seed of the random changes of actions; the first part is the seed of the episode
 # a constant coordinate may change within an episode by this share of its range and still count as constant
 ROUNDING = 1e-6

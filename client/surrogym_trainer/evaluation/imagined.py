@@ -165,7 +165,8 @@ def _as_arrays(predict: Callable[[NDArray[Any]], NDArray[Any]], port: SurrogateP
     try:
         return ActingPolicy.of(predict)
     except ValueError:
-        return None  # ActingPolicy holds one network, no larger than a surrogate accepts
+        # A network that is too large, or of a form that ActingPolicy can't hold, acts step by step in this process.
+        return None
 
 
 def _added(sums: NDArray[np.float64], rows: NDArray[np.floating[Any]]) -> NDArray[np.float64]:

@@ -122,7 +122,8 @@ def save(learner: BaseAlgorithm, path: Path) -> None:
     """Save a policy as ``learner.save`` does. If possible, add a description from which the file is read without
     unpickling."""
     file = io.BytesIO()
-    # without this entry, the module normalisation knows that the observations were not normalised
+    # The entry ``_last_original_obs`` is left out, because in a saved policy it means that VecNormalize normalised the
+    # observations. Here it normalised only the rewards.
     learner.save(file, exclude=["_last_original_obs"])
     if (structure := describe(learner)) is not None:
         with zipfile.ZipFile(file, "a") as archive:

@@ -21,8 +21,8 @@ GAIN = 0.01
 CLEARLY = 2.0  # a mean difference of returns is clear, and not chance, above this number of its standard errors
 # a network that gains less than this share of the best episode's gain over an untrained network has learned nothing
 LEARNED = 0.01
-# this share of the episodes must earn more than with an untrained network, because a few may succeed by a lucky
-# posterior sample
+# a network has learned something only if at least this share of the episodes earns more than with an untrained network;
+# fewer may succeed by a lucky posterior sample
 MANY = 0.25
 # no further gain is possible after this number of checks in a row in which every episode earned the highest return so
 # far

@@ -46,7 +46,7 @@ class SearchTask:
     settings: TrainSettings
     steps: int  # largest number of virtual steps
     out: Path  # file to which the policy will be saved; also the name of the run in trackers
-    prolong: bool = False  # whether to take more cycles while the return rises, and to refine the policy
+    prolong: bool = False  # whether to train in further cycles while the return rises, and then to refine the policy
     progress: Progress = lambda _: None
 
 

@@ -37,7 +37,7 @@ class TrainSettings:
         ValueError: ``threads`` is not an integer from 1 to ``MOST_THREADS``.
     """
 
-    algorithm: str | None = None  # name of a PolicySearch, in upper or lower case; None: see with_algorithm
+    algorithm: str | None = None  # name of a PolicySearch, in upper or lower case; None lets ``with_algorithm`` choose
     total_steps: int | None = None
     num_envs: int | None = None
     seed: int = 0
@@ -47,7 +47,8 @@ class TrainSettings:
     start_from: Path | None = None  # saved policy to continue from
     trust_policy: bool = False  # whether to unpickle the objects of the policy in ``start_from``, which may run code
     anew: bool = False  # whether to begin with a new network, and use the saved policy only if the new one stays worse
-    # whether to add cycles while the return rises, and to refine the policy; None: see the function prolongs
+    # whether to train in further cycles while the return rises, and then to refine the policy; None lets the function
+    # ``prolongs`` decide
     prolong: bool | None = None
     threads: int = 1
     tracker: Tracker | None = None  # tracker of curves, for searches that log them

@@ -31,7 +31,8 @@ class Stand:
     share: float = 0.0
     now: TrainProgress | None = None
     curve: tuple[wire.CurvePoint, ...] = ()
-    # share of the training that is done, which never falls; all records of a job's progress have the same object
+    # Estimate of the share of the training that is done, which never falls. Successive records of one job share this
+    # object.
     estimate: ProgressEstimate = field(default_factory=ProgressEstimate, compare=False)
 
     def trained(self, now: TrainProgress, seconds: float) -> Stand:

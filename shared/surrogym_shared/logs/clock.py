@@ -16,11 +16,12 @@ from surrogym_shared.logs.rows import Rows
 from surrogym_shared.logs.table import Bools, Floats, Ints
 from surrogym_shared.words import counted
 
-# If more than this share of a log's rows have the same time as the row before, the clock may be coarser than the rows.
+# If more than this share of a log's rows have the same time as the row before, the clock's resolution may be coarser
+# than the time between two rows.
 SHARED = 0.1
-# Of the rows that have the same time as the row before, a share differs from that row in other numbers. Up to a share
-# of REPEATS, all rows of the same time are repeats. From a share of DIFFER on, they are steps under a coarse clock.
-# Between the two shares, the log is refused.
+# Some rows have the same time as the row before. The share of these rows that differ from the row before in other
+# columns decides: up to REPEATS, they are repeats of a row; from DIFFER on, they are steps under a coarse clock; in
+# between, the log is refused.
 REPEATS, DIFFER = 0.02, 0.2
 # A log with a coarse clock (several rows of the same time) is refused if the number of rows differs by more than 1 from
 # the usual number at more than this share of the times.
@@ -86,7 +87,8 @@ def _names(rows: Rows, names: Ints, notes: list[str]) -> Ints:
     stretch = np.cumsum(changes, dtype=np.int64)
     alternate = bool(np.median(np.bincount(stretch)) < 2) if len(rows) else False
     returned = int(stretch[-1]) + 1 - len(np.unique(names)) if len(rows) else 0
-    # If there are times, they show where another episode of the same name begins.
+    # Names are kept if no name returns later, or if rows of several episodes alternate. If the log has times, they show
+    # where another episode of the same name begins.
     if rows.time is not None or alternate or not returned:
         return names
     first: dict[int, int] = {}
@@ -219,7 +221,8 @@ def ticks_of(rows: Rows, episode: Ints, left_out: Mapping[int, str]) -> Ticks | 
     begins = np.concatenate([[True], ~same])
     moment = np.cumsum(begins) - 1
     at, of, size = time[begins], number[begins], np.bincount(moment)
-    # Times that are not the first or last of an episode, at which rows may be missing.
+    # Mask of the times that are neither the first nor the last of an episode. At a first or last time, rows may be
+    # missing.
     inner = np.zeros(len(size), dtype=np.bool_)
     inner[1:-1] = (of[1:-1] == of[:-2]) & (of[1:-1] == of[2:])
     within = of[1:] == of[:-1]

@@ -13,7 +13,8 @@ Numbering = Literal["rows", "episodes", "gaps"]
 
 FEWEST = 4  # in a log with fewer rows, the meaning of a column is not inferred from its cells
 MOST_TURNS = 0.5  # a column numbers episodes, or is a clock, if it changes or restarts in at most this share of rows
-EQUAL = 1e-6  # a column grows steadily, as a clock, if its increments differ by at most this share
+# A column grows steadily, as a clock, if its increments differ from their median by at most this share of the median.
+EQUAL = 1e-6
 
 
 def measured(cells: Cells) -> Floats | None:

@@ -14,8 +14,9 @@ MARKED = (
     (codecs.BOM_UTF16_BE, "utf-16"),
 )
 WINDOWS = "cp1252"
-SAMPLED = 4_096  # UTF-16 without a byte order mark is recognised by this many bytes at the start of a log
-MOST_ODD = 0.1  # in UTF-16, at most this share of the bytes that hold Latin letters are zero
+SAMPLED = 4_096  # this many bytes at the start of a log show whether it is UTF-16 without a byte order mark
+# In UTF-16, each Latin letter has a zero byte and another one. Less than this share of the other bytes may be zero.
+MOST_ODD = 0.1
 
 AS_CSV = "save the table as CSV"
 DECOMPRESS = "decompress it first"

@@ -22,12 +22,18 @@ KNOWN = {FULL_TURN: "radians", 360.0: "degrees", 400.0: "gon", 1.0: "turns", 24.
 FILLED = 0.8  # a column wraps only if its values cover at least this share of a full turn
 # A column wraps only if at most this share of its steps are jumps (more than half the column's width).
 MOST_JUMPS = 1 / 3
-CONTINUES = 4.0  # a jump plus a full turn may differ from the predicted change by this many standard deviations
-ROUGHLY = 0.1  # if the motion is not linear, a jump plus a full turn may differ by this share of a usual change
-OUTLIERS = 0.05  # a column wraps only if at most this share of its jumps contradicts the predicted change
-BY_CHANCE = 1e-3  # a column certainly wraps if its jumps match a full turn by chance with a smaller probability
-NEAR = 1e-3  # the size of the jumps may differ from a known full turn by this share of the turn
-FINEST = 1e-6  # the predicted change has a standard deviation of at least this share of the values' width
+# A column that wraps jumps by a full turn, apart from its predicted change. A jump may differ from a full turn plus the
+# predicted change by this many standard deviations of the prediction.
+CONTINUES = 4.0
+# If the motion is not linear, a jump may differ from a full turn plus the predicted change by this share of a usual
+# change.
+ROUGHLY = 0.1
+# A column wraps only if at most this share of its jumps differs by more from a full turn plus the predicted change.
+OUTLIERS = 0.05
+BY_CHANCE = 1e-3  # a column certainly wraps if the probability that its jumps equal full turns by chance is below this
+NEAR = 1e-3  # the median jump may differ from a known full turn, such as 360 degrees, by this share of the turn
+# The standard deviation of the prediction is taken to be at least this share of the width of the column's values.
+FINEST = 1e-6
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from surrogym_shared.spec import EnvironmentSpec, limits
 BEYOND = 20.0  # a log is refused if half of a column lies this many widths of the coordinate's range outside the range
 NARROW = 0.25  # if a log covers less than this share of a coordinate's range, the report notes it
 MOST_OUTSIDE = 0.1  # if more than this share of a log's rows lies outside a coordinate's range, the report notes it
-FEWEST = 8  # with fewer stored rewards, the rewards of a log are not compared with them
+FEWEST = 8  # if the surrogate has fewer rewards of real steps, the rewards of a log are not compared with them
 
 
 def require_units(q: Floats, spec: EnvironmentSpec, which: str = "") -> None:

@@ -12,7 +12,7 @@ from surrogym_shared.patterns import VISIBLE
 MAX_DIMENSIONS = 64
 MAX_TERM_PARTS = 64
 MAX_DISCRETE_ACTIONS = 4096
-MAX_INEQUALITIES = 16  # largest number of inequalities in a group (all must hold), and of groups
+MAX_INEQUALITIES = 16  # largest number of inequalities that must hold together (a group), and of groups
 MAX_ROLLOUT_QUERY = 4_096  # largest number of real steps of one query
 MAX_STARTS = 256
 REWARD = "reward"

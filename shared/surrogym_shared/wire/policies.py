@@ -21,7 +21,8 @@ AliasName = Annotated[str, Field(pattern=ALIAS)]
 Count = Annotated[int, Field(ge=0, le=2**53)]
 Text = Annotated[str, Field(max_length=2_000, pattern=VISIBLE)]
 
-FEWEST_TO_JUDGE = 30  # an evaluation with fewer episodes does not judge a policy's promise (interval of the return)
+# With fewer episodes, an evaluation does not judge a policy's promise (predicted interval of the mean return).
+FEWEST_TO_JUDGE = 30
 MAX_CURVE = 500
 MAX_EPISODES = 10_000
 MAX_TRACE = 10_000  # largest number of steps in a trace (record of one episode's states, actions and rewards)

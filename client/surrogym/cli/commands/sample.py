@@ -229,7 +229,8 @@ def _sample_here(
                 tell(Line(line_of(query, outcome, error), bool(error)))
 
         def ended(phase: Phase) -> None:
-            if not plan.settings.until_done:  # with --until-done, the command ends and prints its result instead
+            # With --until-done the sampler ends now, and the command prints its result.
+            if not plan.settings.until_done:
                 say(_words_of_end(plan.surrogate, phase), quiet=output.quiet)
 
         sampler = Sampler(api, plan.surrogate, environment, plan.settings, report, ended, approve)
@@ -237,7 +238,8 @@ def _sample_here(
             signal.signal(number, lambda *_: sampler.stop())
         with on_interrupt(lambda: _words_of_interruption(sampler.summary())), closing(environment):
             result = sampler.run()
-        result = replace(result, fallback_steps=sampler.summary().fallback_steps)  # with those while it closed
+        # The number now includes steps that the fallback controller took while the environment was closed.
+        result = replace(result, fallback_steps=sampler.summary().fallback_steps)
     output.give(asdict(result), lambda: _words(plan.surrogate, result))
     if result.phase == "failed":
         raise typer.Exit(1)

@@ -7,7 +7,7 @@ import time
 from surrogym_sampler.diagnosis.conformance.target import Target, answer
 from surrogym_sampler.diagnosis.outcomes import expect
 
-SHORT_LEASE = 0.3  # seconds of a lease that a check lets expire
+SHORT_LEASE = 0.3  # duration, in seconds, of a lease that a check lets expire
 
 
 def a_lease_is_renewed_by_its_token_alone(target: Target) -> None:

@@ -19,8 +19,8 @@ from surrogym_shared.spec import Fixed, limits
 PLACES = 3  # number of random states in a check
 SEEDS = 5
 WANDERING = 5  # number of random steps between two steps that are compared
-# A state with coordinates of this share of their ranges is tested. Python writes such a number with an exponent, which
-# the program must be able to read.
+# A test sets coordinates to this share of their ranges. Python writes so small a number with an exponent, which the
+# program must be able to read.
 TINY = 1e-6
 
 

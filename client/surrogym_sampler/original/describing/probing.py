@@ -23,7 +23,8 @@ EXACT = 1e-6  # a difference below this share of a variable's observed range cou
 # Setting a state works if a step after it differs from the one that an episode took there by at most this share of each
 # variable's observed range.
 SETTABLE = 1e-3
-FEW = 3.0  # two steps count as equal if they differ by at most this multiple of the noise measured in a few steps
+# Two steps count as equal if they differ by at most this multiple of the noise that repeated steps have shown.
+FEW = 3.0
 FARTHEST = 3.0  # largest distance by which a test shifts a position, in the simulator's unit
 TURN = 2 * np.pi
 PART = 1.0  # shift in radians, less than a turn, that must change something if a variable is an angle

@@ -101,7 +101,8 @@ class Ranges:
         if variable.motion == "speed":
             fastest = FASTER * max(abs(low), abs(high)) or UNKNOWN_SPEED
             return -fastest, fastest
-        # An object that no actuator drives is pushed by others. Its limits may be far from its usual positions.
+        # An object that no actuator drives moves only if others push it. Its limits may be far from where it usually
+        # is, so they are not used as its sampling range.
         pushed = variable.motion == "slide" and not variable.driven
         trusted = not pushed and (self._probed.stays or constant)
         if variable.low is not None and variable.high is not None and trusted:

@@ -36,7 +36,8 @@ COARSE = 10  # number of first steps of a bisection, which are far enough from t
 # To find a neighbour of a boundary point, one end of its bisection moves by this share of the states' range.
 NEAR = 0.02
 FLAT = 1e-3  # if a singular value is below this share of the largest one, more than one ellipsoid fits the points
-MOST = 5_000  # largest number of groups of terms in which a level or an ellipsoid is searched
+# At most this number of groups of terms is tested for a common value, or an ellipsoid, at the boundary of the reward.
+MOST = 5_000
 READS: dict[Timing, Callable[[Paid], Array]] = {"after": Paid.after, "before": Paid.before}
 
 # Function that takes steps from states (n, C) with actions (n, F), and returns those that don't end an episode.
@@ -276,7 +277,7 @@ def _ellipsoid(group: Sequence[Term], x: Array, elsewhere: Array) -> tuple[Quant
         return None
     if np.abs(others @ weights - 1).max() <= LEVEL:
         return None
-    scale = np.sqrt(a / (1 + (b**2 / (4 * a)).sum())) / reach  # (k,) 1 / r_i for the semi-axes r_i
+    scale = np.sqrt(a / (1 + (b**2 / (4 * a)).sum())) / reach  # (k,) inverse of each of the ellipsoid's k semi-axes
     centre = middle - reach * b / (2 * a)
     return tuple(
         Quantity(term=float(s) * (term + Term.constant(-float(c))))

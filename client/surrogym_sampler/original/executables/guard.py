@@ -6,7 +6,8 @@ import math
 import subprocess
 
 SHELL = "/bin/sh"
-# `read` returns when this process ends, which closes the pipe to the shell's input. $1: grace seconds, $0: the group.
+# `read` returns when this process ends, which closes the pipe to the shell's input. $1 is the time to wait in seconds,
+# $0 the id of the process group to kill.
 SCRIPT = 'read -r _; sleep "$1"; kill -s KILL -- "-$0"'
 
 

@@ -30,7 +30,8 @@ from surrogym_shared.spec.base import REWARD
 
 UNKNOWN_LIMITS = (-1.0, 1.0)  # assumed limits of an input that declares none
 SAME = 1e-9  # a variable counts as set if it is read back with at most this relative error
-# To test whether a variable can be set, its start is shifted by this share of the width of its limits (else, of 2).
+# To test whether a variable can be set, its start value is shifted by this share of the width of its limits, or of 2 if
+# it has no limits.
 SHIFT = 0.05
 MOTIONS: dict[str | None, Motion] = {"rad": "turn", "rad/s": "speed", "m/s": "speed"}
 

@@ -19,7 +19,8 @@ Value = bool | int | float | str
 Typed = tuple[str, int]  # FMI type and value reference of a variable
 Start = tuple[str, int, Value]  # FMI type, value reference and value to set before the FMU is initialised
 STATUS = {2: "discard", 3: "error", 4: "fatal", 5: "pending (it works asynchronously)"}
-SET_AS = {"Enumeration": {2: "Integer", 3: "Int64"}}  # FMI type whose calls serve for another type, by FMI version
+# The type, by FMI version, in the name of the FMI functions that get and set variables of another type.
+SET_AS = {"Enumeration": {2: "Integer", 3: "Int64"}}
 
 
 class Broken(Exception):

@@ -117,11 +117,15 @@ class Watchdog:
         self._guard = guard
         self._step = step
         self._changed = threading.Condition(threading.RLock())
-        self._due: float | None = None  # when the fallback controller acts next, if no action comes; None: no episode
+        # Time at which the fallback controller acts next, unless an action comes before; None if no episode runs.
+        self._due: float | None = None
         self._wanted = self._closed = False
         self._fallen = ""  # why the watchdog ended the episode; empty if it did not
-        self._steps = self._errors = 0  # steps of the fallback controller, and errors in a row during these steps
-        self.taken = 0  # number of the fallback's steps in all episodes that raised no error
+        # Number of steps of the fallback controller in this episode, and of its latest steps in a row that raised an
+        # error.
+        self._steps = self._errors = 0
+        # Number of the fallback controller's steps in all episodes; steps that raised an error are not counted.
+        self.taken = 0
         self._end = 0.0  # time at which the fallback controller stops, even if the machine still moves
         self._thread: threading.Thread | None = None
 
@@ -186,7 +190,7 @@ class Watchdog:
                     self._changed.wait()
                 elif (left := self._due - time.monotonic()) > 0:
                     self._changed.wait(left)
-                elif self._wanted:  # another thread calls the environment, and waits for this one
+                elif self._wanted:  # another thread is about to call the environment, so the fallback waits for it
                     self._changed.wait(self._period)
                 else:
                     self._fall(reason)

@@ -73,7 +73,7 @@ class GuardedRollouts:
     the machine to rest, and the episode ends. Returned steps have the action that was applied.
     """
 
-    keeps_rates = True  # by the environment that it wraps
+    keeps_rates = True  # the wrapped environment keeps actions within the declared rates
 
     def __init__(self, environment: RolloutEnvironment, program: Program | None = None) -> None:
         self._environment: Any = environment  # Any, because the methods save, restore and resume are optional

@@ -47,7 +47,8 @@ RANGES = {  # Allowed range of each setting; settings with integer bounds must b
     "max_grad_norm": (0.0, 1e6),
 }
 
-CYCLES = 3  # the suggested number of steps makes this number of cycles of the stage ``learn``
+# The suggested number of virtual steps is divided into this number of training cycles in the stage ``learn``.
+CYCLES = 3
 LEARNING = 2  # the stage ``learn`` takes at most this multiple of the suggested number of steps
 REFINING = 1 / 2  # the stage ``refine`` takes this share of the steps of a cycle of the stage ``learn``
 PATIENT_ROLLOUTS = 32  # a network that has learned nothing is replaced after this number of rollouts at the earliest
