@@ -75,7 +75,8 @@ def _stream(request: Request, lines: AsyncIterator[str]) -> StreamingResponse:
     streams.require_room(request)
 
     async def counted() -> AsyncIterator[str]:
-        with streams.count(request):  # here in the generator, so that a stream counts only after it has begun
+        # Counted inside the generator, so that a stream counts only once its reply has begun.
+        with streams.count(request):
             yield CONNECTED
             async for text in lines:
                 yield text

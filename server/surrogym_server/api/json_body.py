@@ -17,7 +17,7 @@ from surrogym_shared import frames
 M = TypeVar("M", bound=BaseModel)
 
 JSON = "application/json"
-LONG = 16 * 1024  # before a body with more bytes, which takes over 0.5 ms to parse, other requests run
+LONG = 16 * 1024  # parsing a longer body, in bytes, takes over 0.5 ms; other requests may run before it
 DEEPEST = 200  # largest number of nested levels that the parser jiter accepts
 MOST_FIELDS = 64  # largest number of top-level fields of a body, because the error names each unknown one
 SCHEMAS = "#/components/schemas/{model}"

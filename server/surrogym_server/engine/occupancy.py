@@ -25,7 +25,8 @@ class Reservoir:
     states: Array = field(
         default_factory=lambda: np.zeros((0, 0))
     )  # (m, C) coordinates of m visited states: the sample
-    priority: Array = field(default_factory=lambda: np.zeros(0))  # (m,) random priority of each state in the sample
+    # (m,) random priority of each sampled state; the sample keeps the states with the highest ones.
+    priority: Array = field(default_factory=lambda: np.zeros(0))
 
     def visit(self, states: Array) -> Reservoir:
         """Return a reservoir that also takes into account n further visits to ``states`` (n, C), in order."""

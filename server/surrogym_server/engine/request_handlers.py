@@ -165,7 +165,8 @@ def fingerprint_of(request: Advance) -> Fingerprint:
             return Fingerprint("reset", request.seed, request.mask)
         case Rollout():
             return Fingerprint("rollout", _columns(request.actions, 3))
-        case PolicySteps():  # hashed now: a hash on first use would keep the policy's weights in memory until then
+        case PolicySteps():
+            # The hash is computed at once. A hash on first use would keep the policy's weights in memory until then.
             return Fingerprint(digest=digest_of("policy", *parts_of(request.run)))
         case _:
             assert_never(request)

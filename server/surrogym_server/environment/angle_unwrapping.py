@@ -13,12 +13,17 @@ from torch import Tensor
 from surrogym_server.environment.definition import EnvironmentDefinition, wrap
 from surrogym_server.environment.distributions import scaling
 
-POINTS_A_WEIGHT = 3  # angles are unwrapped only if there are this many steps for each weight of the regression
-MAX_TURNS = 3  # the search for missing turns starts from slopes of up to this many full turns of an angle in one step
-STARTS_A_TURN = 8  # the search for missing turns has this many start slopes per full turn, on each side of zero
-ROUNDS = 10  # the search for missing turns makes this many iterations from each start slope
-# Full turns are added to an angle's increments only if the sum of squared residuals falls below this share of its value
-# without them.
+# Full turns are added to an angle's increments only if there are this many steps for each weight of the regression of
+# the increments on the speeds.
+POINTS_A_WEIGHT = 3
+# The search for full turns starts from linear functions of a speed that reach up to this many turns in a step.
+MAX_TURNS = 3
+# For each full turn of MAX_TURNS, the search has this many start functions of a speed, and as many of its negative.
+STARTS_A_TURN = 8
+# Number of iterations of the search from each start; each chooses the full turns and fits a linear function.
+ROUNDS = 10
+# Full turns are added to an angle's increments only if they reduce the sum of squared residuals of the regression to
+# less than this share.
 CLEARLY = 0.25
 
 

@@ -20,7 +20,8 @@ from surrogym_server.gp.sparse import hardest
 from surrogym_server.gp.subsets import FEW, SOME, spread
 
 NOISY = 1e-2  # noise variance at which the search of ``noisy_explanation`` starts, as a share of the output's variance
-# A fit to more points that starts at an earlier result also tries the default start, but in one of four fits only.
+# With more points, a fit that starts at an earlier result also tries the default start only if the number of points is
+# a multiple of 4.
 MANY_POINTS = 24
 # Stages of ``refine``: each is (greatest number of points, greatest number of iterations). Each stage starts near the
 # optimum, so few iterations suffice.

@@ -19,10 +19,10 @@ from surrogym_server.gp.posterior import Posterior
 from surrogym_server.gp.search import Evidence, blas, minimum
 
 BURN_IN, THINNING = 30, 10  # the first 30 updates of the chain are discarded, then every tenth is a sample
-# If less noise is allowed than was fitted, one search starts at each of these: the logarithms of the fitted length
-# scales less this number.
+# If samples may have less noise than the fit, the likeliest hyperparameters with less noise are searched for. One
+# search starts at the logarithms of the fitted length scales less each of these numbers.
 SHORTER = (0.0, 1.0, 2.0)
-# An update leaves theta unchanged if its interval of rotation angles becomes narrower than this, in radians.
+# Elliptical slice sampling leaves theta unchanged if its interval of angles becomes narrower than this, in radians.
 NARROWEST = 1e-6
 
 Array = NDArray[np.float64]

@@ -60,7 +60,7 @@ class Evaluated:
 
     value: float
     slopes: Array  # gradient of ``value`` with respect to theta
-    half: Array  # (P,) entries (i, j) of 1/2 (beta beta^T - K^-1) with i >= j; those off the diagonal are doubled
+    half: Array  # (P,) entries (i, j), i >= j, of 1/2 (beta beta^T - K^-1) for P pairs of points; doubled if i > j
     weighted: Array  # (1, P), or (2, P) with a reflection: product of ``half`` and the squared exponential
     weights: Array  # (n,) beta = K^-1 y
 
@@ -83,8 +83,8 @@ class Evidence(Parameters):
         self.twice = np.where(self.rows == self.columns, 1.0, 2.0)
         mirrored = [] if reflection is None else [x * reflection.signs]
         differences = [other.numpy()[self.columns] - x.numpy()[self.rows] for other in (x, *mirrored)]
-        # Squared differences between the two points of each pair, (d, P). With a reflection, those between a point and
-        # a mirror image follow, (d, 2 P).
+        # (d, P) squared differences of the d inputs between the points of each of P pairs. With a reflection, the
+        # squared differences between a point and the mirror image of another follow, (d, 2 P).
         self.squared = np.ascontiguousarray(np.concatenate(differences).T ** 2)
         self.parity = 0 if reflection is None else reflection.parity
         self.linear = self._pairs(Polynomial.of(1.0, 0.0, reflection, x)(x, x))

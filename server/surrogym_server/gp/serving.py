@@ -29,11 +29,11 @@ from surrogym_server.tensors import CPU, in_blocks
 
 BLOCK = 262_144  # greatest number of covariances computed at once, so that they fit into the processor's cache
 MIN_ROWS = 64  # inputs are predicted in blocks of at least this many rows, even if their covariances exceed ``BLOCK``
-# Exponents are computed from differences, not by matrix products, if products could cause a rounding error of the mean
-# above this share of the prior standard deviation.
+# Exponents of the kernel are computed from differences of inputs, not by matrix products, if products could cause a
+# rounding error of the mean above this share of the prior standard deviation.
 MEAN_TOLERANCE = 1e-8
-# Exponents are also computed from differences if products could cause a rounding error of the variance above this share
-# of the prior variance.
+# Exponents of the kernel are also computed from differences of inputs if products could cause a rounding error of the
+# variance above this share of the prior variance.
 VARIANCE_TOLERANCE = 5e-10
 
 
@@ -62,11 +62,14 @@ class _Process:
     inverse_lengthscale: Tensor  # (d,) 1 / lengthscale
     scaled: Tensor  # (n, d) points divided by length scales; with a reflection also their mirror images, (2 n, d)
     factor: Tensor  # (n, n) lower Cholesky factor L, divided by sigma_f^2
-    polynomial: Tensor | None  # (D, n) coefficients R of the polynomial covariances, divided by sigma_f^2
-    prior: Tensor  # (D,) coefficients of z^2 in the prior variance, without the part that comes from the mirror image
+    # (D, n) factors of the D entries of z = [x, x^2, 1] in the polynomial covariances with n points, over sigma_f^2.
+    polynomial: Tensor | None
+    # (D,) factors of the squares of z = [x, x^2, 1] in the prior variance, without the part of the mirror image.
+    prior: Tensor
     signal_variance: float
     parity: int  # 1 for even functions, -1 for odd functions, 0 without a reflection
-    # (D,) coefficients of z in the exponent of the squared exponential between x and its mirror image.
+    # (D,) factors of z = [x, x^2, 1], which has D entries, in the exponent of the squared exponential between x and its
+    # mirror image.
     mirror: Tensor | None
     scale: float
     mean_by_differences: bool
@@ -111,9 +114,11 @@ class Serving:
     """Outputs of a model, arranged so that few matrix products predict all of them at inputs x (m, width), each of the
     m points with the ``width`` inputs of the model. A prediction (m, O) has O columns, 0 where there is no output."""
 
-    exponents: Tensor  # A (D, S), coefficients of the exponents for the S points of all processes
-    weights: Tensor  # W (S, O), weights of the points in the means, multiplied by the outputs' scales
-    polynomials: Tensor  # Q (D, O), coefficients of the polynomial parts of the means, in the outputs' units
+    # A (D, S): factors of the D entries of z = [x, x^2, 1] in the kernel's exponents for S points of all processes.
+    exponents: Tensor
+    weights: Tensor  # W (S, O): weights of the S points in the means of O outputs, multiplied by the outputs' scales
+    # Q (D, O): factors of z = [x, x^2, 1] in the polynomial parts of the means of O outputs, in their units.
+    polynomials: Tensor
     processes: dict[int, _Process]  # process of each output column; constant outputs have none
 
     @classmethod

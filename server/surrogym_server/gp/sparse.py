@@ -135,7 +135,8 @@ def _with_noises(hyper: Hyperparameters, x: Tensor, y: Tensor) -> Iterator[Poste
 
 def _projected(hyper: Hyperparameters, x: Tensor, y: Tensor, pivots: tuple[Tensor, Tensor, Tensor]) -> Posterior:
     """Return the process of x (n, d) and y (n,) through inducing points; ``pivots`` is the result of ``_pivots``."""
-    points, v, left = pivots  # indices (m,), V (m, n), remaining variances (n,)
+    # Pivoted Cholesky: indices of m inducing points (m,), factor V (m, n), variances that V does not explain (n,).
+    points, v, left = pivots
     inducing = x[points]
     lower = v[:, points].T.tril()
     noise = hyper.noise_variance

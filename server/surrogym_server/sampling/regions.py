@@ -17,7 +17,9 @@ from torch import Tensor
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.points import Points
 
-LEAST_GAIN = 0.5  # least difference between a region's share of the model uncertainty and its share of the points
+# A region is reported only if its share of the total model uncertainty exceeds its share of the points by at least
+# this.
+LEAST_GAIN = 0.5
 LEAST_DOUBT = 1e-12  # if the mean model uncertainty is below this, no region is searched for
 
 

@@ -33,9 +33,10 @@ MOST = 256  # greatest number of samples in the test for sensor noise, whose tim
 CRITICAL = 5.41  # upper 2 % point of chi-squared with one degree of freedom: the one-sided test has level 1 %
 MAINLY = 0.5  # if at least this share of the noise comes from the sensor, it counts as sensor noise
 SHARES = torch.linspace(0, 1, 21, dtype=torch.float64)  # shares of the noise that are tried as noise of the sensor
-FACTORS = torch.logspace(-0.6, 0.6, 9, dtype=torch.float64)  # factors c of the learned noise variance that are tried
-# Safety factor for the noise in an output that measurement errors at the start of a step cause, because it is computed
-# with derivatives of the model, which has errors.
+# The learned noise variance is tried times each of these factors c.
+FACTORS = torch.logspace(-0.6, 0.6, 9, dtype=torch.float64)
+# Measurement errors at the start of a step cause noise in the predicted output. This noise is computed with derivatives
+# of the model, which has errors, so its standard deviation is multiplied by this safety factor.
 CARRIED = 1.25
 DIFFERENCE = 1e-4  # step of the numerical derivatives with respect to a coordinate, as a share of its sampling range
 

@@ -36,7 +36,8 @@ class EventService:
         self._storage = storage
         self._notices = notices
         self._turn = asyncio.Semaphore(READING)
-        # The last page of each surrogate by name, with (id after which it begins, number of the notice before it).
+        # For each surrogate, by name: the page of events that was read last, for all streams that need it; and (id of
+        # the event after which it begins, number of the latest notice when it was read).
         self._shared: dict[str, tuple[tuple[int, int], asyncio.Task[Page]]] = {}
 
     async def newest(self, name: str) -> int:

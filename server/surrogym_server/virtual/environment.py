@@ -55,7 +55,8 @@ class VirtualSettings:
     # An episode is truncated if the predicted standard deviation of any output exceeds this multiple of the output's
     # standard deviation over the samples. None: no episode is truncated for this reason.
     trust: float | None = None
-    caution: float = 0.0  # each reward is reduced by this multiple of the doubt about the step, see ``_doubted``
+    # Each reward is reduced by this times the largest relative standard deviation of an output (see ``_doubted``).
+    caution: float = 0.0
     compiled: bool = False  # whether steps use the model's compiled code; decided when the session opens
     # (k, C) the coordinates of k real steps; the share ``start_visited`` of the episodes starts at one of these states.
     visited: Tensor | None = field(default=None, compare=False, repr=False)

@@ -19,7 +19,7 @@ from surrogym_server.models.port import DynamicsModel
 from surrogym_server.virtual.dynamics import Moved
 from surrogym_server.virtual.lanes import LaneState
 
-FARTHEST = 3.0  # standardised inputs of a residual are clipped to this absolute value
+FARTHEST = 3.0  # standardised inputs of a model's systematic error are clipped to this absolute value
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Residual:
 
     centre: tuple[float, ...]  # (P,) mean of each of the P inputs, which is subtracted to standardise the input
     scale: tuple[float, ...]  # (P,) standard deviation of each of the P inputs, by which the centred input is divided
-    # (K, O, 1 + P) a constant and P slopes for each of O outputs, in each of K sets of functions.
+    # (K, O, 1 + P) K sets of errors: for each of O outputs, a constant, and a factor for each of P standardised inputs.
     weights: tuple[tuple[tuple[float, ...], ...], ...]
 
     @classmethod

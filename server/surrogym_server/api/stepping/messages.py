@@ -54,7 +54,7 @@ class PromptMessages(WebSocketsSansIOProtocol):
     _answer: Prompt | None = None
     _oversized = False  # whether a frame is too large; uvicorn refuses it, and the following bytes belong to it
     _waiting = False  # whether the app waits for the next message
-    _counted = 0  # bytes of this connection's unfinished message, which ``_together`` includes
+    _counted = 0  # bytes of this connection's unfinished message; ``_together`` sums them over all connections
     _timer: asyncio.TimerHandle | None = None
 
     def __init__(self, *arguments: Any, **named: Any) -> None:

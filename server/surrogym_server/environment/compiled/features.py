@@ -18,8 +18,9 @@ from surrogym_shared.compiled.jit import compiled
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-# An encoder has two matrices in the tables, at these offsets from the first. ROWS: for each feature, the code of its
-# function, the entry that it reads, centre, scale and rate. WEIGHTS: for each feature, a weight for each coordinate.
+# Compiled code reads an encoder as two matrices. These are their offsets from the first one. ROWS: for each feature,
+# the code of its function, the index of the value that it reads, centre, scale and rate. WEIGHTS: for each feature, a
+# weight for each coordinate.
 ROWS, WEIGHTS = range(2)
 FUNCTIONS = ("affine", "cos", "sin", "turned_cos", "turned_sin", "wrapped", "equal", "observed", "grown")
 CODES = {function: code for code, function in enumerate(FUNCTIONS)}

@@ -16,9 +16,9 @@ Ints = NDArray[np.int64]
 
 SHAPES = {"one": 0, "linear": 1, "absolute": 2, "square": 3, "bump": 4, "ball": 5}
 ONE, LINEAR, ABSOLUTE, SQUARE, BUMP, BALL = SHAPES.values()
-# A declared reward has three matrices in the tables, at these offsets from the first. HEAD: the indices of its
-# quantities' terms and of its conditions. WEIGHTS: weights (F, X) of F action entries in X quantities. TERMS: a row
-# (weight, code of the shape, number of quantities) for each reward term.
+# Compiled code reads a declared reward as three matrices. These are their offsets from the first one. HEAD: the indices
+# of its quantities' terms and of its conditions. WEIGHTS: weights (F, X) of F action entries in X quantities. TERMS: a
+# row (weight, code of the shape, number of quantities) for each reward term.
 HEAD, WEIGHTS, TERMS = range(3)
 
 

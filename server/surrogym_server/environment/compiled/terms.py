@@ -14,10 +14,10 @@ from surrogym_shared.compiled.jit import compiled
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-# A ``TermSet`` has four matrices in the tables, at these offsets from the first.
+# Compiled code reads a ``TermSet`` as four matrices. These are their offsets from the first one.
 CONSTANT, FREQUENCIES, COEFFICIENTS, LIMITS = range(4)
-# Conditions have two matrices in the tables, at these offsets from the first. TERMS: the index of their term set, and
-# the number of groups. RULES: a row (sign, threshold, group) for each inequality.
+# Compiled code reads conditions as two matrices. These are their offsets from the first one. TERMS: the index of their
+# term set, and the number of groups. RULES: a row (sign, threshold, group) for each inequality.
 TERMS, RULES = range(2)
 
 

@@ -65,7 +65,8 @@ class RecordedEngine(SessionEngine):
         self._surroundings = surroundings
         self._opening = OpeningLocks()
         self._taking = asyncio.Lock()
-        self._behind: dict[str, int] = {}  # sequence number up to which the client of a taken-over session must repeat
+        # By session that another process has taken over: number of the last request that its client has to send again.
+        self._behind: dict[str, int] = {}
         self._tasks: list[asyncio.Task[None]] = []
 
     async def open(self, request: Open) -> SessionInfo:

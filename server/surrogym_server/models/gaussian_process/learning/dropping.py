@@ -45,7 +45,8 @@ def without_inputs(
     if posterior.sparse is not None:
         x = inputs_of(output, inputs)[used]
         y = output.standardised(target[used], x)
-        if posterior.points != len(x):  # the process has also learned from samples at limits, which ``used`` lacks
+        # The process also learned from samples at limits; ``used`` lacks them, so no input can be tested.
+        if posterior.points != len(x):
             return output
     try:
         if posterior.sparse is not None and (is_noisy(posterior.hyper) or not loses_nothing(posterior)):

@@ -36,11 +36,11 @@ WIDER = " past limits"
 # output's name.
 HELD = " held"
 SHORT = 0.01  # a prediction may fall short of a reached limit by this many standard deviations of the targets
-ROUNDS = 3  # a process is fitted at most this often with further samples at limits that it contradicts
+ROUNDS = 3  # a process is fitted again at most this often, each time with further samples at limits that it contradicts
 # Samples at limits are discarded if they increase the misfit by more than this factor. The factor is large because few
 # samples measure the misfit only roughly.
 WORSE = 10.0
-MOST = 200  # before each such fit, at most this many samples become observations of their limit
+MOST = 200  # at most this many samples at limits are added to a fit, as observations of their limit
 
 
 def past_limits(

@@ -42,8 +42,8 @@ EPS = 4 * torch.finfo(torch.float64).eps  # a reward within this share of the ba
 # Explanations are compared by the probability of an interval around each reward, whose half width is this share of the
 # largest distance of a reward from the base.
 RESOLUTION = 1e-3
-# The process of the logarithms is used only if its log odds against targets that don't depend on the inputs are at
-# least this, unless the spread of the heights alone decides.
+# The logarithms of the heights are used only if the log odds of their process, against targets that don't depend on the
+# inputs, are at least this. Heights that spread over DECADES are used in any case.
 GAIN = 3.0
 
 
@@ -183,7 +183,9 @@ def _agreement(output: OutputModel, reward: Tensor, inputs: Mapping[FeatureMap, 
     assert posterior is not None
     if posterior.sparse is None:
         mean, variance = posterior.leave_one_out()
-    else:  # a process with inducing points has so many points that each hardly influences its own prediction
+    else:
+        # With inducing points there are many points; none needs to be left out, as each has little influence on its
+        # prediction.
         mean, latent = posterior.mean_and_variance(inputs[output.feature_map][going])
         variance = latent + posterior.hyper.noise_variance
     centre, spread = output.centre + output.scale * mean, output.scale * variance.sqrt()

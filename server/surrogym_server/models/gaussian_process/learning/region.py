@@ -60,7 +60,9 @@ def _classifier(learner: OutputLearner, name: str, q: Tensor, inside: Tensor) ->
         return Classifier(definition, process), 0.0
     if process.posterior.sparse is None:
         mean, variance = process.posterior.leave_one_out()
-    else:  # a process with inducing points has so many points that each hardly influences its own prediction
+    else:
+        # With inducing points there are many points; none needs to be left out, as each has little influence on its
+        # prediction.
         mean, latent = process.posterior.mean_and_variance(inputs[process.feature_map])
         variance = latent + process.posterior.hyper.noise_variance
     probability = likely(process.centre + process.scale * mean, process.scale * variance.sqrt())

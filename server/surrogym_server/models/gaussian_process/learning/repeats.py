@@ -26,7 +26,8 @@ class _Candidate:
     place: int  # index of the output in the model
     output: OutputModel
     part: Part
-    every: tuple[int, ...]  # for each input of ``part``, its index among all features of the map, also ignored ones
+    # For each input of ``part``, its index among all features of the output's feature map, ignored features included.
+    every: tuple[int, ...]
 
 
 def with_samples_of_others(learner: OutputLearner, outputs: Sequence[OutputModel]) -> tuple[OutputModel, ...]:
