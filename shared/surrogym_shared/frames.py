@@ -357,9 +357,8 @@ def policy_reply(seq: int, result: PolicyRollout) -> PolicyReply:
         terminated=_flat(result.terminated, BOOL),
         truncated=_flat(result.truncated, BOOL),
         model_version=_flat(versions[0] if (versions == versions[0]).all() else versions, INT64),
-        reward_mean=None
-        if mean.tobytes() == reward.tobytes()
-        else mean,  # left out if equal to ``reward``; bytes are compared, as 0.0 == -0.0
+        # Left out if equal to ``reward``. Bytes are compared, because 0.0 == -0.0 as numbers.
+        reward_mean=None if mean.tobytes() == reward.tobytes() else mean,
         final_steps=_flat(result.final_steps, INT64) if has_ends else None,
         final_lanes=_flat(result.final_lanes, INT64) if has_ends else None,
         final_observation=_flat(result.final_observation, FLOAT32) if has_ends else None,

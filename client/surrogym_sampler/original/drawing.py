@@ -28,9 +28,8 @@ class Canvas:
         self._frame: Frame = np.full((height, width, 3), WHITE)
         self._scale = scale
         self._x = (np.arange(width) + 0.5 - width / 2) / scale  # horizontal position of each pixel column (width,)
-        self._y = (height / 2 - np.arange(height) - 0.5)[
-            :, None
-        ] / scale  # vertical position of each pixel row (height, 1)
+        # Vertical position of each pixel row (height, 1).
+        self._y = (height / 2 - np.arange(height) - 0.5)[:, None] / scale
 
     def stroke(self, start: Point, end: Point, thickness: float, colour: Colour) -> None:
         """Draw a line with round ends; if both ends are the same point, a disc."""

@@ -7,8 +7,8 @@ from math import isclose
 from surrogym_sampler.original.errors import UnknownEnvironment
 from surrogym_shared.spec import EnvironmentSpec
 
-NAMES = ("sampling_period", "dt")  # names of attributes and of entries of `metadata` that contain the period
-CLOSE = 1e-3  # relative difference of periods that count as equal
+NAMES = ("sampling_period", "dt")  # names of attributes, and of entries of `metadata`, that give the sampling period
+CLOSE = 1e-3  # sampling periods with at most this relative difference count as equal
 
 
 def period_of(environment: object) -> float | None:

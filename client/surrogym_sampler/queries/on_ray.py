@@ -22,7 +22,7 @@ from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import Query
 
 IDLE_SECONDS = 5.0  # longest wait of a claim for queries; a sampler can stop only between claims
-LOOK_SECONDS = 1.0  # seconds between two checks of the samplers
+LOOK_SECONDS = 1.0  # seconds between two checks of whether samplers have ended, and of what they report
 STOP_SECONDS = 15.0  # seconds, in addition to the limit of a step, in which stopped samplers have to end
 NO_MODULE = "No module named "
 WITHOUT_CODE = (

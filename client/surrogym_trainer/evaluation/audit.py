@@ -22,11 +22,11 @@ from surrogym_trainer.policies.evidence import Audit, Promise
 
 AUDIT_STEPS = 8
 MOST_STEPS = 40  # while the result of an audit is undecided, further steps are added up to this number in all
-ALARM = 0.01  # probability that the sizes of the output errors fail the test although the model is right
+ALARM = 0.01  # probability that an audit fails a right model because of the sizes of its errors
 # probability that a right model ever fails the test for errors that all steps share, however many steps are taken
 SHIFT_ALARM = 0.05
-# if shared errors move the return out of the promised interval with more than this probability, an audit takes more
-# steps and widens the interval
+# if errors that all steps share move the return out of the promised interval with more than this probability, an audit
+# takes more steps and widens the interval
 UNDECIDED = 0.05
 # an audit fails if the model wrongly predicted, in at least this number of steps, whether the step ends its episode
 MISPLACED_ENDS = 2

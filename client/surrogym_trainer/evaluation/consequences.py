@@ -23,7 +23,7 @@ from surrogym_trainer.policies.predict import Predict
 # If all steps of an audit share an error, its effect on the return is computed for this number of errors, which are
 # drawn from the error's posterior distribution.
 DRAWS = 64
-STARTS = 4  # for each drawn error, the return is the mean over this number of virtual episodes
+STARTS = 4  # to see the effect of one error of the model, the return is the mean over this number of virtual episodes
 # an output is reported only if the probability that its errors have a part that all steps share exceeds this
 CERTAIN = 0.9
 # for the reported effect of one output's errors, the return is the mean over this number of virtual episodes

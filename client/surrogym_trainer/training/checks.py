@@ -43,11 +43,11 @@ class Checks:
         self.latest: float | None = None  # mean return of the policy in the last check (imagined return)
         self.returns_of_best: Returns | None = None  # (episodes,) returns of the best policy so far
         self._half_way = self.untrained if saved is None else (self.untrained + float(saved.mean())) / 2
-        # return that the best quarter of the episodes of a check reaches: with an untrained network (few), and the
-        # highest so far (many)
+        # ``_few``: return that the best quarter of the episodes of an untrained network reach or exceed. ``_many``: the
+        # highest such return of all checks so far.
         self._few = self._many = _of_many(untrained)
-        self._seen = self.untrained  # highest return of a training episode
-        self._most = float(untrained.max())  # highest return of an episode of a check
+        self._seen = self.untrained  # highest return of a training episode so far
+        self._most = float(untrained.max())  # highest return of an episode of a check so far
         self._full = 0  # number of checks in a row in which every episode had the highest return so far
 
     @property

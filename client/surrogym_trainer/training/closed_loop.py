@@ -25,7 +25,7 @@ from surrogym_trainer.training.settings import (
 )
 from surrogym_trainer.training.trainer import train
 
-ROUND_SHARE = 0.25  # each round before the last training takes at most this share of its virtual steps
+ROUND_SHARE = 0.25  # each round before the last training takes at most this share of the last training's virtual steps
 VISIT_LANES = 32
 VISIT_STEPS = 1_000  # a round collects visited states in at most this number of steps of each virtual environment
 

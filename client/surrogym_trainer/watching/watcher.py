@@ -28,8 +28,8 @@ from surrogym_trainer.watching.detector import FALSE_ALARM_STEPS, Detector
 BATCH = 500  # largest number of real steps that one request to the server contains
 KEPT = 2_000  # a drift is described from at most this number of latest steps
 QUARTERS = ("lowest", "second", "third", "highest")
-# if a quarter of an input's range adds more than this to the relative entropy (nats) between errors and visits, the
-# errors are concentrated in it
+# errors count as concentrated in a quarter of an input's range if the quarter adds more than this to the relative
+# entropy (in nats) of the squared errors' distribution over the quarters to that of the steps
 TELLING = 0.1
 
 Array = NDArray[np.float64]
@@ -42,7 +42,7 @@ class Region(NamedTuple):
     low: float
     high: float
     quarter: str
-    share: float  # sum of the squared errors in this quarter, as a share of the sum over the whole range
+    share: float  # sum of the squared errors in this quarter of the input's range, as a share of the sum over the range
 
     def words(self) -> str:
         return (

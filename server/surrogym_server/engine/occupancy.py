@@ -22,9 +22,8 @@ class Reservoir:
 
     seed: int
     visits: int = 0  # number of states that the session has visited so far, each visit counted
-    states: Array = field(
-        default_factory=lambda: np.zeros((0, 0))
-    )  # (m, C) coordinates of m visited states: the sample
+    # (m, C) coordinates of the m sampled ones of the visited states.
+    states: Array = field(default_factory=lambda: np.zeros((0, 0)))
     # (m,) random priority of each sampled state; the sample keeps the states with the highest ones.
     priority: Array = field(default_factory=lambda: np.zeros(0))
 

@@ -256,13 +256,13 @@ class Bound(Parameters):
         inner.flat[:: m + 1] += JITTER * prior / n
         if (lower := _factor(inner)) is None:
             return 1e10, np.zeros_like(theta)
-        v = _solve_lower(lower, k)  # the matrix V of the equations in the module's docstring
+        v = _solve_lower(lower, k)  # V = L^-1 K_uf in the module's docstring
         square = v @ v.T
         s = square.copy()
         s.flat[:: m + 1] += noise
         if (root := _factor(s)) is None:
             return 1e10, np.zeros_like(theta)
-        # The vector a of the equations in the module's docstring.
+        # a = S^-1 V y in the module's docstring.
         weights = scipy.linalg.cho_solve((root, True), v @ self.y, check_finite=False)
         inverse = scipy.linalg.cho_solve((root, True), np.eye(m), check_finite=False)
         alpha = (self.y - weights @ v) / noise
@@ -277,9 +277,8 @@ class Bound(Parameters):
         within = np.outer(weights, weights) + s / noise - 2 * np.eye(m) + noise * inverse
         within = -0.5 * back @ within @ back.T
         outer[:, self.inducing_rows] += within
-        each = (
-            -0.5 / noise + JITTER * float(within.trace()) / n
-        )  # derivative with respect to each diagonal entry of K_ff
+        # Derivative of the bound with respect to each diagonal entry of K_ff.
+        each = -0.5 / noise + JITTER * float(within.trace()) / n
         gradient = self._gradient(theta, covariances, outer, each)
         freedom = n - m + noise * float(inverse.trace())
         gradient[-1] = 0.5 * (noise * float(alpha @ alpha) - freedom + left / noise)

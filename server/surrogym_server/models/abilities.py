@@ -156,8 +156,8 @@ class AtSamples:
     """Values of one output at those k samples from which it is learned, and the prior covariance of its function there,
     in the output's unit."""
 
-    rows: Tensor  # (k,) indices of these samples among all samples
-    targets: Tensor  # (k,) values of the output less their mean
+    rows: Tensor  # (k,) indices, among all samples, of the k samples from which the output is learned
+    targets: Tensor  # (k,) the output at each of these k samples, less the mean
     covariance: Tensor  # (k, k) prior covariance of the function at the samples, without noise
     noise_variance: float
 

@@ -99,9 +99,8 @@ def judge_model(
         peak = highest(model, samples, candidates.points, widened[-1], rng)
     if peak is not None:
         settled = False
-        if (
-            candidates.reserved is None or state.round % 2
-        ):  # if both ends of episodes and a peak of the reward need queries, rounds serve them alternately
+        # If both ends of episodes and a peak of the reward need queries, even rounds query ends, odd rounds the peak.
+        if candidates.reserved is None or state.round % 2:
             candidates = with_reserved(candidates, peak)
     verdict = judge(definition, confidences, widened, len(samples), request, settled)
     return Judgement(confidences, widened, verdict, candidates)

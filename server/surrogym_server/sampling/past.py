@@ -26,7 +26,8 @@ from surrogym_server.environment.samples import Samples, increments, preceding
 from surrogym_server.models.abilities import AtSamples, LeaveOneOut, SampledFunctions, offers
 from surrogym_server.models.port import DynamicsModel
 
-EXPLAINED = 0.5  # earlier steps count as a cause only if they explain at least this share of the squared error
+# Earlier steps count as a cause of the model's errors only if they explain at least this share of the squared errors.
+EXPLAINED = 0.5
 PAIRS = 3  # a regression needs at least this many pairs of consecutive steps for each of its coefficients
 DEPTHS = (1, 3)  # numbers of earlier actions that the regressions include; a dead time of more steps is not found
 MOST = 400  # greatest number of samples in the test, because its time grows with their third power

@@ -51,7 +51,7 @@ class VirtualSettings:
     residual: Residual | None = None  # systematic errors that are added to each prediction; None adds nothing
     process_noise: bool = False  # whether random noise of the learned size (w of eq. 2) is added to each next state
     sensor_noise: SensorNoise = ()  # measurement noise added to observed coordinates; it does not change the state
-    reward_limits: tuple[float, float] | None = None  # lowest and highest mean reward of a step; None: no limits
+    reward_limits: tuple[float, float] | None = None  # mean rewards are limited to this range; None: no limits
     # An episode is truncated if the predicted standard deviation of any output exceeds this multiple of the output's
     # standard deviation over the samples. None: no episode is truncated for this reason.
     trust: float | None = None

@@ -52,7 +52,7 @@ EXPECTED = {
 }
 SHOWN = 60  # a message shows at most this many characters of a wrong value
 LONGEST = 64  # largest number of characters of a coordinate's name
-MOST = 1_000  # largest number of columns that a mapping may name for one role
+MOST = 1_000  # largest number of columns that a mapping may name for one role, such as state or action
 
 Choices = Annotated[list[float], Field(min_length=2, max_length=MOST)]
 Limits = Annotated[list[float | None], Field(min_length=2, max_length=2)]

@@ -44,8 +44,8 @@ WITHIN = "it numbers the rows of each episode"
 LONGEST_HINT = 600  # a message proposes a mapping only if the mapping has at most this many characters
 
 Shown = Callable[[Cells], bool]
-# For each role: words in a column's name that make the role likely, whole names that do, and a test that the column's
-# cells have to pass.
+# For each role of a column, such as reward: words in the column's name that make the role likely, whole names that do,
+# and a test that the column's cells have to pass.
 LIKELY: dict[str, tuple[set[str], set[str], Shown]] = {
     "reward": (
         {"reward", "rewards", "rew", "return", "returns"},

@@ -11,9 +11,8 @@ from surrogym_shared.patterns import ALIAS, DIGEST, VISIBLE
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire.base import MAX_MEASURED, Key, Measured, Reply, Request, Vector
 
-PolicyForm = Literal[
-    "zip", "onnx", "pt2", "mp4", "gif"
-]  # formats of policy files (zip, onnx, pt2) and of videos of policies
+# Formats of policy files (zip, onnx, pt2) and of videos of policies (mp4, gif).
+PolicyForm = Literal["zip", "onnx", "pt2", "mp4", "gif"]
 Controller = Literal["policy", "zero", "random", "reference"]
 TraceRank = Literal["paired", "best", "median", "worst"]  # paired: an episode from the same start for every controller
 Digest = Annotated[str, Field(pattern=DIGEST, description="SHA-256 of the file, as hex")]

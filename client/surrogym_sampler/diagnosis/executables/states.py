@@ -18,7 +18,7 @@ from surrogym_shared.spec import Fixed, limits
 
 PLACES = 3  # number of random states in a check
 SEEDS = 5
-WANDERING = 5  # number of random steps between two steps that are compared
+WANDERING = 5  # before a check repeats a step, it takes this many random steps, which must not change the result
 # A test sets coordinates to this share of their ranges. Python writes so small a number with an exponent, which the
 # program must be able to read.
 TINY = 1e-6

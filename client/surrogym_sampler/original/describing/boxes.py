@@ -19,7 +19,7 @@ from surrogym_sampler.original.protocol import Array
 from surrogym_shared.spec import EnvironmentSpec, Inequality, Term
 from surrogym_shared.terms import evaluate, holds
 
-LEVEL = 1e-5  # points have the same value (level) of a quantity if they differ by at most this share of its range
+LEVEL = 1e-5  # two points count as equal in a quantity (as having one level) up to this share of the quantity's range
 SHARED = 2  # boundary points form a face of the box if at least this number of them share the value of a quantity
 SURE = 3  # if at least this number of points share the value (level) of a quantity, this is not by chance
 MOST_FACES = 6

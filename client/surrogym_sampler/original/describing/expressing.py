@@ -14,7 +14,8 @@ from surrogym_sampler.original.protocol import Array
 from surrogym_shared.spec import EnvironmentSpec, ObservationEntry, Term
 from surrogym_shared.terms import evaluate
 
-TOLERANCE = 1e-7  # a term expresses an observation entry with an error of at most this share of its largest value
+# A term expresses an observation entry if it differs by at most this share of the entry's largest value.
+TOLERANCE = 1e-7
 DIGITS = 6  # weights rounded to this number of decimals are preferred, if they still give the observation exactly
 FEW_TURNS = 4  # with at most this number of angles, the cosine and sine of sums of three angles are tried as well
 CLIPPED = 0.02  # an observation entry is clipped at an end of its range if this share of the states has that value

@@ -32,7 +32,7 @@ BATCH = 12
 ENOUGH = 4  # bisections begin once this number of steps has the rarer one of the two reward values
 POINTS = 12  # number of boundary points to find: twice the unknowns of an ellipsoid in three dimensions
 HALVINGS = 24
-COARSE = 10  # number of first steps of a bisection, which are far enough from the boundary to test a formula of it
+COARSE = 10  # the first steps of a bisection, this many, are far enough from the boundary to test a formula for it
 # To find a neighbour of a boundary point, one end of its bisection moves by this share of the states' range.
 NEAR = 0.02
 FLAT = 1e-3  # if a singular value is below this share of the largest one, more than one ellipsoid fits the points

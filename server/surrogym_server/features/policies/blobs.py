@@ -86,7 +86,7 @@ class FolderBlobs(Blobs):
 
     def remove(self, names: Freed) -> None:
         for name in names:
-            with suppress(OSError):  # the next periodic sweep tries again
+            with suppress(OSError):  # a file that can't be removed now is removed by the next periodic sweep
                 (self._folder / _checked(name)).unlink()
 
     def older(self, seconds: float) -> set[str]:

@@ -14,7 +14,8 @@ from surrogym_server.environment.distributions import scaling
 from surrogym_server.environment.features import Drift
 from surrogym_server.environment.samples import Samples
 
-POINTS_A_WEIGHT = 3  # the regression of the drift needs at least this many samples for each of its weights
+# The regression that predicts an angle's change needs at least this many samples for each of its weights.
+POINTS_A_WEIGHT = 3
 
 
 def learn_drift(definition: EnvironmentDefinition, samples: Samples) -> Drift:

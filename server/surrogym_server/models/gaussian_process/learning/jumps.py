@@ -24,14 +24,14 @@ from surrogym_server.models.gaussian_process.prediction.regions import Jump, Reg
 
 EDGE = "reward edge"
 MAX_JUMPS = 3
-SPLITS = 3  # a jump is searched for at this many gaps between the sorted rewards, the widest first
-GAP = 0.2  # a jump is searched for only at gaps wider than this share of the range of the rewards
-# Log odds per sample by which jumps must be likelier than no jump. In experiments smooth bumps reached 1.5, true jumps
-# at least 2.9.
+SPLITS = 3  # a jump of the reward is searched for at this many gaps between the sorted rewards, the widest first
+GAP = 0.2  # a jump of the reward is searched for only at gaps wider than this share of the range of the rewards
+# Log odds per sample by which jumps of the reward must be likelier than a reward without jumps. In experiments smooth
+# bumps reached 1.5, true jumps at least 2.9.
 MARGIN = 2.0
-WORTH = 5.0  # log odds by which one more jump must be likelier than fewer jumps
-SIZE = 3.0  # prior standard deviation of the height of a jump, in standard deviations of the reward
-FLOOR = 1e-4  # standard deviation of the noise if all rewards are equal, in standard deviations of the reward
+WORTH = 5.0  # log odds by which one more jump of the reward must be likelier than fewer jumps
+SIZE = 3.0  # prior standard deviation of the height of a jump of the reward, in standard deviations of the reward
+FLOOR = 1e-4  # standard deviation of the noise that every reward is taken to have, in standard deviations of the reward
 
 Split = tuple[float, Region, OutputModel, Tensor]
 

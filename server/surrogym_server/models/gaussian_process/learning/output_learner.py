@@ -40,7 +40,8 @@ class OutputLearner:
     warm: Warm  # logarithms of hyperparameters from the previous model's fits, by "output|feature map"
     thetas: dict[str, NDArray[np.float64]]  # logarithms of hyperparameters from this model's fits, by the same keys
     many: ManySamples = field(default_factory=BySubsets)  # strategy for fits to more than ``subsets.FEW`` samples
-    # For the name of each output of which inputs were left out as a trial: the best remaining inputs, and their fit.
+    # For each output, by name, of which it was tested which inputs can be left out: the best subset of inputs, and its
+    # fit.
     selections: dict[str, Selection] = field(default_factory=dict)
 
     def allowed(self, maps: tuple[FeatureMap, ...]) -> tuple[FeatureMap, ...]:
