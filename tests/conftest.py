@@ -29,7 +29,7 @@ from support.server import ServerProcess, running_server
 from support.teaching import teach
 from surrogym_client.transport import Api
 from surrogym_sampler.original.classic import pendulum
-from surrogym_server.engine.compiling import Compiling
+from surrogym_server.engine.local import Compiling
 
 # The same examples in every run, on machines of any speed, and none kept in the checkout.
 hypothesis.settings.register_profile(

@@ -31,7 +31,7 @@ from surrogym_client.transport.step_codecs import BinaryForm, Form, JsonForm
 from surrogym_client.transport.stream import Stream
 from surrogym_sampler.original.classic import pendulum
 from surrogym_server.convert import definition_from_spec
-from surrogym_server.engine import request_handlers
+from surrogym_server.engine import requests
 from surrogym_server.local import LocalSurrogate
 from surrogym_server.models.files import from_bytes
 from surrogym_shared import frames
@@ -113,7 +113,7 @@ def stepping(port: SurrogatePort, lanes: int, *, compiled: bool = True, **chosen
     """Steps of a new session, by torch where they are not to be compiled."""
     with pytest.MonkeyPatch.context() as patch:
         if not compiled:
-            patch.setattr(request_handlers, "in_fastest_form", lambda settings, _: settings)
+            patch.setattr(requests, "in_fastest_form", lambda settings, _: settings)
         session = port.open(OpenSession(num_envs=lanes, seed=0, **chosen)).id
     port.reset(session)
     action = np.random.default_rng(0).uniform(-2, 2, (lanes, 1)).astype(np.float32)

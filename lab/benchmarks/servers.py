@@ -50,10 +50,10 @@ def serve_echo(port: int) -> None:
 def serve_surrogym(options: list[str]) -> None:
     """The server as it is, but for the model of one surrogate: its steps give zeros at once."""
     from surrogym.cli import main
-    from surrogym_server.engine import request_handlers
+    from surrogym_server.engine import requests
     from surrogym_shared.port import StepResult
 
-    true_step = request_handlers.step_session
+    true_step = requests.step_session
 
     @cache
     def nothing_done(lanes: int, size: int) -> StepResult:
@@ -67,7 +67,7 @@ def serve_surrogym(options: list[str]) -> None:
             return true_step(session, *arguments)
         return session, nothing_done(len(session.versions), len(session.definition.observation_names))
 
-    request_handlers.step_session = step_session  # type: ignore[assignment]
+    requests.step_session = step_session  # type: ignore[assignment]
     sys.argv = ["surrogym", "serve", *options]
     main()
 

@@ -41,10 +41,9 @@ from surrogym_server.convert import definition_from_spec, stored_definition
 from surrogym_server.convert.stored import read_stored
 from surrogym_server.engine.design_job import DesignJob, DesignResult, run_design_job
 from surrogym_server.engine.fits import Fits
-from surrogym_server.engine.local import LocalEngine
+from surrogym_server.engine.local import MEBIBYTE, Limits, LocalEngine
 from surrogym_server.engine.models import ModelCache
 from surrogym_server.engine.port import Compute, SessionEngine
-from surrogym_server.engine.sessions import MEBIBYTE, Limits
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import InvalidInput
 from surrogym_server.feature import Cluster, Core, Feature, Parts

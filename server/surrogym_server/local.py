@@ -12,8 +12,18 @@ from numpy.typing import NDArray
 
 from surrogym_server.convert import stored_definition
 from surrogym_server.convert.sessions import opening, session_view
-from surrogym_server.engine.request_handlers import carried_out, opened, visited_states
-from surrogym_server.engine.requests import Advance, Open, PolicySteps, Reset, Rollout, Step, info_of
+from surrogym_server.engine.requests import (
+    Advance,
+    Open,
+    PolicySteps,
+    Reset,
+    Rollout,
+    Step,
+    carried_out,
+    info_of,
+    opened,
+    visited_states,
+)
 from surrogym_server.engine.session import Outcome, Session, check_opening, digest_of
 from surrogym_server.errors import InvalidInput, UnknownModel, UnknownSession
 from surrogym_server.models.files import from_bytes
@@ -163,7 +173,7 @@ class LocalSurrogate:
 
 
 class _OneModel:
-    """Source of models (``engine.request_handlers.Models``) that returns one model for each surrogate and version."""
+    """Source of models (``engine.requests.Models``) that returns one model for each surrogate and version."""
 
     def __init__(self, model: DynamicsModel) -> None:
         self._model = model

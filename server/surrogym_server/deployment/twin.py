@@ -14,7 +14,7 @@ from pathlib import Path
 import torch
 
 from surrogym_server.convert import stored_definition
-from surrogym_server.engine.request_handlers import limits_rewards
+from surrogym_server.engine.requests import limits_rewards
 from surrogym_server.environment.definition import CoordinateDefinition, EnvironmentDefinition
 from surrogym_server.errors import InvalidInput
 from surrogym_server.models.abilities import StepSource, WrittenInC, offers

@@ -1,14 +1,16 @@
 """One round of the design as a picklable job on arrays: fit a model, compute its confidence, choose the next queries.
 
-The result is a pure function of the job, so it can run in another process, and the same job gives the same result.
+The result is a pure function of the job, so it can run in another process, and the same job gives the same result. The
+fidelity of a model (confidence index, tolerances, errors) becomes JSON here, for fitted and for imported models.
 """
 
 from __future__ import annotations
 
 import json
 import time
+from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -16,15 +18,17 @@ import torch
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from surrogym_server.engine.fidelity import fidelity_fields
 from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_server.environment.points import Points
 from surrogym_server.environment.samples import Samples
 from surrogym_server.errors import InvalidInput
 from surrogym_server.models.files import from_bytes, to_bytes
 from surrogym_server.models.guard import plugin_calls
+from surrogym_server.models.port import DynamicsModel
+from surrogym_server.sampling.confidence import OutputConfidence, confidences_of, stds
 from surrogym_server.sampling.design import Decision, advance
-from surrogym_server.sampling.judging import judge_model
-from surrogym_server.sampling.limits import reached_limits
+from surrogym_server.sampling.judging import judge_model, monte_carlo
+from surrogym_server.sampling.limits import Limit, reached_limits
 from surrogym_server.sampling.prequential import LATEST, Predictions, latest, predicted
 from surrogym_server.sampling.state import DesignState, Request
 from surrogym_server.sampling.tolerances import default_tolerances
@@ -191,3 +195,51 @@ def _request(job: DesignJob) -> Request:
         open=job.open_steps,
         prior=None if job.prior is None else from_bytes(job.definition, job.prior),
     )
+
+
+def fidelity_fields(
+    model: DynamicsModel,
+    confidences: Sequence[OutputConfidence],
+    tolerances: Sequence[float],
+    target: float,
+    limits: Sequence[Limit] = (),
+) -> dict[str, Any]:
+    """Return the fields of ``wire.Fidelity`` for a model.
+
+    Args:
+        model: the model.
+        confidences: (O,) confidence of each output.
+        tolerances: (O,) tolerance of each output, in its unit.
+        target: confidence index that the design aims at.
+        limits: ends of coordinates' ranges that samples have reached.
+    """
+    rows = [
+        {"name": name, "structure": structure, "tolerance": tolerance, **asdict(output)}
+        for name, structure, output, tolerance in zip(
+            model.definition.outputs, model.structures, confidences, tolerances, strict=True
+        )
+    ]
+    return {
+        "confidence_index": min(c.confidence_index for c in confidences),
+        "confidence_index_paper": min(c.confidence_index_paper for c in confidences),
+        "target": target,
+        "samples": model.samples,
+        "outputs": rows,
+        "limits": [asdict(limit) for limit in limits],
+    }
+
+
+def fidelity_of(model: DynamicsModel, defaults: Sequence[float], target: float) -> dict[str, Any]:
+    """Compute the confidence of a model, and return the fields of ``wire.Fidelity``.
+
+    Args:
+        model: the model.
+        defaults: (O,) tolerances for outputs without a declared one. If empty, as before the first round of a design,
+            they are computed from the scales of the model's outputs.
+        target: confidence index that the design aims at.
+    """
+    defaults = defaults or default_tolerances(model.definition, model.scales.tolist())
+    tolerances = model.definition.tolerances_or(defaults)
+    points = Points(*monte_carlo(model.definition))
+    confidences = confidences_of(model, points, stds(model, points.q, points.u), tolerances)
+    return fidelity_fields(model, confidences, tolerances, target)

@@ -9,7 +9,7 @@ from typing import Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from surrogym_server.engine.fidelity import fidelity_of
+from surrogym_server.engine.design_job import fidelity_of
 from surrogym_server.engine.models import ModelCache
 from surrogym_server.environment.actions import model_actions
 from surrogym_server.errors import Damaged, InvalidInput, PluginFailed

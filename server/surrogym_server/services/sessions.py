@@ -9,8 +9,16 @@ import logging
 import numpy as np
 
 from surrogym_server.engine.port import SessionEngine
-from surrogym_server.engine.request_handlers import limits_rewards
-from surrogym_server.engine.requests import Array, Open, Opening, Restore, SampledRewards, Saved, SessionInfo
+from surrogym_server.engine.requests import (
+    Array,
+    Open,
+    Opening,
+    Restore,
+    SampledRewards,
+    Saved,
+    SessionInfo,
+    limits_rewards,
+)
 from surrogym_server.engine.tallies import SessionActivity
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import Damaged, SurrogymError, UnknownSession

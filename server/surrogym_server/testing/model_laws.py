@@ -14,7 +14,7 @@ import torch
 from safetensors.torch import load, save
 from torch import Tensor
 
-from surrogym_server.engine.fidelity import fidelity_of
+from surrogym_server.engine.design_job import fidelity_of
 from surrogym_server.environment.samples import Samples
 from surrogym_server.environment.step_rules import placed, settle, with_lags
 from surrogym_server.errors import InvalidInput

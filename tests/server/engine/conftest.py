@@ -12,8 +12,7 @@ import torch
 from support import pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.engine.design_job import DesignJob, DesignResult, run_design_job
-from surrogym_server.engine.occupancy import Reservoir
-from surrogym_server.engine.session import Session
+from surrogym_server.engine.session import Reservoir, Session
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.models.files import from_bytes
 from surrogym_server.models.gaussian_process.model import GaussianProcessModel

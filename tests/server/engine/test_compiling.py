@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from surrogym_server.engine import compiling
-from surrogym_server.engine.compiling import Compiling
+from surrogym_server.engine import local
+from surrogym_server.engine.local import Compiling
 from surrogym_shared import compiled
 from surrogym_shared.compiled import disk_cache
 
@@ -25,7 +25,7 @@ def test_without_a_compile_cache_the_server_compiles_in_a_separate_process(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ):
     done = folder / "done"
-    monkeypatch.setattr(compiling, "PROGRAM", f"open({str(done)!r}, 'w').close()")
+    monkeypatch.setattr(local, "PROGRAM", f"open({str(done)!r}, 'w').close()")
     ahead = Compiling()
     ahead.start()
     ahead.wait()
@@ -36,14 +36,14 @@ def test_without_a_compile_cache_the_server_compiles_in_a_separate_process(
 def test_with_a_filled_compile_cache_the_server_starts_no_compile_process(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(compiling.subprocess, "Popen", lambda *_, **__: pytest.fail("nothing is left to compile"))
+    monkeypatch.setattr(local.subprocess, "Popen", lambda *_, **__: pytest.fail("nothing is left to compile"))
     (folder / "step").mkdir()
     (folder / "step" / "step.nbi").touch()
     Compiling().start()
 
 
 def test_closing_the_server_ends_its_compile_process(folder: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(compiling, "PROGRAM", "import time; time.sleep(600)")
+    monkeypatch.setattr(local, "PROGRAM", "import time; time.sleep(600)")
     ahead = Compiling()
     ahead.start()
     ahead.close()

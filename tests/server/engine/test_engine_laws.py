@@ -8,9 +8,8 @@ from collections.abc import Callable
 
 import pytest
 
-from surrogym_server.engine.local import LocalEngine
+from surrogym_server.engine.local import Limits, LocalEngine
 from surrogym_server.engine.models import ModelCache
-from surrogym_server.engine.sessions import Limits
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import UnknownModel
 from surrogym_server.models.port import DynamicsModel

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from surrogym_server.engine import occupancy
-from surrogym_server.engine.occupancy import CAPACITY, Reservoir
+from surrogym_server.engine import session
+from surrogym_server.engine.session import CAPACITY, Reservoir
 
 
 def visit(batch: int, visits: int, seed: int = 5) -> Reservoir:
@@ -24,7 +24,7 @@ def test_all_visited_states_are_kept_below_the_reservoir_capacity():
 
 
 def test_the_reservoir_of_visited_states_does_not_depend_on_batch_sizes(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(occupancy, "CAPACITY", 100)  # batches of one take seconds to fill it
+    monkeypatch.setattr(session, "CAPACITY", 100)  # batches of one take seconds to fill it
     visits = 211
     kept = [visit(batch, visits).states for batch in (1, 3, 64, visits)]
     assert len(kept[0]) == 100

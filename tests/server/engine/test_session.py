@@ -10,8 +10,7 @@ import pytest
 import torch
 
 from support.acting import assert_same_rollout, random_policy
-from surrogym_server.engine.rollouts import roll_policy
-from surrogym_server.engine.saved import session_from_bytes, session_to_bytes
+from surrogym_server.engine.requests import roll_policy
 from surrogym_server.engine.session import (
     Fingerprint,
     Session,
@@ -19,6 +18,8 @@ from surrogym_server.engine.session import (
     digest_of,
     replay,
     reset_session,
+    session_from_bytes,
+    session_to_bytes,
     step_session,
 )
 from surrogym_server.environment.definition import EnvironmentDefinition

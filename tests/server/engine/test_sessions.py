@@ -10,8 +10,8 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
+from surrogym_server.engine.local import MEBIBYTE, Limits, LiveSessions, Threads
 from surrogym_server.engine.session import Fingerprint, Outcome, Session, reset_session
-from surrogym_server.engine.sessions import MEBIBYTE, Limits, LiveSessions, Threads
 from surrogym_server.errors import (
     DeadlineExceeded,
     Overloaded,

@@ -6,9 +6,8 @@ import asyncio
 
 import pytest
 
-from surrogym_server.engine.local import LocalEngine
+from surrogym_server.engine.local import Limits, LocalEngine
 from surrogym_server.engine.models import ModelCache
-from surrogym_server.engine.sessions import Limits
 from surrogym_server.errors import Unavailable
 from surrogym_server.services.metrics import ProcessMetrics
 from surrogym_server.services.notices import Notices

@@ -17,9 +17,8 @@ from threadpoolctl import threadpool_limits
 from surrogym_server import logs
 from surrogym_server.convert import stored_definition
 from surrogym_server.convert.stored import read_stored
-from surrogym_server.engine.local import LocalEngine
+from surrogym_server.engine.local import MEBIBYTE, Limits, LocalEngine
 from surrogym_server.engine.models import ModelCache
-from surrogym_server.engine.sessions import MEBIBYTE, Limits
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import SurrogymError
 from surrogym_server.features.ray.leases import Leases, Pace, seconds_now

@@ -8,8 +8,7 @@ import time
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass, field
 
-from surrogym_server.engine.saved import session_to_bytes
-from surrogym_server.engine.session import Session
+from surrogym_server.engine.session import Session, session_to_bytes
 from surrogym_server.errors import SurrogymError, Unavailable
 from surrogym_server.features.ray.records import Checkpoint, NewLiveSession, SessionLease, TakenSession
 from surrogym_server.features.ray.store import LiveSessions

@@ -6,10 +6,9 @@ import asyncio
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from surrogym_server.engine.local import LocalEngine
+from surrogym_server.engine.local import LocalEngine, OpeningLocks
 from surrogym_server.engine.port import SessionEngine
 from surrogym_server.engine.requests import Advance, Array, Open, Reply, Restore, Saved, SessionInfo, Visited
-from surrogym_server.engine.sessions import OpeningLocks
 from surrogym_server.engine.tallies import Counts, SessionActivity
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import (

@@ -14,8 +14,8 @@ import pytest
 
 from surrogym_sampler.original import classic
 from surrogym_server.convert import stored_definition
+from surrogym_server.engine.local import Limits
 from surrogym_server.engine.requests import Advance, Reply
-from surrogym_server.engine.sessions import Limits
 from surrogym_server.errors import Overloaded, SeqConflict, Unavailable, UnknownSession
 from surrogym_server.features.ray import leases
 from surrogym_server.features.ray.host import HostSettings, recorded_engine
