@@ -72,7 +72,7 @@ class FrameSplitter:
         self._max_bytes = max_bytes
         self._max_frames = max_frames
         self._rest = bytearray()
-        self._due = 0  # ``_rest`` must have this number of bytes before its frame can be complete
+        self._due = 0  # a frame that ``_rest`` has in part can't be complete before ``_rest`` has this number of bytes
 
     @property
     def rest_bytes(self) -> int:

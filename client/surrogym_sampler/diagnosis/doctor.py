@@ -42,8 +42,8 @@ from surrogym_shared.wire import PROTOCOL, StepQuery
 
 ROUND_TRIPS = 20
 NEEDS = "see docs/how-to/own-environment.md for what an environment needs"
-# The registry that each group of plug-ins (entry points) extends, as module:name. It is imported only if its package
-# is installed.
+# The registry that each group of plug-ins (entry points) extends, as module:name. A registry is imported only if the
+# package that contains it is installed.
 REGISTRIES = {
     "surrogym.policy_searches": "surrogym_trainer.training.search:SEARCHES",
     "surrogym.acquisitions": "surrogym_server.sampling.acquisition:ACQUISITIONS",

@@ -27,7 +27,8 @@ from surrogym_shared.spec import EnvironmentSpec, limits
 
 SKIPPED = "the design chooses another query, and surrogym doctor --env ENVIRONMENT checks save and restore"
 MOST_HANGS = 2  # number of time-outs of `save` in a row after which no state is saved; a single one may be chance
-ELSEWHERE = 0.01  # a restored state is reported if it differs by more than this share of a sampling range
+# A restored state is reported if it differs from the saved one by more than this share of a sampling range.
+ELSEWHERE = 0.01
 
 
 @runtime_checkable

@@ -18,7 +18,8 @@ from surrogym_server.environment.distributions import scaling
 POINTS_A_WEIGHT = 3
 # The search for full turns starts from linear functions of a speed that reach up to this many turns in a step.
 MAX_TURNS = 3
-# For each full turn of MAX_TURNS, the search has this many start functions of a speed, and as many of its negative.
+# For each full turn in a step, the search starts from this many positive slopes of the linear function, and as many
+# negative ones.
 STARTS_A_TURN = 8
 # Number of iterations of the search from each start; each chooses the full turns and fits a linear function.
 ROUNDS = 10

@@ -26,7 +26,7 @@ ENOUGH = 3  # noise is confirmed only after at least this many repetitions of ea
 STAGES = (1, ENOUGH, 6, 9)  # a test for noise follows when this many earlier steps have been repeated
 LEVEL = 0.01  # significance level of each test for noise
 NEGLIGIBLE = 0.5  # true noise below this share of the tolerance is confirmed with probability ``LEVEL`` at most
-# If the noise that a model has learned is larger than that of repeated steps by more than this factor, it is misfit.
+# If a model has learned noise of more than this multiple of that of repeated steps, the excess is misfit, not noise.
 AT_MOST = 3.0
 SLACK = 1.25  # a leave-one-out error up to this many times the tolerance is accepted, because samples are few
 

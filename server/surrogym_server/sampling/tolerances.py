@@ -19,7 +19,8 @@ from surrogym_server.environment.distributions import scaling
 from surrogym_server.environment.samples import Samples, increments
 
 TOLERANCE = 0.05  # default tolerance, as a share of the output's standard deviation over the initial design
-FLOOR = 1e-9  # changes of a coordinate below this share of its standard deviation over its range are rounding errors
+# Changes of a coordinate below this share of the standard deviation of its sampling range are rounding errors.
+FLOOR = 1e-9
 # If the samples from which a default tolerance was computed cover less than this share of the output's range over all
 # samples so far, the tolerance is computed again.
 NOTHING = 1e-3

@@ -61,7 +61,8 @@ class SessionService:
             SessionExpired: the session was idle for too long.
         """
         info = await self._engine.describe(id)
-        if info.behind:  # such a session needs its client's last requests again, but this client does not have them
+        # A session restored from an older checkpoint needs its client's last requests, which this client does not have.
+        if info.behind:
             raise UnknownSession(
                 f"session {id!r} has lost its last steps, because the process that ran it died: open a new session"
             )

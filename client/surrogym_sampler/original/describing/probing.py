@@ -20,8 +20,8 @@ from surrogym_sampler.original.simulator import Taken
 
 PLACES = 4  # number of states, out of those that random steps reached, at which a property of a simulator is tested
 EXACT = 1e-6  # a difference below this share of a variable's observed range counts as rounding
-# Setting a state works if a step after it differs from the one that an episode took there by at most this share of each
-# variable's observed range.
+# Setting a state works if a step from the set state differs from the step that an episode took in this state by at most
+# this share of each variable's observed range.
 SETTABLE = 1e-3
 # Two steps count as equal if they differ by at most this multiple of the noise that repeated steps have shown.
 FEW = 3.0

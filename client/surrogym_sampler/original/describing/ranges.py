@@ -16,7 +16,7 @@ from surrogym_sampler.original.simulator import Simulator
 from surrogym_shared.spec import Coordinate, Fixed, Uniform, limits
 
 FASTER = 1.5  # largest speed as a multiple of the observed one, because a policy may be faster than random actions
-MARGIN = 0.25  # the sampling range exceeds the observed range by this share of it on each side
+MARGIN = 0.25  # the sampling range is wider than the observed range, on each side, by this share of the observed range
 SINGLE = 1e-6  # relative rounding error of an observation in single precision
 # If a joint moves more than this share of the distance between its two stops in one step, it may meet a stop from
 # anywhere. Its sampling range then includes the stops.

@@ -13,7 +13,7 @@ from surrogym_trainer.deployment.c import source
 from surrogym_trainer.deployment.controller import Array, Controller, NotDeployable
 from surrogym_trainer.deployment.vectors import Vector, vectors_of
 
-LONGEST = 2_000_000  # longest period of a sketch in seconds; its clock can count 2^31 milliseconds
+LONGEST = 2_000_000  # longest period of an Arduino sketch in seconds; the sketch's clock can count 2^31 milliseconds
 
 
 def prefix_of(controller: Controller) -> str:

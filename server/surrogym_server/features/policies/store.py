@@ -45,7 +45,7 @@ policy_files = checked(
         sa.Column("surrogate_id", Id, primary_key=True, autoincrement=False),
         sa.Column("version", sa.Integer, primary_key=True, autoincrement=False),
         sa.Column("form", sa.Text, primary_key=True),
-        # Whether the policy was stored with this file, not given it later.
+        # Whether the policy was first stored with this file; false for a file that was added to the policy later.
         sa.Column("main", sa.Boolean, nullable=False),
         sa.Column("bytes", sa.BigInteger, nullable=False),
         sa.Column("digest", sa.Text, nullable=False),  # SHA-256 of the file

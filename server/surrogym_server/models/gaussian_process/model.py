@@ -83,7 +83,8 @@ class GaussianProcessModel(
     digest: str
     ending: Region | None = None  # region in which episodes end, if termination is learned
     jumps: tuple[Jump, ...] = ()  # regions of states with the constants that are added to the reward inside them
-    # Prior model, for example of a simulator. Its predictions are added to outputs with a ``size_with_prior``.
+    # Prior model, for example of a simulator. Its predictions are added to the outputs that have learned the difference
+    # from it (those with a ``size_with_prior``).
     prior: GaussianProcessModel | None = None
 
     @property

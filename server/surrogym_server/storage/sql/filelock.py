@@ -62,7 +62,8 @@ class FileLock:
         with _turn:
             if not path.exists():
                 self._require_own_log(b"")
-            # Opening and closing the file again would drop this process's locks on it.
+            # A second use of the file in this process is refused without opening it: closing it would drop this
+            # process's locks.
             if _identity(path) in _locked_files:
                 raise _unavailable(path)
             self._descriptors = [_lock_byte(path)] if WHOLE_DESCRIPTION else [_lock_beside(path), _open(path)]

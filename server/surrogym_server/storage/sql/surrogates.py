@@ -291,7 +291,9 @@ class Counted:
 
     def __init__(self, samples: CountedSamples) -> None:
         self._samples = samples
-        self._answers: dict[int, tuple[int | None, int]] = {}  # surrogate id: id of its newest sample, answered queries
+        # By surrogate id: id of the surrogate's newest sample, and number of answered queries, when they were counted
+        # last.
+        self._answers: dict[int, tuple[int | None, int]] = {}
 
     def read(self, connection: Connection, newest: Mapping[int, int | None]) -> dict[int, tuple[SampleCounts, int]]:
         """Return the numbers of samples and of answered queries of each surrogate, by surrogate id.

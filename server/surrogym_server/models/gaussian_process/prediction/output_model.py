@@ -39,8 +39,8 @@ class OutputModel:
     at_limit: tuple[int, ...] = ()
     # Names of other outputs from whose samples this output learned too, see ``gp.pooling``.
     shared: tuple[str, ...] = ()
-    # If the output adds to a prior model's prediction, its standard deviation over the samples, this prediction
-    # included; otherwise None.
+    # Standard deviation, over the samples, of the output together with the prior model's prediction to which it is
+    # added; None if no prior model's prediction is added.
     size_with_prior: float | None = None
 
     def mean(self, x: Tensor) -> Tensor:

@@ -34,7 +34,8 @@ class Predictor:
     transitions: tuple[OutputModel, ...]  # the M transition outputs, in the order of definition.outputs
     reward: OutputModel
     jumps: tuple[Jump, ...]  # regions of states with the constants that are added to the reward inside them
-    # Predictor of the prior model. Its predictions are added to outputs with a ``size_with_prior``.
+    # Predictor of the prior model. Its predictions are added to the outputs that have learned the difference from it
+    # (those with a ``size_with_prior``).
     prior: Predictor | None = None
 
     def transition(
