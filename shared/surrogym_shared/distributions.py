@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 HALF_LOG_TAU = 0.5 * float(np.log(2 * np.pi))
 
-Array = NDArray[np.floating[Any]]  # array of floats of any size; a training uses float32
+Array = NDArray[np.floating[Any]]  # array of floats of any precision; a training uses float32
 
 
 class Sampled(Protocol):

@@ -284,7 +284,7 @@ def _checked(url: str) -> str:
 def _new_client(url: str, token: str | None) -> httpx.Client:
     headers = {"Authorization": f"Bearer {token}"} if token else {}
     limits = httpx.Limits(keepalive_expiry=_KEEPALIVE_SECONDS)
-    trusted = httpx.create_ssl_context()  # also for loopback hosts, reads SSL_CERT_FILE
+    trusted = httpx.create_ssl_context()  # reads SSL_CERT_FILE also for loopback hosts, for which trust_env is false
     return httpx.Client(headers=headers, limits=limits, verify=trusted, trust_env=not _is_loopback(url))
 
 

@@ -13,7 +13,7 @@ from surrogym_client.errors import SurrogymClientError
 from surrogym_shared.wire import ClaimedQueries
 
 HELD_SECONDS = 1.0  # a query claimed ahead is returned if the running step does not end within these seconds
-LEAD = 3.0  # the next query is claimed this multiple of an answer's duration before the expected end of the step
+LEAD = 3.0  # the next query is claimed this many durations of an answer before the expected end of the running step
 
 S = TypeVar("S")
 T = TypeVar("T")

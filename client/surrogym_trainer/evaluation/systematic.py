@@ -91,7 +91,7 @@ class _Form(NamedTuple):
     variances (1 + P,) of its weights, and how well it explains the errors."""
 
     variances: Array
-    # likelihood of the errors under this form, divided by that under the hypothesis that the model is right
+    # likelihood of the errors if they have this form, divided by their likelihood if the model is right
     evidence: float
     mean: Array  # (1 + P,) posterior mean of the weights of a constant and of P inputs
     root: Array  # (1 + P, 1 + P) square root R of the posterior covariance R R' of the weights

@@ -51,7 +51,8 @@ class DesignJob:
     budget: int  # largest number of real steps that the design may take
     target: float  # the design ends when the model's confidence index reaches this number
     pending: tuple[Query, ...] = ()  # queries without an answer, which a sampler may still take or which were set aside
-    open_steps: int = 0  # number of real steps of the queries that are still to be taken, those set aside not counted
+    # Number of real steps of the queries that are still to be taken, without queries that were set aside.
+    open_steps: int = 0
     refused: tuple[Query, ...] = ()  # queries that the original environment refused, such as an unreachable state
     snapshots: dict[str, tuple[float, ...]] = field(default_factory=dict)  # coordinates (C,) of each snapshot, by name
     extra_queries: int = 0  # number of queries requested beyond those of the design, also after the design has ended

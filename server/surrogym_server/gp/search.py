@@ -61,7 +61,8 @@ class Evaluated:
     value: float
     slopes: Array  # gradient of ``value`` with respect to theta
     half: Array  # (P,) entries (i, j), i >= j, of 1/2 (beta beta^T - K^-1) for P pairs of points; doubled if i > j
-    weighted: Array  # (1, P), or (2, P) with a reflection: product of ``half`` and the squared exponential
+    # (1, P) product of ``half`` and the squared exponential for P pairs of points; (2, P) with a reflection.
+    weighted: Array
     weights: Array  # (n,) beta = K^-1 y
 
 

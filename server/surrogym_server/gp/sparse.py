@@ -34,8 +34,8 @@ MAX_EXACT = 2_000  # a process with more points uses inducing points
 INDUCING = 1_000  # greatest number of inducing points, unless the caller gives another number
 NOISES = (1.0, 1e2)  # noise variances that ``condition_many`` tries, as multiples of the fitted noise variance
 SHARE = 1e-12  # lower limit of 1 - h_i in the leave-one-out formulas, against a division by 0
-# No further inducing point is chosen if the unexplained variance of all points is below the first share of the prior
-# variance, or below the second share of the noise variance.
+# No further inducing point is chosen if the unexplained variance of every point is at most the first share of the mean
+# prior variance, or at most the second share of the noise variance.
 EXPLAINED, BELOW_NOISE = 1e-10, 1e-3
 
 

@@ -28,7 +28,7 @@ LEVEL = 0.01  # significance level of each test for noise
 NEGLIGIBLE = 0.5  # true noise below this share of the tolerance is confirmed with probability ``LEVEL`` at most
 # If a model has learned noise of more than this multiple of that of repeated steps, the excess is misfit, not noise.
 AT_MOST = 3.0
-SLACK = 1.25  # a leave-one-out error up to this many times the tolerance is accepted, because samples are few
+SLACK = 1.25  # if an output has confirmed noise, a leave-one-out error up to this many times its tolerance is accepted
 
 
 @dataclass(frozen=True)

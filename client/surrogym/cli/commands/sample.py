@@ -238,7 +238,7 @@ def _sample_here(
             signal.signal(number, lambda *_: sampler.stop())
         with on_interrupt(lambda: _words_of_interruption(sampler.summary())), closing(environment):
             result = sampler.run()
-        # The number now includes steps that the fallback controller took while the environment was closed.
+        # ``fallback_steps`` is read again, because the fallback controller may act while the environment is closed.
         result = replace(result, fallback_steps=sampler.summary().fallback_steps)
     output.give(asdict(result), lambda: _words(plan.surrogate, result))
     if result.phase == "failed":

@@ -26,7 +26,7 @@ from surrogym_sampler.original.state_parts import (
     mujoco_parts,
 )
 
-# Environments of the package ROBOTICS are opened without consent if a server names them. So only an installed package
+# If a server names an environment of this package, it is opened without asking the user. So only an installed package
 # is used: the working directory is not searched.
 ROBOTICS = "gymnasium_robotics"
 # Observation spaces that can't be used, because their values are not numbers that change gradually.

@@ -142,7 +142,7 @@ class _Boundary:
         self._steps, self._step = steps, step
         self._ends: list[tuple[Paid, Paid]] = []  # the two ends of the bisection that found each point
         few, others = ([steps.one(i) for i in _spread(np.flatnonzero(of), explored)] for of in (rare, ~rare))
-        self._paired = 0  # for this number of the first points, neighbours were already searched
+        self._paired = 0  # neighbours have been searched for this number of the points, beginning with the first
         self._pairs = ((few[n % len(few)], others[(n + n // len(few)) % len(others)]) for n in itertools.count())
 
     def more(self) -> Paid:

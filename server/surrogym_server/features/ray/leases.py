@@ -179,5 +179,5 @@ async def _tried(work: Awaitable[None]) -> None:
         await work
     except SurrogymError as error:
         logger.warning("leases or checkpoints of sessions could not be written, the next try follows: %s", error)
-    except Exception:  # must not end the periodic renewal; while a lease is expired, steps are refused
+    except Exception:  # an error must not end the periodic renewal; while a lease is expired, steps are refused
         logger.exception("leases or checkpoints of sessions could not be written; the next try follows")

@@ -29,11 +29,11 @@ from surrogym_server.models.port import Transition
 
 MODELS = 8  # number of models with different hyperparameters, from which functions are sampled
 MOST_POINTS = 128  # hyperparameters of a process with more points are certain enough, so they are not sampled
-# If the learned noise variance, as a share of the output's variance, is at most this, it need not be tested by repeated
-# steps.
+# A learned noise variance up to this share of the output's variance is never a misfit. If a process misfits, sampled
+# hyperparameters have at most this noise variance.
 NEGLIGIBLE = 0.01**2
-# If the learned noise variance exceeds that of repeated steps by more than this factor, the process fits badly. The
-# factor is large because repeated steps may be few.
+# A process misfits if its learned noise variance exceeds that of repeated steps by more than this factor. The factor is
+# large because repeated steps may be few.
 AT_MOST = 3.0**2
 
 Floats = NDArray[np.float64]
