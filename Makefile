@@ -21,7 +21,7 @@ unexport PYTHONDONTWRITEBYTECODE
 demo: .venv/demo  ## Solve Pendulum with server, sampler and trainer on this machine (ARGS="--seed 1")
 	@exec $(BIN)/surrogym demo pendulum $(ARGS)
 
-install: .venv/all  ## Everything a user may want into .venv: MuJoCo, pictures and exports as well
+install: .venv/all  ## Surrogym into .venv, with MuJoCo, pictures and exports
 	@echo "next: . .venv/bin/activate"
 
 test: format-check lint  ## Everything that guards the project

@@ -23,9 +23,11 @@ from support.twins import PERIOD, OpenFmu, drained, exported, opened, tanks
 from surrogym.cli import main
 from surrogym_sampler import original
 from surrogym_sampler.original.classic import cartpole
+from surrogym_server.convert import stored_definition
 from surrogym_server.deployment import twin_of, write_twin
 from surrogym_server.errors import InvalidInput
 from surrogym_server.local import LocalSurrogate
+from surrogym_server.models.files import from_bytes, to_bytes
 from surrogym_shared import c_compiler, fmu
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.surrogate_file import SurrogateFile
@@ -251,6 +253,12 @@ def test_exporting_an_fmu_of_a_model_family_without_c_export_is_refused(tmp_path
     )
     with pytest.raises(InvalidInput, match="gaussian_process or sparse_gaussian_process, got 'ensemble'"):
         twin_of(exported("tanks", spec, drained(24)))
+
+
+def test_exporting_an_fmu_of_a_model_with_a_prior_is_refused(surrogate):
+    model, prior = (from_bytes(stored_definition(surrogate.spec), surrogate.model) for _ in range(2))
+    with pytest.raises(InvalidInput, match="expected a model without a prior"):
+        twin_of(replace(surrogate, model=to_bytes(replace(model, prior=prior))))
 
 
 def test_the_command_writes_the_fmu_of_a_surrogate_file(surrogate, tmp_path, capsys, monkeypatch):

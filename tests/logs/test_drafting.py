@@ -83,6 +83,30 @@ def test_a_state_that_is_fixed_within_episodes_is_drafted_as_constant(tmp_path: 
     assert {c.name: c.kind for c in log.spec.coordinates} == {"x": "linear", "goal": "constant"}
 
 
+@pytest.mark.parametrize("name", ["setpoint", "x_SP", "SetPoint", "set_point", "LIC-101.SP", "x target", "reference"])
+def test_the_draft_asks_about_a_set_point_that_moves_within_an_episode(tmp_path: Path, name: str):
+    stepped = np.repeat(RNG.uniform(-1, 1, 5), 10)
+    log = drafted(tmp_path, **rows(**{name: stepped, f"next_{name}": np.append(stepped[1:], stepped[-1])}))
+    assert {c.name: c.kind for c in log.spec.coordinates} == {"x": "linear", name: "linear"}
+    assert [note for note in log.notes if f'declare constants = ["{name}"]' in note]
+
+
+@pytest.mark.parametrize("name", ["spin", "speed", "point"])
+def test_the_draft_does_not_ask_about_states_without_a_word_for_set_points(tmp_path: Path, name: str):
+    walk = np.cumsum(RNG.uniform(-1, 1, 51))
+    log = drafted(tmp_path, **rows(**{name: walk[:-1], f"next_{name}": walk[1:]}))
+    assert not [note for note in log.notes if "set point" in note]
+
+
+def test_a_set_point_that_is_declared_constant_is_drafted_as_constant_although_it_moves(tmp_path: Path):
+    stepped = np.repeat(RNG.uniform(-1, 1, 5), 10)
+    np.savez(tmp_path / "log.npz", **rows(sp=stepped, next_sp=np.append(stepped[1:], stepped[-1])))
+    mapping = {"state": {"x": "x", "sp": "sp"}, "next": {"x": "next_x", "sp": "next_sp"}, "action": {"0": "action"}}
+    log = read_log(tmp_path / "log.npz", Options({**mapping, "reward": "reward", "constants": ["sp"]}))
+    assert {c.name: c.kind for c in log.spec.coordinates} == {"x": "linear", "sp": "constant"}
+    assert len(log.steps) == 50
+
+
 def test_drafted_state_ranges_have_a_margin_and_action_ranges_none(tmp_path: Path):
     columns = rows()
     spec = drafted(tmp_path, **columns).spec

@@ -239,7 +239,15 @@ class LoopOptions:
             "budget. This needs a running sampler; without one the card says that there was no audit.",
         ),
     ] = True
-    audit_steps: Annotated[int, typer.Option(min=2, max=256, help="Number of real steps of an audit.")] = 8
+    audit_steps: Annotated[
+        int,
+        typer.Option(
+            min=2,
+            max=256,
+            help="Number of real steps with which an audit begins; as many again follow, up to 40 in all, while they "
+            "leave the promise undecided.",
+        ),
+    ] = 8
 
     def settings(self) -> LoopSettings | None:
         from surrogym_trainer.training.closed_loop import LoopSettings

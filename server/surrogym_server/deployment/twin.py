@@ -98,7 +98,10 @@ def _source_of(model: DynamicsModel) -> StepSource:
         )
     source = able.step_source()
     if source is None:
-        raise InvalidInput("expected the package numba, which writes a model in C, got none: install numba")
+        raise InvalidInput(
+            "expected a model without a prior, and the package numba, which writes it in C, got a prior or no numba: "
+            "remove the prior (surrogym prior NAME --drop), or install numba"
+        )
     if source.numbers > MOST_NUMBERS:
         raise InvalidInput(
             f"model: expected at most {MOST_NUMBERS:,} numbers, got {source.numbers:,}: use the model family "

@@ -11,6 +11,7 @@ import numpy as np
 from surrogym_shared.checks import LARGEST, NARROWEST, RESOLUTION
 from surrogym_shared.logs.columns import Roles
 from surrogym_shared.logs.errors import UnusableLog
+from surrogym_shared.logs.headings import heading
 from surrogym_shared.logs.table import Bools, Floats
 from surrogym_shared.logs.transitions import Transitions
 from surrogym_shared.logs.turns import FULL_TURN, turn_of
@@ -39,6 +40,7 @@ FEW_EPISODES = 2  # with fewer episodes, a log does not show the time limit and 
 USUAL_LIMIT = 200  # drafted time limit of virtual episodes if the log does not show one
 MOST_STARTS = 64
 FEW_STARTS = 8  # if a log has fewer episodes, virtual episodes also start at other states of the log
+SET_POINT = {"setpoint", "setpoints", "sp", "reference", "target"}  # words in the names of columns of set points
 FAR = 8.0  # a note names values farther from the median than this many widths of the middle half of the data
 
 
@@ -110,7 +112,19 @@ def _coordinate(roles: Roles, steps: Transitions, name: str, index: int, notes: 
     least, most = (-math.inf if ends[0] is None else ends[0]), (math.inf if ends[1] is None else ends[1])
     sampling = Uniform(low=max(low - margin, least, -LARGEST), high=min(high + margin, most, LARGEST))
     notes += [f"{name}: {remark}" for remark in _remarks(after)]
+    if _is_set_point(roles, name):
+        notes.append(
+            f"{name}: its name is that of a set point, but it moves within an episode. It is drafted as a state whose "
+            f'changes are learned. If it is a set point, declare constants = ["{name}"] in a mapping file (--map), or '
+            "leave the column out of it"
+        )
     return Coordinate(name=name, sampling=sampling, bounds=bounds)
+
+
+def _is_set_point(roles: Roles, name: str) -> bool:
+    """Whether the name of a state, or of its column, has a word for set points."""
+    words = {word.lower() for one in (name, roles.state[name]) for word in heading(one).words}
+    return not words.isdisjoint(SET_POINT) or {"set", "point"} <= words
 
 
 def _require_range(name: str, low: float, high: float) -> None:

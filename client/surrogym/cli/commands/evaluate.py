@@ -121,7 +121,9 @@ class Keeping:
 
 def command(
     context: typer.Context,
-    policy: Annotated[Path, typer.Argument(help="Policy file from surrogym train or Stable-Baselines3.")],
+    policy: Annotated[
+        Path, typer.Argument(help="Policy file from surrogym train or Stable-Baselines3, or an ONNX file.")
+    ],
     env: Environment = None,
     spec: SpecFile = None,
     fallback: FallbackProgram = None,

@@ -30,7 +30,7 @@ def command(
     """Convert a policy to ONNX (.onnx) or torch.export (.pt2).
 
     The converted policy returns the most probable action. The command checks on random observations that it gives the
-    same actions as the original policy, which is a zip file that Stable-Baselines3 loads.
+    same actions as the original policy.
 
     Example: surrogym export-policy policy.zip --out policy.onnx
     """

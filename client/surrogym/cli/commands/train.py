@@ -61,8 +61,9 @@ def command(
 ) -> None:
     """Train a policy in the virtual environment.
 
-    A running sampler takes the few real steps of the audit. No other real step is taken, unless --improve is given. The
-    command prints the imagined return: what the policy earns in the virtual environment, not in the original
+    A running sampler takes the few real steps of the audit. If it fails or leaves the model in doubt, the sampler takes
+    up to eight more from the budget, and the training continues. No other real step is taken, unless --improve is
+    given. The command prints the imagined return: what the policy earns in the virtual environment, not in the original
     environment.
 
     Example: surrogym train pendulum --out policy.zip --seed 0
