@@ -52,8 +52,9 @@ class StepResult:
     # (N,) whether each lane was truncated because the model is too uncertain there; None in a session without
     # ``trust``.
     untrusted: Bools | None = None
-    # (N,) whether the episode ended outside the sampling range, or where the fallback of declared limits acts; None if
-    # neither an outside reward nor limits are declared.
+    # (N,) whether the lane's episode ended early: outside the sampling range, or where the model is too uncertain, if a
+    # reward outside is declared; or where the fallback of declared limits acts. None if neither that reward nor limits
+    # are declared.
     left: Bools | None = None
 
 
@@ -76,8 +77,9 @@ class PolicyRollout:
     # (T, N) whether a lane's episode ended in this step because the model is too uncertain there; None in a session
     # without the option ``trust``.
     untrusted: Bools | None = None
-    # (T, N) whether a lane's episode ended in this step outside the sampling range, or where the fallback of declared
-    # limits acts; None if neither an outside reward nor limits are declared.
+    # (T, N) whether a lane's episode ended early in this step: outside the sampling range, or where the model is too
+    # uncertain, if a reward outside is declared; or where the fallback of declared limits acts. None if neither that
+    # reward nor limits are declared.
     left: Bools | None = None
 
     def __len__(self) -> int:

@@ -39,7 +39,7 @@ class Preset:
     input_probability: InputProbability
     stopping: Stopping
 
-    # Settings of the training and the audit of a policy.
+    # Settings of the training of a policy, and of its audit (real steps that test the model).
     algorithm: str  # name of the training algorithm of a policy
     wide_networks: bool
     adapts_training: bool  # whether settings of a training depend on noise, episode length, and progress

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 Transport = Literal["auto", "stream", "binary", "json"]
 T = TypeVar("T")
 
-_RETURNS = 5  # how often a server may restore an older checkpoint of a session during one request
+_RETURNS = 5  # how often a server may go back to an older checkpoint (saved state) of a session during one request
 _UPGRADE_PAUSE_SECONDS = 60.0  # pause before a stream is tried again, after one was refused or broke without an answer
 
 
@@ -42,7 +42,8 @@ class _Live:
     shape: Shape
     seq: int
     stream: Stream
-    window: ResendBuffer | None  # the last requests; None: the server never restores an older checkpoint of the session
+    # The last requests, to send them again if the server goes back to an older saved state; None: it never does.
+    window: ResendBuffer | None
 
 
 class HttpSurrogate:

@@ -29,11 +29,13 @@ LONGEST = 5
 EPISODE = 20  # largest number of steps in an episode of the test
 HELD = 4  # largest number of steps for which a random action is held
 RIDGE = 1e-6  # ridge term of the linear regression, relative to the variance of its inputs
-ENOUGH = 0.05  # a history suffices if its prediction error is below this share of the standard deviation of the changes
-# A history also suffices if its prediction error is below this multiple of the smallest one of all histories.
+# A history (past values in the state) suffices if its prediction error is below this share of the changes' deviation.
+ENOUGH = 0.05
+# A history (past values in the state) also suffices if its prediction error is below this multiple of the smallest
+# prediction error of all histories.
 SLACK = 1.2
-# If even the chosen history has a prediction error above this share of the changes' standard deviation, the test can't
-# tell which history is needed.
+# If even the chosen history (past values in the state) has a prediction error above this share of the changes' standard
+# deviation, the test can't tell which history is needed.
 EXPLAINED = 0.5
 WIDER = 1.5  # the declared largest change of a coordinate is this multiple of its largest observed change
 

@@ -21,27 +21,29 @@ from surrogym_trainer.evaluation.systematic import Inputs, Systematic, columns, 
 from surrogym_trainer.policies.evidence import Audit, Promise
 
 AUDIT_STEPS = 8
-MOST_STEPS = 40  # while the result of an audit is undecided, further steps are added up to this number in all
-ALARM = 0.01  # probability that an audit fails a right model because of the sizes of its errors
+MOST_STEPS = 40  # largest number of real steps of an audit, which takes further steps while its result is undecided
+# Probability that an audit (real steps that test the model) fails a right model because of the sizes of its errors.
+ALARM = 0.01
 # probability that a right model ever fails the test for errors that all steps share, however many steps are taken
 SHIFT_ALARM = 0.05
-# if errors that all steps share move the return out of the promised interval with more than this probability, an audit
-# takes more steps and widens the interval
+# if errors that all steps share move the return out of the promised (predicted) interval with more than this
+# probability, an audit takes more steps and widens the interval
 UNDECIDED = 0.05
 # an audit fails if the model wrongly predicted, in at least this number of steps, whether the step ends its episode
 MISPLACED_ENDS = 2
-# an audit passes although a return, or the promise of the new model, lies outside the promised interval by up to this
-# share of the policy's gain over an untrained policy
+# an audit passes although a real return, or the return that the model predicts after the audit, lies outside the
+# promised interval by up to this share of the policy's gain over an untrained policy
 SLACK = 0.1
 # two states are far apart if a coordinate differs by more than this multiple of the coordinate's standard deviation
 # over the states that the policy visits
 FAR = 1.0
-# an audit does not support a promise if more than this share of the states that the policy visits is far from every
-# step of the audit
+# an audit does not support the promised interval of the return if more than this share of the states that the policy
+# visits is far from every step of the audit
 MOST_UNTESTED = 0.2
-QUANTILES = 200  # to widen a promise, its distribution is represented by this number of quantiles
-# if the lower half of a promised interval is wider than this share of the gain over an untrained policy, more real
-# steps may narrow it
+# To widen the promised interval of the return, its distribution is represented by this number of quantiles.
+QUANTILES = 200
+# if the lower half of the promised interval of the return is wider than this share of the policy's gain over an
+# untrained policy, more real steps may narrow it
 UNSURE = 0.2
 
 Array = NDArray[np.float64]

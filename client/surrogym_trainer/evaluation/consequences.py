@@ -20,8 +20,8 @@ from surrogym_trainer.evaluation.imagined import imagine
 from surrogym_trainer.evaluation.systematic import Inputs, Region, Systematic, region
 from surrogym_trainer.policies.predict import Predict
 
-# If all steps of an audit share an error, the error's effect on the return is computed for this number of possible
-# errors, which are drawn from the posterior distribution.
+# If all real steps that test a policy's model share an error, the error's effect on the return is computed for this
+# number of possible errors, which are drawn from the posterior distribution.
 DRAWS = 64
 STARTS = 4  # to see the effect of one error of the model, the return is the mean over this number of virtual episodes
 # an output is reported only if the probability that its errors have a part that all steps share exceeds this

@@ -36,8 +36,9 @@ class Imagined:
     returns: NDArray[np.float64]  # (episodes,) undiscounted returns, less any penalty
     penalty_share: float  # sum of the penalties as a share of the sum of absolute rewards
     episode_penalty: float | None  # mean penalty of an episode; None if the session has no penalty
-    # (episodes,) whether each episode ended outside the sampling range, or where the fallback of declared limits acts;
-    # None if neither an outside reward nor limits are declared
+    # (episodes,) whether each episode ended early: outside the sampling range, or where the model is too uncertain, if
+    # a reward outside is declared; or where the fallback of declared limits acts. None if neither that reward nor
+    # limits are declared.
     left: NDArray[np.bool_] | None = None
 
 

@@ -16,12 +16,13 @@ from surrogym_trainer.evaluation.imagined import imagine
 from surrogym_trainer.policies.evidence import FallbackShare, Promise
 from surrogym_trainer.policies.predict import Predict
 
-FUNCTIONS = 32  # a promise is computed along this number of functions drawn from the model's posterior
+# A promise (predicted interval of the mean return) is computed along this number of functions drawn from the posterior.
+FUNCTIONS = 32
 STARTS = 8  # number of virtual episodes along each drawn function
-EVALUATION_STARTS = 100  # number of real starts whose mean return is promised
+EVALUATION_STARTS = 100  # a promise predicts the mean return of this number of real episodes
 LOW, HIGH = 0.05, 0.95
-# an audit does not notice errors that change the return by less than this share of the policy's gain over an untrained
-# policy
+# an audit (real steps that test the model) does not notice errors that change the return by less than this share of the
+# policy's gain over an untrained policy
 UNNOTICED = 0.02
 NORMAL_POINTS = 201  # number of quantiles that represent a normal distribution
 

@@ -43,7 +43,7 @@ DEGREES = 0.1  # degrees of freedom of the prior for the errors' standard deviat
 # a standardised input is clipped to this number of standard deviations; sessions that add an error to the model clip it
 # likewise
 FARTHEST = 3.0
-# An audit takes a model's error on left-out samples to be at least this share of the output's tolerance.
+# A test takes a model's error on left-out samples to be at least this share of the output's tolerance.
 LEAST = 1e-3
 # to find where an error is largest, an input's range is divided into this number of parts with equal numbers of steps
 PARTS = 3
@@ -91,7 +91,7 @@ class _Form(NamedTuple):
     variances (1 + P,) of its weights, and how well it explains the errors."""
 
     variances: Array
-    # likelihood of the errors if they have this form, divided by their likelihood if the model is right
+    # likelihood of the errors if all steps share an error of this form, divided by that if the model is right
     evidence: float
     mean: Array  # (1 + P,) posterior mean of the weights of a constant and of P inputs
     root: Array  # (1 + P, 1 + P) square root R of the posterior covariance R R' of the weights

@@ -49,15 +49,15 @@ class PolicyCard(BaseModel):
     spec: EnvironmentSpec | None = None
     seed: int | None = None
     virtual_steps: int | None = None
-    model: str = ""  # hash of the samples from which the promise's model was learned
+    model: str = ""  # hash of the samples from which the model learned that predicts the promised return
     seconds: float | None = None
     imagined_return: float | None = None
     visited_confidence: tuple[float | None, ...] = ()
     untrained: float | None = None  # imagined return of an untrained network
     promise: Promise | None = None
     audit: Audit | None = None
-    trusted: bool | None = None  # whether the promise is supported; None if it was not judged
-    reason: str = ""  # sentence about why the promise is trusted or not
+    trusted: bool | None = None  # whether the promised interval of the return is supported; None if it was not judged
+    reason: str = ""  # sentence about why the promised interval of the return is trusted or not
     curve: tuple[CurvePoint, ...] = ()  # points of the training curve: virtual steps and imagined return
     networks: int = 1  # number of networks that the last training began; above 1 if some learned nothing
     settings: dict[str, Any] = Field(default_factory=dict)

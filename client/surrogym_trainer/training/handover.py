@@ -46,17 +46,19 @@ from surrogym_trainer.evaluation.uncontrolled import baseline
 from surrogym_trainer.policies.evidence import Audit, Promise
 from surrogym_trainer.policies.predict import Predict
 
-# all audits of a surrogate together may take this number of real steps, or as many as its budget if that is larger
+# all audits (real steps that test the model) of a surrogate together may take this number of real steps, or as many as
+# its budget if that is larger
 LEAST_AUDITED = 128
 MOST_AUDITS = 3  # largest number of audits in one training
-WAY_LANES = 16  # an audit chooses its states from this number of virtual episodes of the policy
+WAY_LANES = 16  # an audit takes real steps at states from this number of virtual episodes of the policy
 # at most this number of steps of each virtual episode is compared with the log from which the model was learned
 MOST_OF_A_WAY = 200
-ELSEWHERE = 4  # of each group of this many steps of an audit, one is in a gap between samples, if the design is ready
-# the steps of an audit in gaps between the samples are chosen from this number of points of the sampling range
+# If the model is ready, one of this many steps of an audit is in a gap between the samples, not on the policy's way.
+ELSEWHERE = 4
+# the states of an audit in gaps between the samples are chosen from this number of points of the sampling range
 ANYWHERE = 1_024
-# a promise is not trusted if the lower half of its interval is wider than this share of the gain over an untrained
-# policy
+# a promised interval of the return is not trusted if its lower half is wider than this share of the policy's gain over
+# an untrained policy
 WIDE = 0.5
 NO_SAMPLER = "no sampler is connected"
 

@@ -53,7 +53,8 @@ def train(
     started = time.perf_counter()
     found = search.search(task)
     out.parent.mkdir(parents=True, exist_ok=True)
-    card_path(out).unlink(missing_ok=True)  # an earlier policy's card must not remain beside this policy
+    # The card (description) of an earlier policy must not remain beside this policy.
+    card_path(out).unlink(missing_ok=True)
     found.policy.save(out)
     result = _result(found, settings, out, time.perf_counter() - started)
     card_path(out).write_text(json.dumps(asdict(result), indent=2, default=str) + "\n")

@@ -35,7 +35,8 @@ class SessionEngine(ABC):
 
     idle_seconds: float  # a session expires if it gets no request for this many seconds
     lasting: bool = False  # whether sessions continue after this process has ended, and other processes can use them
-    # A client should keep this many of its last requests, to repeat them if the session goes back to a checkpoint.
+    # A client should keep this many of its last requests, to send them again if the session goes back to an older saved
+    # state.
     replay: int = 0
 
     @abstractmethod

@@ -21,10 +21,10 @@ from surrogym_server.models.port import DynamicsModel
 from surrogym_server.sampling.rollouts import Sequences, best_rollout, predict_paths
 from surrogym_shared.nouns import Query, Vector
 
-# An excursion should end at least this far from the states of all samples, in standard deviations of the sampling
-# range.
+# An excursion, an action sequence that tests the model away from the samples, should end at least this far from the
+# states of all samples, in standard deviations of the sampling range.
 FAR = 0.5
-LONGEST = 16  # greatest number of actions of an excursion
+LONGEST = 16  # greatest number of actions of an excursion (an action sequence that tests the model)
 
 
 def excursion(

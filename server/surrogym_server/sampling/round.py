@@ -29,7 +29,8 @@ class Round:
     # True if the design continues, so that the round may use the rest of the budget. If false, the round may only
     # request ``request.extra`` steps.
     continues: bool
-    testing: bool  # true if the model satisfies the stopping rule, but still has to be tested by an excursion
+    # True if the model satisfies the stopping rule, but an action sequence away from the samples still has to test it.
+    testing: bool
 
     @property
     def definition(self) -> EnvironmentDefinition:

@@ -47,8 +47,8 @@ class DesignState:
     ended_as: str = ""  # the verdict with which the design ended; "" while it continues
     # Predictions of the latest samples by models that had not learned from them. They are only scored and reported.
     predictions: Predictions = ()
-    # Number of real steps that counted towards the budget when the last excursion was planned to test a model that
-    # satisfies the stopping rule; 0 if none was planned since the model last failed the rule.
+    # Number of real steps that counted towards the budget when the last excursion was planned: an action sequence that
+    # tests a model which satisfies the stopping rule; 0 if none was planned since a model last failed the rule.
     tested_at: float = 0
 
     def to_json(self) -> dict[str, Any]:
@@ -94,7 +94,7 @@ class Request:
     # Coordinates (C,) of each state to which the environment can return (snapshot), by the snapshot's name.
     snapshots: Mapping[str, Vector] = field(default_factory=dict)
     logged: int = 0  # number of samples that come from a log of earlier steps
-    audited: int = 0  # number of samples that come from audits of policies
+    audited: int = 0  # number of samples that come from audits (tests of trained policies)
     unlearned: int = 0  # number of real steps that are not among the samples, because lags (past values) were not known
     open: int = 0  # number of real steps of the pending queries that may still be answered, without those set aside
     prior: DynamicsModel | None = None  # model of what is known beforehand, such as a model of a simulator

@@ -86,7 +86,8 @@ class LaneTransition:
     # (N,) lanes that were truncated because a predicted standard deviation exceeded the limit ``trust``; None if
     # ``trust`` is None.
     untrusted: Bools | None
-    # (N,) lanes whose episode ended early with the outside reward; None if neither an outside reward nor limits are
+    # (N,) lanes whose episode ended early: outside the sampling range, or where the model is too uncertain, if a reward
+    # outside is declared; or where the fallback of declared limits acts. None if neither that reward nor limits are
     # declared.
     left: Bools | None = None
 

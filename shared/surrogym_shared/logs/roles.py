@@ -41,7 +41,8 @@ INDEX = {"index", "step", "steps", "timestep", "row", "line"}  # words in the na
 COUNTERS = {"sample", "frame", "tick", "counter", "count", "number", "no", "nr", "id", "i", "k", "n"}
 COUNTED = "it grows by one in each row, as the number of a row does"
 WITHIN = "it numbers the rows of each episode"
-LONGEST_HINT = 600  # a message proposes a mapping only if the mapping has at most this many characters
+# A message proposes a mapping (which column has which role) only if it has at most this many characters.
+LONGEST_HINT = 600
 
 Shown = Callable[[Cells], bool]
 # For each role of a column, such as reward: words in the column's name that make the role likely, whole names that do,

@@ -20,7 +20,7 @@ from surrogym_server.storage.records import JSON
 from surrogym_shared import wire
 from surrogym_shared.wire.drifts import AddDrift
 
-CARD = "the card of a policy"  # what error messages call a stored card
+CARD = "the card of a policy"  # what error messages call the stored description of a policy
 
 
 def new_policy(body: wire.AddPolicy) -> tuple[JSON, list[JSON], PolicyFile]:

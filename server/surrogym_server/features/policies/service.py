@@ -42,7 +42,7 @@ logger = logging.getLogger(__name__)
 
 MEBIBYTE = 2**20
 ORPHAN_SECONDS = 3_600.0  # age from which a file that no policy names is removed; an upload takes less time
-# Fields of a specification that must be equal in a policy's card and its surrogate.
+# Fields in which the specification in a policy's card (its description) must equal that of the surrogate.
 MUST_AGREE = ("observation", "action")
 
 

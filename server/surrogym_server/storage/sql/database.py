@@ -83,7 +83,7 @@ class _Now(FunctionElement[float]):
 
 @compiles(_Now)
 def _now(_: _Now, compiler: SQLCompiler, **__: Any) -> str:
-    return CLOCKS.get(compiler.dialect.name, "now()")  # other dialects are only used to print statements
+    return CLOCKS.get(compiler.dialect.name, "now()")  # statements in other dialects are never executed, only printed
 
 
 NOW = _Now()  # SQL expression of the database's clock, in seconds since 1970

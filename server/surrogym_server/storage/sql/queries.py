@@ -75,8 +75,8 @@ OLDEST_FREE: sa.Select[Any] = (
     .limit(sa.bindparam("most", type_=sa.Integer()))
     .with_for_update(skip_locked=True)
 )
-# All audits of a surrogate may take this many real steps even if its budget is smaller: three
-# audits of 40 steps.
+# All audits (tests of trained policies) of a surrogate may take this many real steps even if its budget is smaller:
+# three audits of 40 steps.
 LEAST_AUDITED = 128
 
 

@@ -173,9 +173,10 @@ surrogates = sa.Table(
     sa.Column("extra_queries", sa.Integer, nullable=False),
     sa.Column("checkpoint", sa.Text),
     sa.Column("revision", sa.BigInteger, nullable=False),  # increases with each change that makes a fit due
-    # Revision of the surrogate up to which its last fit read the data.
+    # Number of changes (``revision``) of the surrogate up to which its last fit read the data.
     sa.Column("fitted_revision", sa.BigInteger, nullable=False),
-    # Revision of the surrogate at which its last log was complete. Pending or leased queries don't delay its fit.
+    # Number of changes (``revision``) with which the last log was complete; ``revision`` + 1 while a log is incomplete.
+    # Pending or leased queries don't delay the fit of a new log.
     sa.Column("logged_revision", sa.BigInteger, nullable=False, server_default="0"),
     sa.Column("fit_token", sa.Text),
     sa.Column("fit_owner", sa.Text),

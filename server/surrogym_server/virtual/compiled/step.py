@@ -47,8 +47,8 @@ class _Changed:
     elapsed: Ints  # (N,) number of steps that each lane's episode has taken
     phase: NDArray[np.int8]  # (N,) phase of each lane: NEW, RUNNING or ENDED
     rewards: Floats  # (2, N) rewards less the penalties for uncertainty, and rewards without them
-    # (5, N) five flags of each lane: the episode terminated; was truncated; was truncated because the model is too
-    # uncertain; terminated or was truncated; ended early with the outside reward.
+    # (5, N) five flags of each lane. The episode: terminated; was truncated; was truncated because the model is too
+    # uncertain; terminated or was truncated; ended early, for a declared outside reward or limit (see ``_left``).
     ends: Bools
 
     @classmethod

@@ -26,7 +26,8 @@ class _Candidate:
     place: int  # index of the output in the model
     output: OutputModel
     part: Part
-    # For each input of ``part``, its index among all features of the output's feature map, ignored features included.
+    # For each input of ``part``, its index among all features in the output's encoding of state and action, ignored
+    # features included.
     every: tuple[int, ...]
 
 

@@ -30,7 +30,7 @@ class OutputModel:
     centre: float
     scale: float
     left_out: int = 0  # number of samples that were not used, because they ended at a bound or ended the episode
-    # Name and score of every candidate that was compared, usually the log evidence of a feature map.
+    # Name and score of every candidate that was compared, usually the log evidence of an encoding of state and action.
     scores: tuple[tuple[str, float], ...] = ()
     warp: Warp | None = None
     past_limits: bool = False  # whether the output learned from samples that ended at a limit of another coordinate

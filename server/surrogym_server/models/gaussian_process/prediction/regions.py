@@ -157,8 +157,10 @@ class Region:
     """Learned region of states: a weighted mean of forms (thresholds or a classifier) that each explain which samples
     lie inside. Where the forms disagree, the probability of being inside lies between 0 and 1."""
 
-    forms: tuple[tuple[float, Form], ...]  # pairs of a weight and a form; the weights add up to 1
-    scores: tuple[tuple[str, float], ...]  # name of every form that was compared, and its leave-one-out log probability
+    # Pairs of a weight and a form (thresholds or a classifier) of the region; the weights add up to 1.
+    forms: tuple[tuple[float, Form], ...]
+    # Name and leave-one-out log probability of each form (thresholds or a classifier) that was compared.
+    scores: tuple[tuple[str, float], ...]
 
     def probability(self, q: Tensor) -> Tensor:
         """Return the probability (m,) that states q (m, C) lie inside the region."""
