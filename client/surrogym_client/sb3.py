@@ -75,7 +75,7 @@ class SurrogateVecEnv(VecEnv):
         view = self._lanes.view
         super().__init__(num_envs, space(view.observation_space), space(view.action_space))
         self._actions: NDArray[Any] | None = None
-        self._penalty = np.zeros(num_envs)  # (N,) sum of the penalties in each running episode
+        self._penalty = np.zeros(num_envs)  # (N,) sum of the penalties for uncertainty in each running episode
 
     @property
     def session(self) -> str:

@@ -29,7 +29,8 @@ LONGEST = 5
 EPISODE = 20  # largest number of steps in an episode of the test
 HELD = 4  # largest number of steps for which a random action is held
 RIDGE = 1e-6  # ridge term of the linear regression, relative to the variance of its inputs
-# A history (past values in the state) suffices if its prediction error is below this share of the changes' deviation.
+# A history (past values in the state) suffices if its prediction error is below this share of the standard deviation of
+# the changes.
 ENOUGH = 0.05
 # A history (past values in the state) also suffices if its prediction error is below this multiple of the smallest
 # prediction error of all histories.

@@ -10,7 +10,7 @@ from surrogym_sampler.original.executables import is_executable
 from surrogym_sampler.original.periods import is_other
 from surrogym_shared.spec import BoxAction, DiscreteAction, EnvironmentSpec
 
-ROUNDING = 1e-6  # a value may exceed a limit by this share of the limit, because float32 rounds
+ROUNDING = 1e-6  # an end of a range may be exceeded by this share of the end, because float32 rounds
 
 Range: TypeAlias = tuple[float, float]
 

@@ -30,7 +30,7 @@ from surrogym_shared.spec import EnvironmentSpec
 
 START_LIMIT = 120.0  # seconds until the environment must be made; importing a simulator may take long
 PARENTS_BUSINESS = (signal.SIGINT, getattr(signal, "SIGHUP", signal.SIGINT))
-CLOSE_LIMIT = 2.0  # seconds for closing the environment, in addition to the limit of a step
+CLOSE_LIMIT = 2.0  # seconds for closing the environment, in addition to the seconds that one step may take
 
 
 class IsolatedEnvironment:

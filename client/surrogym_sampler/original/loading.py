@@ -106,7 +106,7 @@ def for_queries(
 ) -> Environment:
     """Make an original environment as ``isolated`` does, but one that keeps the limits of its specification."""
     made = isolated(name, step_limit, spec, fallback)
-    # an IsolatedEnvironment keeps the limits by itself
+    # an IsolatedEnvironment keeps the declared limits in its child process
     return made if isinstance(made, IsolatedEnvironment) else keeping_limits(made, fallback)
 
 

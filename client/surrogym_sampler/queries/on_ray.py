@@ -23,7 +23,7 @@ from surrogym_shared.wire import Query
 
 IDLE_SECONDS = 5.0  # longest wait of a claim for queries; a sampler can stop only between claims
 LOOK_SECONDS = 1.0  # seconds between two checks of whether samplers have ended, and of what they report
-STOP_SECONDS = 15.0  # seconds, in addition to the limit of a step, in which stopped samplers have to end
+STOP_SECONDS = 15.0  # seconds in which stopped samplers have to end, in addition to the seconds that one step may take
 NO_MODULE = "No module named "
 WITHOUT_CODE = (
     "; install it on each machine of the cluster, or bring it by --runtime-env FILE, a YAML file with working_dir: ."

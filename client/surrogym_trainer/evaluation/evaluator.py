@@ -96,7 +96,8 @@ class Evaluation:
     varied: tuple[str, ...] = ()  # names of constants of the specification that changed within an episode
     limit: int | None = None  # largest number of steps in an episode, by the specification or by the environment itself
     seeded: bool = True  # whether a second reset with the first seed began in the same state
-    limits: LimitsKept | None = None  # how the specification's limits were kept; None if it has none
+    # How the limits that the specification declares were kept; None if it declares none.
+    limits: LimitsKept | None = None
 
     @property
     def trace(self) -> Trace:

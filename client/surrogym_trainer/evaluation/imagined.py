@@ -33,9 +33,9 @@ STEPS_AT_ONCE = 1_000
 class Imagined:
     """The returns and the penalties of whole virtual episodes."""
 
-    returns: NDArray[np.float64]  # (episodes,) undiscounted returns, less any penalty
-    penalty_share: float  # sum of the penalties as a share of the sum of absolute rewards
-    episode_penalty: float | None  # mean penalty of an episode; None if the session has no penalty
+    returns: NDArray[np.float64]  # (episodes,) undiscounted returns, less the penalties for uncertainty
+    penalty_share: float  # sum of the penalties for uncertainty, as a share of the sum of absolute rewards
+    episode_penalty: float | None  # mean penalty for uncertainty in an episode; None if the session has no penalty
     # (episodes,) whether each episode ended early: outside the sampling range, or where the model is too uncertain, if
     # a reward outside is declared; or where the fallback of declared limits acts. None if neither that reward nor
     # limits are declared.

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from surrogym_shared.limits import left_too_often, limits_of, past, room
 from surrogym_shared.spec import EnvironmentSpec
 
-LEVEL = 0.05  # if a policy keeps its limits as declared, they count as broken with at most this probability
+# If a policy leaves the limits no more often than declared, they count as broken with at most this probability.
+LEVEL = 0.05
 
 
 @dataclass(frozen=True)

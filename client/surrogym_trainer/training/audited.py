@@ -65,7 +65,8 @@ class AuditedTraining:
     progress: Callable[[TrainProgress], None] | None = None
     waiting: Callable[[SurrogateView], None] | None = None
     candidates: Candidates = field(default_factory=Candidates, init=False)
-    _unspent: int = field(default=0, init=False)  # number of rounds of the closed loop that took no real step
+    # Number of rounds (train a policy, then query where it goes) that took no real step.
+    _unspent: int = field(default=0, init=False)
 
     def train(self) -> tuple[TrainResult, Handover]:
         """Train and audit, and train further if the audit fails or lowers the promise clearly.

@@ -25,9 +25,11 @@ from surrogym_trainer.training.settings import (
 )
 from surrogym_trainer.training.trainer import train
 
-ROUND_SHARE = 0.25  # each round before the last training takes at most this share of the last training's virtual steps
+# Each round (train a policy, then query where it goes) takes at most this share of the last training's virtual steps.
+ROUND_SHARE = 0.25
 VISIT_LANES = 32
-VISIT_STEPS = 1_000  # a round collects visited states in at most this number of steps of each virtual environment
+# To find the states that a round's policy visits, each virtual environment takes at most this number of steps.
+VISIT_STEPS = 1_000
 
 
 @dataclass(frozen=True)
@@ -38,9 +40,9 @@ class LoopSettings:
     reaches the design's target.
     """
 
-    queries: int  # number of real steps in one round
+    queries: int  # number of real steps in one round (train a policy, then query where it goes)
     rounds: int = 3
-    # longest time in seconds to wait until the sampler has answered the queries of a round
+    # longest time in seconds to wait until samplers have taken the real steps of a round
     patience_seconds: float = 3_600.0
 
 
@@ -79,7 +81,8 @@ class ClosedLoop:
     waiting: Callable[[SurrogateView], None] | None = None
     trained: list[TrainResult] = field(default_factory=list, init=False)
     candidates: Candidates = field(default_factory=Candidates)
-    _visited: int = field(default=0, init=False)  # number of virtual steps in which the rounds collected visited states
+    # Number of virtual steps that were taken to find the states which policies visit.
+    _visited: int = field(default=0, init=False)
     # for each round, the confidence index over the states that its policy visited; None if it is not known
     _known: list[float | None] = field(default_factory=list, init=False)
     _region_known: bool = field(default=False, init=False)

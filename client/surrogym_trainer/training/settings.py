@@ -11,7 +11,8 @@ from surrogym_shared.wire import OF_PARTICLES, SurrogateView
 
 CHECKS = 12  # number of checks of the imagined return in one training; the best policy is kept
 CHECK_EPISODES = 64
-SUGGESTED_STEPS = 1_000_000  # default largest number of virtual steps, for all rounds together; the paper's maximum
+# Default largest number of virtual steps, for all rounds of training together; the paper's maximum.
+SUGGESTED_STEPS = 1_000_000
 # session options with which each step is a draw from the model's prediction
 DRAWS: dict[str, Any] = {"variant": "probabilistic", "particles": 1, "spread": 0.0}
 # session options with which each episode follows one sampled function
@@ -143,9 +144,11 @@ class TrainProgress:
     total_steps: int
     # imagined return at the last check: mean return of virtual episodes from the declared starts
     imagined_return: float | None
-    penalty_share: float  # sum of the penalties as a share of the sum of absolute rewards, since the last report
-    episode_penalty: float | None = None  # mean penalty of the last 100 training episodes; None without a penalty
-    # confidence index over the states that the policy visited in the last round
+    # Sum of the penalties for uncertainty since the last report, as a share of the sum of absolute rewards.
+    penalty_share: float
+    # Mean penalty for uncertainty in the last 100 training episodes; None without it.
+    episode_penalty: float | None = None
+    # confidence index over the states that the policy visited in the last round of training
     visited_confidence: float | None = None
     stage: str | None = None  # name of the current stage, if the search has stages
 
@@ -161,11 +164,13 @@ class TrainResult:
     imagined_return: float | None  # imagined return of the saved policy
     lost_episodes: int  # number of episodes that ended because the server lost the session
     settings: dict[str, Any]
-    episode_penalty: float | None = None  # mean penalty of the last 100 training episodes; None without a penalty
+    # Mean penalty for uncertainty in the last 100 training episodes; None without it.
+    episode_penalty: float | None = None
     networks: int = 1  # number of networks that the last training began; above 1 if some learned nothing
     gaining: bool = False  # whether the best policy was still improving when the training ended
     untrained: float | None = None  # imagined return of an untrained network; None if not measured
-    visited_confidence: tuple[float | None, ...] = ()  # confidence index over the visited states of each round
+    # For each round of training, the confidence index over the states that its policy visited.
+    visited_confidence: tuple[float | None, ...] = ()
 
 
 class TrainingInterrupted(KeyboardInterrupt):

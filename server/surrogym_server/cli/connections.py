@@ -85,7 +85,7 @@ class Patient(HttpToolsProtocol):
     def on_header(self, name: bytes, value: bytes) -> None:
         self._head_lines += 1
         self._count(len(name) + len(value))
-        # A trailer (header after the body) counts towards the limits, but the app does not get it.
+        # A trailer (header after the body) counts towards the limits of a request's size, but the app does not get it.
         if not self._head_complete:
             super().on_header(name, value)
 

@@ -88,7 +88,8 @@ class Tally:
         self._seq = 0
         self._pending: list[StepResult | PolicyRollout] = []
         self._unfolded = 0  # number of steps in ``_pending``, whose rewards are not summed yet
-        # (2, N) sums of reward and of penalty in the running episode of each lane; None before the first step.
+        # (2, N) sums of the reward and of the penalty for uncertainty in the running episode of each lane; None before
+        # the first step.
         self._sums: NDArray[np.float64] | None = None
         self._steps = 0
         self._episodes = 0
@@ -137,7 +138,8 @@ class Tally:
         ended = np.concatenate([np.atleast_2d(result.terminated | result.truncated) for result in self._pending])
         self._pending.clear()
         self._unfolded = 0
-        gains = np.stack([reward, penalty], 1)  # (T, 2, N) reward and penalty in each of T steps and N lanes
+        # (T, 2, N) reward and penalty for uncertainty in each of T steps and N lanes.
+        gains = np.stack([reward, penalty], 1)
         sums = np.zeros(gains.shape[1:]) if self._sums is None else self._sums
         begin = 0
         for step in np.flatnonzero(ended.any(1)).tolist():

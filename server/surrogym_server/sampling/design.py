@@ -56,9 +56,9 @@ class Decision:
     model: DynamicsModel
     confidences: tuple[OutputConfidence, ...]  # (O,) how well the model knows each output
     tolerances: tuple[float, ...]  # (O,) tolerance of each output: declared or default, widened by confirmed noise
-    state: DesignState  # state to pass to the next round
+    state: DesignState  # state to pass to the next round of the design
     verdict: Verdict
-    queries: tuple[Query, ...]  # real steps that are requested before the next round
+    queries: tuple[Query, ...]  # real steps that are requested before the next round of the design
 
 
 def initial_queries(definition: EnvironmentDefinition, budget: int) -> tuple[Query, ...]:

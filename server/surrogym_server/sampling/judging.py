@@ -36,7 +36,7 @@ class Judgement:
     confidences: tuple[OutputConfidence, ...]  # (O,) how well the model knows each output
     # (O,) tolerances with which the confidences were computed: sqrt(tolerance^2 + noise^2), with the confirmed noise.
     widened_tolerances: tuple[float, ...]
-    verdict: Verdict  # verdict that follows from this model alone, without regard to earlier rounds
+    verdict: Verdict  # verdict that follows from this model alone, without regard to earlier rounds of the design
     candidates: Candidates  # points from which the next queries are chosen
 
 

@@ -12,7 +12,8 @@ from torch import Tensor
 from surrogym_server.environment.definition import EnvironmentDefinition
 
 Array = NDArray[np.float64]
-REDRAWS = 100  # greatest number of times that points in terminated states or near a limit are drawn again
+# Greatest number of times that points in terminal states, or within the margin of a declared limit, are drawn again.
+REDRAWS = 100
 
 
 def latin_hypercube(

@@ -11,7 +11,7 @@ from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.samples import Samples, limit_sides
 from surrogym_shared.kinds import Side
 
-MANY = 0.2  # a limit is reported if at least this share of the samples end at it
+MANY = 0.2  # a bound of a coordinate is reported if at least this share of the samples end at it
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class Limit:
     coordinate: str
     side: Side
     value: float
-    share: float  # share of the samples whose next state is at the limit
+    share: float  # share of the samples whose next state is at this bound
 
 
 def reached_limits(definition: EnvironmentDefinition, samples: Samples) -> tuple[Limit, ...]:

@@ -64,7 +64,7 @@ class Paths:
     q: Tensor  # (b, T, C) states before each step
     u: Tensor  # (b, T, F) actions
     q_next: Tensor  # (b, T, C) states after each step
-    running: Tensor  # (b, T) 1 for steps of a running episode; 0 after the episode ended or came too close to a limit
+    running: Tensor  # (b, T) 1 for steps of a running episode; 0 after it ended or came too close to a declared limit
     ended: Tensor  # (b, T) 1 from the step that ends the episode, 0 before
     # (b, T) predictive variances of the moving coordinates, summed over coordinates and earlier steps, each divided by
     # the variance of the coordinate's sampling range.

@@ -28,7 +28,8 @@ FEW = 3.0
 FARTHEST = 3.0  # largest distance by which a test shifts a position, in the simulator's unit
 TURN = 2 * np.pi
 PART = 1.0  # shift in radians, less than a turn, that must change something if a variable is an angle
-ANYWHERE = 32  # number of random states within the limits from which a step tests whether states stay inside
+# Number of random states within the limits of the variables; a step from each tests whether states stay inside.
+ANYWHERE = 32
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ class Rollout:
 
     rows: Batch
     earned: list[float]  # unscaled returns of the episodes that ended
-    penalty_share: float  # sum of the penalties as a share of the sum of absolute rewards
+    penalty_share: float  # sum of the penalties for uncertainty, as a share of the sum of absolute rewards
     lost: int  # number of episodes that were cut because the server lost the session
 
 
@@ -46,7 +46,7 @@ class Collector:
         self._lanes.reset()
         self._scale = RewardScale(lanes.num_envs, gamma)
         self._earned = np.zeros(lanes.num_envs)  # (N,) returns of the running episodes
-        # (N,) penalties that were subtracted from the returns of the running episodes
+        # (N,) penalties for uncertainty that were subtracted from the returns of the running episodes
         self._penalty = np.zeros(lanes.num_envs)
         self._penalties: deque[float] = deque(maxlen=LATEST_EPISODES)
 

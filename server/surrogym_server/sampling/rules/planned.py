@@ -6,7 +6,8 @@ from surrogym_server.sampling.rollouts import Aim, plan_round
 from surrogym_server.sampling.round import Round
 from surrogym_shared.nouns import Query
 
-SHORTEST = 4  # if the environment has no snapshots, a planned round has at least this many real steps
+# If the environment has no snapshots, a round of planned action sequences has at least this many real steps.
+SHORTEST = 4
 
 
 def plan_rollouts(round: Round) -> tuple[Query, ...]:

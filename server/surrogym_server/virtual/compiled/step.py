@@ -48,7 +48,7 @@ class _Changed:
     phase: NDArray[np.int8]  # (N,) phase of each lane: NEW, RUNNING or ENDED
     rewards: Floats  # (2, N) rewards less the penalties for uncertainty, and rewards without them
     # (5, N) five flags of each lane. The episode: terminated; was truncated; was truncated because the model is too
-    # uncertain; terminated or was truncated; ended early, for a declared outside reward or limit (see ``_left``).
+    # uncertain; terminated or was truncated; ended early, as a declared outside reward or limits require.
     ends: Bools
 
     @classmethod

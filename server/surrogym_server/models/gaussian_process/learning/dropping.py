@@ -45,7 +45,7 @@ def without_inputs(
     if posterior.sparse is not None:
         x = inputs_of(output, inputs)[used]
         y = output.standardised(target[used], x)
-        # The process also learned from samples at limits; ``used`` lacks them, so no input can be tested.
+        # the process also learned from samples at bounds, which ``used`` lacks, so no input can be tested
         if posterior.points != len(x):
             return output
     try:

@@ -101,8 +101,8 @@ def _transitions(learner: OutputLearner, samples: Samples, known: Tensor | None)
     keep = ~saturated(definition, samples.q_next)
     keep = keep if int(keep.sum()) >= MIN_POINTS else everything
     sides = limit_sides(definition, samples.q_next)
-    # ``sides`` marks samples at a limit, which give an inequality for the coordinate at its limit. A sample at the
-    # limits of several coordinates gives none, so it is not marked.
+    # ``sides`` marks samples that ended at a bound of a coordinate, which give an inequality for this coordinate. A
+    # sample at bounds of several coordinates gives none, so it is not marked.
     sides = sides * ((sides != 0).sum(-1, keepdim=True) == 1)
     lead, drift = leading(definition), learn_drift(definition, samples)
     outputs = []

@@ -29,18 +29,19 @@ from surrogym_server.models.gaussian_process.learning.output_learner import Outp
 from surrogym_server.models.gaussian_process.learning.rates import inputs_of, output_with_rates
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 
-# Warm starts are stored by output. For a fit that includes samples at limits of other coordinates, this is added to the
-# output's name.
+# Warm starts are stored by output. For a fit that includes samples at limits (bounds) of other coordinates, this is
+# added to the output's name.
 WIDER = " past limits"
-# Warm starts are stored by output. For a fit that includes samples at the output's own limit, this is added to the
-# output's name.
+# Warm starts are stored by output. For a fit that includes samples at the limits (bounds) of the output's own
+# coordinate, this is added to the output's name.
 HELD = " held"
-SHORT = 0.01  # a prediction may fall short of a reached limit by this many standard deviations of the targets
-ROUNDS = 3  # a process is fitted again at most this often, each time with further samples at limits that it contradicts
-# Samples at limits are discarded if they increase the misfit by more than this factor. The factor is large because few
-# samples measure the misfit only roughly.
+# If a sample ended at a bound, the prediction may fall short of it by this many standard deviations of the targets.
+SHORT = 0.01
+ROUNDS = 3  # a process is fitted again at most this often, each time with further samples that ended at a bound
+# Samples that ended at a bound are discarded if they increase the misfit by more than this factor. The factor is large
+# because few samples measure the misfit only roughly.
 WORSE = 10.0
-MOST = 200  # at most this many samples at limits are added to a fit, as observations of their limit
+MOST = 200  # at most this many samples that ended at a bound are added to a fit, as observations of the bound
 
 
 def past_limits(

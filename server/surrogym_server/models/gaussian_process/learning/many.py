@@ -136,7 +136,8 @@ class ByBound(ManySamples):
         mirror: Reflection | None,
         at_limit: Censored | None,
     ) -> Posterior:
-        # Points at limits help to choose between candidate hyperparameters, but here is only one candidate.
+        # Samples that ended at a bound help to choose between candidate hyperparameters, but here is only one
+        # candidate.
         del at_limit
         return fit_bound(x, y, options, theta, self.inducing, mirror)
 

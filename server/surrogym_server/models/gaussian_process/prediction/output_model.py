@@ -33,9 +33,10 @@ class OutputModel:
     # Name and score of every candidate that was compared, usually the log evidence of an encoding of state and action.
     scores: tuple[tuple[str, float], ...] = ()
     warp: Warp | None = None
-    past_limits: bool = False  # whether the output learned from samples that ended at a limit of another coordinate
-    # For each point of the process, 1 if it ended at the output's upper limit, -1 at the lower, otherwise 0. The tuple
-    # is empty if no point ended at a limit.
+    # Whether the output also learned from samples that ended at a bound of another coordinate.
+    past_limits: bool = False
+    # For each point of the process, 1 if it ended at the upper bound of the output's coordinate, -1 at the lower,
+    # otherwise 0. The tuple is empty if no point ended at a bound.
     at_limit: tuple[int, ...] = ()
     # Names of other outputs from whose samples this output learned too, see ``gp.pooling``.
     shared: tuple[str, ...] = ()
