@@ -63,8 +63,8 @@ def drawn_with(name: str) -> list[tuple[str, str]]:
 
 def read_of(spec: EnvironmentSpec, name: str) -> Read | None:
     """Return a function that computes a coordinate from an observation; None if no entry shows the coordinate."""
-    # By the function of an observation entry, such as "sin": the entry's index, and the factor and offset of the
-    # function.
+    # The observation entries that show the coordinate: by an entry's function, such as "sin", its index, factor and
+    # offset.
     found: dict[str, tuple[int, float, float]] = {}
     for index, entry in enumerate(spec.observation):
         parts = [part for part in entry.term.parts if part.function != "one"]

@@ -36,7 +36,7 @@ from surrogym_shared.wire import ClaimedQueries, NewSample, Phase, Query, StepQu
 PATIENCE = Retries(seconds=900.0, first_delay=0.1, longest_delay=5.0)
 LOOK_SECONDS = 0.1  # seconds between two checks by a waiting sampler of whether it was stopped
 LAST_SECONDS = 5.0  # a stopped sampler tries for these seconds to send its last real step
-END_SECONDS = 2.0  # longest wait of a claim, in seconds, if the sampler has to end with the design
+END_SECONDS = 2.0  # if the sampler ends with the design, a claim for queries waits at most this many seconds
 AGAIN_SECONDS = 1.0  # seconds to wait after a claim that gave no query which the environment allows
 MOST_GONE = 1_000  # largest number of deleted snapshots in one report to the server
 STOPPED = "the sampler was stopped"

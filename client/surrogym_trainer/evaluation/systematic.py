@@ -43,7 +43,8 @@ DEGREES = 0.1  # degrees of freedom of the prior for the errors' standard deviat
 # a standardised input is clipped to this number of standard deviations; sessions that add an error to the model clip it
 # likewise
 FARTHEST = 3.0
-# A test takes a model's error on left-out samples to be at least this share of the output's tolerance.
+# The test for errors that all steps share takes a model's error on left-out samples to be at least this share of the
+# output's tolerance.
 LEAST = 1e-3
 # to find where an error is largest, an input's range is divided into this number of parts with equal numbers of steps
 PARTS = 3

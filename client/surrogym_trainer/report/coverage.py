@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from surrogym_shared.spec import BoxAction, EnvironmentSpec, limits
 
-CELLS = 10  # number of cells along each side of a grid
+CELLS = 10  # a picture counts samples in a grid with this number of cells along each side
 MOST_COLUMNS = 8  # a picture shows at most this number of columns, so that it stays readable
 
 Array = NDArray[np.float64]

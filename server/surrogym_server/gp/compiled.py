@@ -246,7 +246,9 @@ def _add_residuals(
         amplitude = np.sqrt(head[0, SIGNAL] / count)
         total = dot(cosine, paths[b, :count]) + dot(sine, paths[b, count : 2 * count])
         if parity != 0:
-            if head[0, TURNS_ALL]:  # the mirror image has the opposite phase: cos(-a) = cos(a), sin(-a) = -sin(a)
+            # A mirror image that changes the sign of every input has the opposite phase: cos(-a) = cos(a), sin(-a) =
+            # -sin(a).
+            if head[0, TURNS_ALL]:
                 total += parity * (dot(cosine, paths[b, :count]) - dot(sine, paths[b, count : 2 * count]))
             else:
                 sine_and_cosine(mirrored, sine, cosine)
