@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from surrogym_server.environment import conditions, declared_reward, distributions, safety, terms
 from surrogym_server.environment import definition as core
+from surrogym_server.environment import distributions
 from surrogym_server.environment.observation_inverse import ObservationInverse
 from surrogym_server.errors import InvalidSpec
 from surrogym_server.models.registry import GAUSSIAN_PROCESS, in_full, learner_of
@@ -37,28 +37,23 @@ def stored_definition(spec: wire.EnvironmentSpec) -> core.EnvironmentDefinition:
     Raises:
         InvalidSpec: the preset can't represent this environment.
     """
-    names = spec.coordinate_names
     definition = core.EnvironmentDefinition(
         coordinates=tuple(_coordinate(c, spec) for c in spec.coordinates),
-        observation_names=spec.observation_names,
-        observation_terms=tuple(_term(o.term, names) for o in spec.observation),
-        observation_low=tuple(_or(o.low, -math.inf) for o in spec.observation),
-        observation_high=tuple(_or(o.high, math.inf) for o in spec.observation),
+        observation=spec.observation,
         action=_action(spec.action),
-        termination_groups=tuple(tuple(_inequality(i, names) for i in g) for g in spec.termination_groups),
+        termination_groups=spec.termination_groups,
         time_limit=spec.time_limit,
-        reward_timing=spec.reward.timing,
+        reward=spec.reward,
         penalty=_penalty(spec),
         tolerances=tuple(spec.tolerances.items()),
         learning=_learning(spec),
         design=_design(spec),
         learns_termination=spec.termination == "learned",
-        declared_reward=_declared_reward(spec),
         max_rollout=_max_rollout(spec) if spec.query == "rollout" else None,
         snapshots=spec.snapshots,
         starts=spec.starts,
         outside_reward=spec.outside_reward,
-        limits=None if spec.limits is None else _limits(spec.limits, names),
+        limits=spec.limits,
         rates=tuple(core.RateDefinition(rate.entry, rate.last, rate.change) for rate in rates(spec)),
     )
     if definition.moves_observation:
@@ -153,52 +148,10 @@ def _distribution(distribution: wire.Uniform | wire.Normal | wire.Fixed) -> dist
     raise InvalidSpec(f"distribution of a coordinate: expected uniform, normal or fixed, got {distribution!r}")
 
 
-def _term(term: wire.Term, names: tuple[str, ...]) -> terms.TermDefinition:
-    parts = tuple(
-        terms.PartDefinition(p.function, p.coefficient, tuple(p.weights.get(n, 0.0) for n in names)) for p in term.parts
-    )
-    return terms.TermDefinition(parts, _or(term.low, -math.inf), _or(term.high, math.inf))
-
-
 def _penalty(spec: wire.EnvironmentSpec) -> float:
     if isinstance(spec.reward, wire.DeclaredReward):
         return 0.0
     return _or(spec.reward.penalty, spec.preset.penalty)
-
-
-def _declared_reward(spec: wire.EnvironmentSpec) -> declared_reward.DeclaredRewardDefinition | None:
-    if not isinstance(spec.reward, wire.DeclaredReward):
-        return None
-    names = spec.coordinate_names
-    reward_terms = tuple(
-        declared_reward.RewardTermDefinition(
-            term.weight,
-            term.shape,
-            tuple(_quantity(quantity, spec) for quantity in term.of),
-            tuple(_inequality(inequality, names) for inequality in term.when),
-        )
-        for term in spec.reward.terms
-    )
-    return declared_reward.DeclaredRewardDefinition(
-        reward_terms, spec.reward.timing == "after", spec.reward.terminal, len(names)
-    )
-
-
-def _quantity(quantity: wire.Quantity, spec: wire.EnvironmentSpec) -> declared_reward.QuantityDefinition:
-    term = terms.TermDefinition(()) if quantity.term is None else _term(quantity.term, spec.coordinate_names)
-    return declared_reward.QuantityDefinition(term, quantity.action or (0.0,) * spec.action.size)
-
-
-def _inequality(inequality: wire.Inequality, names: tuple[str, ...]) -> conditions.InequalityDefinition:
-    return conditions.InequalityDefinition(_term(inequality.term, names), inequality.relation, inequality.value)
-
-
-def _limits(limits: wire.Limits, names: tuple[str, ...]) -> safety.LimitsDefinition:
-    keep = (
-        safety.LimitDefinition(_term(x.term, names), _or(x.low, -math.inf), _or(x.high, math.inf), x.margin)
-        for x in limits.keep
-    )
-    return safety.LimitsDefinition(tuple(keep), limits.probability)
 
 
 def _action(action: wire.BoxAction | wire.DiscreteAction | wire.MultiDiscreteAction) -> core.ActionDefinition:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Iterator
 from dataclasses import fields
 from typing import Any
@@ -71,7 +70,7 @@ def session_view(session: SessionInfo, idle_seconds: float, replay: int = 0) -> 
         seq=session.seq,
         time_limit=session.settings.time_limit,
         penalty=session.settings.penalty,
-        observation_space=_box(session.definition.observation_low, session.definition.observation_high),
+        observation_space=_box((o.low, o.high) for o in session.definition.observation),
         action_space=_action_space(session.definition.action),
         outputs=list(session.definition.outputs),
         idle_seconds=idle_seconds,
@@ -102,16 +101,15 @@ def session_activity(activity: SessionActivity) -> replies.SessionActivity:
     )
 
 
-def _box(low: Iterable[float], high: Iterable[float]) -> replies.BoxSpace:
-    return replies.BoxSpace(
-        low=[x if math.isfinite(x) else None for x in low], high=[x if math.isfinite(x) else None for x in high]
-    )
+def _box(ranges: Iterable[tuple[float | None, float | None]]) -> replies.BoxSpace:
+    low, high = zip(*ranges, strict=True)
+    return replies.BoxSpace(low=list(low), high=list(high))
 
 
 def _action_space(action: core.ActionDefinition) -> replies.ActionSpace:
     match action.policy_counts:
         case ():
-            return _box(action.low, action.high)
+            return _box(zip(action.low, action.high, strict=True))
         case (n,) if action.kind != "multi_discrete":
             return replies.DiscreteSpace(n=n)
         case counts:

@@ -10,18 +10,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from surrogym_server.environment.terms import TermDefinition, TermSet, compile_terms
+from surrogym_server.environment.terms import TermSet, compile_terms
 from surrogym_server.tensors import CPU, to_device
-from surrogym_shared.kinds import Relation
-
-
-@dataclass(frozen=True)
-class InequalityDefinition:
-    """Inequality between a term (a function of the coordinates) and a number, such as x > 0.5."""
-
-    term: TermDefinition
-    relation: Relation
-    value: float
+from surrogym_shared.spec import Inequality
 
 
 @dataclass(frozen=True)
@@ -35,10 +26,8 @@ class Conditions:
     membership: Tensor  # (K, G) 1 if the inequality of this row belongs to the group of this column, otherwise 0
 
     @classmethod
-    def of(
-        cls, groups: Sequence[Sequence[InequalityDefinition]], coordinates: int, device: torch.device = CPU
-    ) -> Conditions:
-        """Compile groups of inequalities over C coordinates. An empty group always holds."""
+    def of(cls, groups: Sequence[Sequence[Inequality]], names: Sequence[str], device: torch.device = CPU) -> Conditions:
+        """Compile groups of inequalities over the C coordinates ``names``. An empty group always holds."""
         inequalities = [i for group in groups for i in group]
         belongs = [g for g, group in enumerate(groups) for _ in group]
         sign = np.array([1.0 if i.relation in (">", ">=") else -1.0 for i in inequalities])
@@ -46,7 +35,7 @@ class Conditions:
         strict = np.array([i.relation in ("<", ">") for i in inequalities], dtype=bool)
         threshold = np.where(strict, np.nextafter(bound, np.inf), bound)
         membership = np.eye(len(groups))[belongs].reshape(len(inequalities), len(groups))
-        terms = compile_terms([i.term for i in inequalities], coordinates)
+        terms = compile_terms([i.term for i in inequalities], names)
         compiled = cls(terms, *(torch.from_numpy(array) for array in (sign, threshold, membership)))
         return to_device(compiled, device)
 

@@ -3,72 +3,62 @@ is data, and evaluating it runs no code of a user."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from surrogym_server.environment.conditions import Conditions, InequalityDefinition
-from surrogym_server.environment.terms import TermDefinition, TermSet, compile_terms
-from surrogym_server.tensors import CPU, cached, to_device
+from surrogym_server.environment.conditions import Conditions
+from surrogym_server.environment.terms import TermSet, compile_terms
+from surrogym_server.tensors import CPU, to_device
 from surrogym_shared.kinds import RewardShape
+from surrogym_shared.spec import DeclaredReward
 
 
 @dataclass(frozen=True)
-class QuantityDefinition:
-    """Quantity on which terms of a declared reward depend: x = term(q) + action . u, with coordinates q and
-    action u."""
+class RewardFunction:
+    """Compiled declared reward: a sum of R terms, which depend on X quantities. See ``spec.RewardTerm``."""
 
-    term: TermDefinition
-    action: tuple[float, ...]  # (F,) weight of each action entry in the quantity
+    declared: DeclaredReward
+    values: TermSet  # part of each of the X quantities that depends on the coordinates
+    weights: Tensor  # (F, X) weight of each action entry in each quantity; empty if the reward depends on no quantity
+    conditions: Conditions  # one group of inequalities for each of the R terms, which counts only where they all hold
 
+    @classmethod
+    def of(
+        cls, declared: DeclaredReward, names: Sequence[str], actions: int, device: torch.device = CPU
+    ) -> RewardFunction:
+        """Compile a reward of the C coordinates ``names`` and of F = ``actions`` action entries."""
+        quantities = [quantity for term in declared.terms for quantity in term.of]
+        values = compile_terms([quantity.of_state for quantity in quantities], names)
+        rows = [quantity.action or (0.0,) * actions for quantity in quantities]
+        weights = torch.tensor(rows, dtype=torch.float64).reshape(len(rows), -1 if rows else 1).T
+        conditions = Conditions.of([term.when for term in declared.terms], names)
+        return to_device(cls(declared, values, weights, conditions), device)
 
-@dataclass(frozen=True)
-class RewardTermDefinition:
-    """Term of a declared reward: weight * shape(x_1, x_2, ...), if every inequality in ``when`` holds, else 0. The
-    shape is a function, such as the square, of the quantities x_1, x_2, ... in ``of``; see ``spec.RewardTerm``."""
+    @property
+    def after(self) -> bool:
+        """Whether the reward depends on the state after the step instead of the one before."""
+        return self.declared.timing == "after"
 
-    weight: float
-    shape: RewardShape
-    of: tuple[QuantityDefinition, ...]
-    when: tuple[InequalityDefinition, ...]
-
-
-@dataclass(frozen=True)
-class DeclaredRewardDefinition:
-    """Declared reward: the sum of its terms, which depend on the action and on the state before or after the step."""
-
-    terms: tuple[RewardTermDefinition, ...]
-    after: bool  # whether the reward depends on the state after the step instead of the one before
-    terminal: float  # reward that is added if the step reaches a terminal state
-    coordinates: int  # number of coordinates of a state, C
-    device: torch.device = CPU  # device on which the reward is computed
+    @property
+    def terminal(self) -> float:
+        """Reward that is added if the step reaches a terminal state."""
+        return self.declared.terminal
 
     def __call__(self, q: Tensor, u: Tensor) -> Tensor:
         """Return the reward (m,) of actions u (m, F) in states q (m, C), without the reward ``terminal`` of terminating
         steps. If ``after`` is true, q are the states after the step, otherwise those before it."""
-        values, weights, conditions = self._compiled
-        # ``weights`` is empty if the reward depends on no quantity.
-        x = values(q) + u @ weights if weights.numel() else values(q)
-        holds = conditions(q)
+        x = self.values(q) + u @ self.weights if self.weights.numel() else self.values(q)
+        holds = self.conditions(q)
         total = q.new_zeros(len(q))
         begin = 0
-        for index, term in enumerate(self.terms):
+        for index, term in enumerate(self.declared.terms):
             own = x[:, begin : begin + len(term.of)]
             begin += len(term.of)
             total = total + term.weight * _shaped(term.shape, own) * holds[:, index]
         return total
-
-    @cached
-    def _compiled(self) -> tuple[TermSet, Tensor, Conditions]:
-        """Compiled form of the reward: the functions of the coordinates in its X quantities, the action weights (F, X)
-        of these quantities, and the conditions of each reward term."""
-        quantities = [quantity for term in self.terms for quantity in term.of]
-        weights = torch.tensor([quantity.action for quantity in quantities], dtype=torch.float64)
-        terms = compile_terms([quantity.term for quantity in quantities], self.coordinates)
-        conditions = Conditions.of([term.when for term in self.terms], self.coordinates)
-        compiled = terms, weights.T if quantities else weights.reshape(1, 0), conditions
-        return to_device(compiled, self.device)
 
 
 def _shaped(shape: RewardShape, x: Tensor) -> Tensor:

@@ -1,9 +1,9 @@
 """EnvironmentDefinition: one environment in the form with which the core computes.
 
-A specification (``surrogym_shared.spec``) is what a person writes: it names coordinates, leaves defaults open, and is
-checked when it is made. A definition is derived from it, only in ``convert.definitions``: it has an index in place of
-each name, a weight for each coordinate, infinity in place of an open limit, and every default. Names of classes of a
-definition end in ``Definition``, those of a specification do not: ``spec.Term``, ``TermDefinition``.
+A specification (``surrogym_shared.spec``) is what a person writes: it leaves defaults open, and is checked when it is
+made. A definition is derived from it, only in ``convert.definitions``: it has every default. Both have the same terms,
+inequalities, rewards and limits, of the frozen types in ``surrogym_shared.spec``. The core makes none of them. What a
+step needs is compiled from them when it is first used, with an index in place of each name.
 """
 
 from __future__ import annotations
@@ -19,15 +19,16 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from surrogym_server.environment.conditions import Conditions, InequalityDefinition
-from surrogym_server.environment.declared_reward import DeclaredRewardDefinition
+from surrogym_server.environment.conditions import Conditions
+from surrogym_server.environment.declared_reward import RewardFunction
 from surrogym_server.environment.distributions import Distribution
-from surrogym_server.environment.safety import Limits, LimitsDefinition
-from surrogym_server.environment.terms import TermDefinition, TermSet, compile_terms
+from surrogym_server.environment.safety import LimitSet
+from surrogym_server.environment.terms import TermSet, compile_terms
 from surrogym_server.plugins import Choice
 from surrogym_server.tensors import CPU, cached, to_device
 from surrogym_shared.kinds import CoordinateKind, LagKind, RewardTiming
 from surrogym_shared.presets import InputProbability, Moves, Stopping, Tolerance
+from surrogym_shared.spec import DeclaredReward, Inequality, Limits, ObservationEntry, Reward
 
 REWARD = "reward"
 REACH = 1e6  # a prediction without a bound is clipped at this many widths of the sampling range beyond that range
@@ -156,21 +157,17 @@ class EnvironmentDefinition:
     """One environment, with C coordinates, D observation entries and F action entries."""
 
     coordinates: tuple[CoordinateDefinition, ...]
-    observation_names: tuple[str, ...]
-    observation_terms: tuple[TermDefinition, ...]
-    observation_low: tuple[float, ...]
-    observation_high: tuple[float, ...]
+    observation: tuple[ObservationEntry, ...]
     action: ActionDefinition
-    termination_groups: tuple[tuple[InequalityDefinition, ...], ...]
+    termination_groups: tuple[tuple[Inequality, ...], ...]
     time_limit: int | None
-    reward_timing: RewardTiming
-    penalty: float
+    reward: Reward | DeclaredReward
+    penalty: float  # k of eq. 14; 0 if the reward is declared
     tolerances: tuple[tuple[str, float], ...]
     learning: LearningDefinition
     design: DesignDefinition
     # Whether a model learns from samples which states are terminal. Then ``termination_groups`` is empty.
     learns_termination: bool = False
-    declared_reward: DeclaredRewardDefinition | None = None
     # Largest number of actions in a query, which is then a rollout. None if the original environment can be set to any
     # state, so that a query is a single step.
     max_rollout: int | None = None
@@ -180,7 +177,7 @@ class EnvironmentDefinition:
     # A virtual episode that leaves the sampling range ends, and gets this reward for each step up to the time limit.
     # None: leaving the range does not end an episode.
     outside_reward: float | None = None
-    limits: LimitsDefinition | None = None  # declared limits within which the original environment has to stay
+    limits: Limits | None = None  # declared limits within which the original environment has to stay
     rates: tuple[RateDefinition, ...] = ()  # largest changes of action entries per step; empty: no limits
     device: torch.device = CPU  # device of the definition's tensors, and of states and actions that are passed to it
 
@@ -206,6 +203,21 @@ class EnvironmentDefinition:
     @cached_property
     def coordinate_names(self) -> tuple[str, ...]:
         return tuple(c.name for c in self.coordinates)
+
+    @cached_property
+    def observation_names(self) -> tuple[str, ...]:
+        return tuple(o.name for o in self.observation)
+
+    @property
+    def reward_timing(self) -> RewardTiming:
+        return self.reward.timing
+
+    @cached
+    def declared_reward(self) -> RewardFunction | None:
+        """The declared reward as a function of states and actions; None if the reward is learned."""
+        if not isinstance(self.reward, DeclaredReward):
+            return None
+        return RewardFunction.of(self.reward, self.coordinate_names, self.action.size, self.device)
 
     @cached_property
     def moving(self) -> tuple[int, ...]:
@@ -268,13 +280,13 @@ class EnvironmentDefinition:
     @cached
     def observe(self) -> TermSet:
         """Function that computes the observations o (..., D) of coordinates q (..., C)."""
-        return to_device(compile_terms(self.observation_terms, len(self.coordinates)), self.device)
+        return to_device(compile_terms([o.term for o in self.observation], self.coordinate_names), self.device)
 
     @cached_property
     def observation_combines(self) -> bool:
         """Whether any observation entry is a sum of several functions, or a function of several coordinates."""
-        terms = self.observation_terms
-        return any(len(t.parts) > 1 or any(np.count_nonzero(p.weights) > 1 for p in t.parts) for t in terms)
+        sums = [o.term.parts for o in self.observation]
+        return any(len(parts) > 1 or any(sum(map(bool, p.weights.values())) > 1 for p in parts) for parts in sums)
 
     @cached
     def observation_scaling(self) -> tuple[Tensor, Tensor]:
@@ -352,13 +364,13 @@ class EnvironmentDefinition:
         return self._limits.room(q)
 
     @cached
-    def _limits(self) -> Limits:
+    def _limits(self) -> LimitSet:
         assert self.limits is not None
-        return Limits.of(self.limits, len(self.coordinates), self.device)
+        return LimitSet.of(self.limits, self.coordinate_names, self.device)
 
     @cached
     def _termination(self) -> Conditions:
-        return Conditions.of(self.termination_groups, len(self.coordinates), self.device)
+        return Conditions.of(self.termination_groups, self.coordinate_names, self.device)
 
     @cached
     def start_states(self) -> Tensor:

@@ -12,8 +12,10 @@ import torch
 from torch import Tensor
 
 from surrogym_server.environment.definition import EnvironmentDefinition
-from surrogym_server.environment.terms import PartDefinition
+from surrogym_server.environment.terms import parts_of
 from surrogym_server.errors import InvalidSpec
+from surrogym_shared.kinds import Function
+from surrogym_shared.spec import ends_of
 
 
 @dataclass(frozen=True)
@@ -43,11 +45,10 @@ class ObservationInverse:
 
 def _source(definition: EnvironmentDefinition, index: int) -> tuple[int, ...]:
     coordinate = definition.coordinates[index]
-    unit = tuple(float(i == index) for i in range(len(definition.coordinates)))
-    direct = _entry(definition, PartDefinition("linear", 1.0, unit), coordinate.sampling.low, coordinate.sampling.high)
+    direct = _entry(definition, "linear", index, coordinate.sampling.low, coordinate.sampling.high)
     if direct is not None:
         return (direct,)
-    cosine, sine = (_entry(definition, PartDefinition(f, 1.0, unit), -1.0, 1.0) for f in ("cos", "sin"))
+    cosine, sine = (_entry(definition, "cos", index, -1.0, 1.0), _entry(definition, "sin", index, -1.0, 1.0))
     if coordinate.kind == "angle" and cosine is not None and sine is not None:
         return (cosine, sine)
     raise InvalidSpec(
@@ -57,10 +58,13 @@ def _source(definition: EnvironmentDefinition, index: int) -> tuple[int, ...]:
     )
 
 
-def _entry(definition: EnvironmentDefinition, part: PartDefinition, low: float, high: float) -> int | None:
-    """Return the index of the observation entry that equals ``part`` alone and is not clipped within [low, high]; None
-    if there is no such entry."""
-    for position, term in enumerate(definition.observation_terms):
-        if term.parts == (part,) and term.low <= low and term.high >= high:
+def _entry(definition: EnvironmentDefinition, function: Function, index: int, low: float, high: float) -> int | None:
+    """Return the index of the observation entry that is ``function`` of coordinate number ``index`` alone and is not
+    clipped within [low, high]; None if there is no such entry."""
+    unit = tuple(float(i == index) for i in range(len(definition.coordinates)))
+    for position, entry in enumerate(definition.observation):
+        least, most = ends_of(entry.term.low, entry.term.high)
+        alone = parts_of(entry.term, definition.coordinate_names) == ((function, 1.0, unit),)
+        if alone and least <= low and most >= high:
             return position
     return None

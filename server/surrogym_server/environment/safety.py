@@ -8,31 +8,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from surrogym_server.environment.terms import TermDefinition, TermSet, compile_terms
+from surrogym_server.environment.terms import TermSet, compile_terms
 from surrogym_server.tensors import CPU, to_device
+from surrogym_shared.spec import Limits, ends_of
 
 
 @dataclass(frozen=True)
-class LimitDefinition:
-    """Declared limit: the range [low, high] in which a term, a function of the coordinates, has to stay. If the term is
-    closer than ``margin`` to an end, the declared fallback action takes over."""
-
-    term: TermDefinition
-    low: float
-    high: float
-    margin: float
-
-
-@dataclass(frozen=True)
-class LimitsDefinition:
-    """L declared limits. ``probability`` is the greatest share of episodes that may leave a limit."""
-
-    keep: tuple[LimitDefinition, ...]
-    probability: float
-
-
-@dataclass(frozen=True)
-class Limits:
+class LimitSet:
     """L limits, compiled to tensors that evaluate them for many states at once."""
 
     terms: TermSet
@@ -41,10 +23,10 @@ class Limits:
     margin: Tensor  # (L,) a declared fallback action takes over if a term is closer than this to an end of its range
 
     @classmethod
-    def of(cls, declared: LimitsDefinition, coordinates: int, device: torch.device = CPU) -> Limits:
-        """Compile limits over C coordinates on a device."""
-        terms = compile_terms([limit.term for limit in declared.keep], coordinates)
-        rows: Sequence[tuple[float, ...]] = [(limit.low, limit.high, limit.margin) for limit in declared.keep]
+    def of(cls, declared: Limits, names: Sequence[str], device: torch.device = CPU) -> LimitSet:
+        """Compile limits over the C coordinates ``names`` on a device."""
+        terms = compile_terms([limit.term for limit in declared.keep], names)
+        rows = [(*ends_of(limit.low, limit.high), limit.margin) for limit in declared.keep]
         low, high, margin = torch.tensor(rows, dtype=torch.float64).T.contiguous().unbind()
         return to_device(cls(terms, low, high, margin), device)
 

@@ -11,24 +11,7 @@ from torch import Tensor
 from torch.nn.functional import linear
 
 from surrogym_shared.kinds import Function
-
-
-@dataclass(frozen=True)
-class PartDefinition:
-    """Part of a term: coefficient * function(weights . q), with a weight for each coordinate (C,)."""
-
-    function: Function
-    coefficient: float
-    weights: tuple[float, ...]
-
-
-@dataclass(frozen=True)
-class TermDefinition:
-    """Function of the coordinates: a sum of parts, clipped to [low, high]."""
-
-    parts: tuple[PartDefinition, ...]
-    low: float = -torch.inf
-    high: float = torch.inf
+from surrogym_shared.spec import Term, ends_of
 
 
 @dataclass(frozen=True)
@@ -51,27 +34,35 @@ class TermSet:
         return value if self.low is None else torch.clamp(value, self.low, self.high)
 
 
-def compile_terms(terms: Sequence[TermDefinition], coordinates: int) -> TermSet:
-    """Compile terms, functions of C coordinates, to a ``TermSet``. If several sines and cosines have the same argument,
-    the argument is computed once."""
-    frequencies = sorted({p.weights for t in terms for p in t.parts if p.function in ("sin", "cos")})
-    first = {"sin": coordinates, "cos": coordinates + len(frequencies)}
+def compile_terms(terms: Sequence[Term], names: Sequence[str]) -> TermSet:
+    """Compile terms, functions of the C coordinates ``names``, to a ``TermSet``. If several sines and cosines have the
+    same argument, the argument is computed once."""
+    sums = [parts_of(term, names) for term in terms]
+    frequencies = sorted({weights for parts in sums for function, _, weights in parts if function in ("sin", "cos")})
+    first = {"sin": len(names), "cos": len(names) + len(frequencies)}
     constant = torch.zeros(len(terms), dtype=torch.float64)
-    coefficients = torch.zeros(len(terms), coordinates + 2 * len(frequencies), dtype=torch.float64)
-    for row, term in enumerate(terms):
-        for part in term.parts:
-            if part.function == "one":
-                constant[row] += part.coefficient
-            elif part.function == "linear":
-                weights = torch.tensor(part.weights, dtype=torch.float64)
-                coefficients[row, :coordinates] += part.coefficient * weights
+    coefficients = torch.zeros(len(terms), len(names) + 2 * len(frequencies), dtype=torch.float64)
+    for row, parts in enumerate(sums):
+        for function, coefficient, weights in parts:
+            if function == "one":
+                constant[row] += coefficient
+            elif function == "linear":
+                coefficients[row, : len(names)] += coefficient * torch.tensor(weights, dtype=torch.float64)
             else:
-                coefficients[row, first[part.function] + frequencies.index(part.weights)] += part.coefficient
-    clipped = any(math.isfinite(limit) for t in terms for limit in (t.low, t.high))
+                coefficients[row, first[function] + frequencies.index(weights)] += coefficient
+    ends = [ends_of(term.low, term.high) for term in terms]
+    clipped = any(math.isfinite(end) for both in ends for end in both)
+    low, high = torch.tensor(ends, dtype=torch.float64).T.contiguous() if clipped else (None, None)
     return TermSet(
         constant,
-        torch.tensor(frequencies, dtype=torch.float64).reshape(-1, coordinates).T.contiguous(),
+        torch.tensor(frequencies, dtype=torch.float64).reshape(-1, len(names)).T.contiguous(),
         coefficients,
-        torch.tensor([t.low for t in terms], dtype=torch.float64) if clipped else None,
-        torch.tensor([t.high for t in terms], dtype=torch.float64) if clipped else None,
+        low,
+        high,
     )
+
+
+def parts_of(term: Term, names: Sequence[str]) -> tuple[tuple[Function, float, tuple[float, ...]], ...]:
+    """Return the function and the coefficient of each part of a term, and the weights (C,) of the C coordinates
+    ``names`` in its argument."""
+    return tuple((p.function, p.coefficient, tuple(p.weights.get(name, 0.0) for name in names)) for p in term.parts)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from surrogym_shared.lazy import on_first_use
 from surrogym_shared.spec.actions import BoxAction, DiscreteAction, MultiDiscreteAction
-from surrogym_shared.spec.base import MAX_DIMENSIONS, MAX_ROLLOUT_QUERY
+from surrogym_shared.spec.base import MAX_DIMENSIONS, MAX_ROLLOUT_QUERY, ends_of
 from surrogym_shared.spec.coordinates import Bounds, Coordinate, Fixed, Lag, Normal, Uniform, limits
 from surrogym_shared.spec.environment import Access, AcquisitionChoice, Choice, Design, EnvironmentSpec, ModelChoice
 from surrogym_shared.spec.rewards import DeclaredReward, Quantity, Reward, RewardTerm, Success
@@ -51,6 +51,7 @@ __all__ = [
     "Success",
     "Term",
     "Uniform",
+    "ends_of",
     "limits",
     "with_history",
 ]

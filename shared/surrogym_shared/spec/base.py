@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated
 
 from pydantic import ConfigDict, Field
@@ -24,3 +25,8 @@ class Frozen(FailFast):
     """Base class of all models of a specification: immutable, and without unknown fields."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, ser_json_inf_nan="null")
+
+
+def ends_of(low: float | None, high: float | None) -> tuple[float, float]:
+    """Return the ends of a range, with an infinity in place of an end that is None."""
+    return -math.inf if low is None else low, math.inf if high is None else high

@@ -11,6 +11,7 @@ from surrogym_shared.checks import Number, Width, require, require_range
 from surrogym_shared.kinds import CoordinateKind, LagKind
 from surrogym_shared.patterns import VISIBLE
 from surrogym_shared.spec.base import Frozen, Name
+from surrogym_shared.spec.terms import Term
 
 
 class Uniform(Frozen):
@@ -137,6 +138,11 @@ class Coordinate(Frozen):
     bounds: Bounds | None = None
     unit: Annotated[str, Field(pattern=VISIBLE)] = ""
     lag: Lag | None = None
+
+    @property
+    def term(self) -> Term:
+        """The coordinate as a term."""
+        return Term.linear(**{self.name: 1.0})
 
     @property
     def moves(self) -> bool:

@@ -12,7 +12,7 @@ from surrogym_shared.checks import SHOWN, Number, Positive, require, require_kno
 from surrogym_shared.patterns import VISIBLE
 from surrogym_shared.presets import PRESETS, Preset, PresetName, Tolerance
 from surrogym_shared.spec.actions import Action, BoxAction
-from surrogym_shared.spec.base import MAX_DIMENSIONS, MAX_ROLLOUT_QUERY, MAX_STARTS, REWARD, Frozen, Name
+from surrogym_shared.spec.base import MAX_DIMENSIONS, MAX_ROLLOUT_QUERY, MAX_STARTS, REWARD, Frozen, Name, ends_of
 from surrogym_shared.spec.coordinates import Coordinate, StartDistribution, limits
 from surrogym_shared.spec.rewards import AnyReward, DeclaredReward, Reward, Success
 from surrogym_shared.spec.safety import Limits
@@ -219,8 +219,7 @@ class EnvironmentSpec(Frozen):
             for part in term.parts:
                 require_known(f"{where}: term", part.weights, names)
         for entry in self.observation:
-            low = -math.inf if entry.low is None else entry.low
-            high = math.inf if entry.high is None else entry.high
+            low, high = ends_of(entry.low, entry.high)
             require(low < high, f"limits of observation {entry.name!r}: expected low < high, got [{low}, {high}]")
         require(
             self.max_rollout is None or self.query == "rollout",

@@ -9,7 +9,7 @@ from surrogym_shared.checks import require, require_known
 from surrogym_shared.spec.actions import Action, BoxAction
 from surrogym_shared.spec.coordinates import Bounds, Coordinate, Fixed, Lag, StartDistribution, Uniform
 from surrogym_shared.spec.environment import EnvironmentSpec
-from surrogym_shared.spec.terms import ObservationEntry, Term
+from surrogym_shared.spec.terms import ObservationEntry
 
 COUNTER = "steps since reset"
 
@@ -60,7 +60,7 @@ def with_history(
     starts: dict[str, StartDistribution] = {lag.name: Fixed(value=_at_rest(lag)) for lag in lags}
     for name, most in at_start.items():
         starts |= {f"{name}.change{age}": Uniform(low=-most, high=most) for age in range(1, changes + 1)}
-    entries = tuple(ObservationEntry(name=lag.name, term=Term.linear(**{lag.name: 1.0})) for lag in lags)
+    entries = tuple(ObservationEntry(name=lag.name, term=lag.term) for lag in lags)
     if at_start:
         lags.append(_counter(changes))
         starts[COUNTER] = Fixed(value=float(changes))

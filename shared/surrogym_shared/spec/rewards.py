@@ -42,6 +42,11 @@ class Quantity(Frozen):
         )
         return self
 
+    @property
+    def of_state(self) -> Term:
+        """The term; the constant 0 for a quantity that depends on the action alone."""
+        return Term.constant(0.0) if self.term is None else self.term
+
 
 class RewardTerm(Frozen):
     """Term of a declared reward: weight * shape(of) if every inequality in ``when`` holds, else 0.

@@ -8,41 +8,49 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from surrogym_server.environment.conditions import InequalityDefinition
 from surrogym_server.environment.definition import EnvironmentDefinition, wrap
-from surrogym_server.environment.terms import PartDefinition, TermDefinition, compile_terms
+from surrogym_server.environment.terms import compile_terms
+from surrogym_shared.spec import Inequality, Part, Term, ends_of
 
-COORDINATES = 3
+NAMES = ("x", "y", "z")
 numbers = st.floats(-4, 4, width=32)
-weights = st.tuples(*[st.sampled_from([0.0, 1.0, -1.0, 0.5, 2.0])] * COORDINATES)
-part = st.builds(PartDefinition, st.sampled_from(["one", "linear", "sin", "cos"]), numbers, weights)
-limits = st.tuples(st.floats(-3, 0), st.floats(0.5, 3)) | st.just((-math.inf, math.inf))
+weights = st.dictionaries(st.sampled_from(NAMES), st.sampled_from([0.0, 1.0, -1.0, 0.5, 2.0]), min_size=1)
+part = st.builds(
+    lambda function, coefficient, weights: Part(
+        function=function, coefficient=coefficient, weights={} if function == "one" else weights
+    ),
+    st.sampled_from(["one", "linear", "sin", "cos"]),
+    numbers,
+    weights,
+)
+limits = st.tuples(st.none() | st.floats(-3, 0), st.none() | st.floats(0.5, 3))
 term = st.builds(
-    lambda parts, limit: TermDefinition(tuple(parts), *limit),
+    lambda parts, limit: Term(parts=tuple(parts), low=limit[0], high=limit[1]),
     st.lists(part, min_size=1, max_size=5),
     limits,
 )
 
 
-def by_hand(term: TermDefinition, q: tuple[float, ...]) -> float:
+def by_hand(term: Term, q: tuple[float, ...]) -> float:
     total = 0.0
     for p in term.parts:
-        phase = sum(a * b for a, b in zip(p.weights, q, strict=True))
+        phase = sum(p.weights.get(name, 0.0) * value for name, value in zip(NAMES, q, strict=True))
         function = {"one": lambda _: 1.0, "linear": float, "sin": math.sin, "cos": math.cos}[p.function]
         total += p.coefficient * function(phase)
-    return min(max(total, term.low), term.high)
+    low, high = ends_of(term.low, term.high)
+    return min(max(total, low), high)
 
 
 @given(terms=st.lists(term, min_size=1, max_size=4), points=st.lists(st.tuples(*[numbers] * 3), min_size=1))
 def test_compiled_terms_equal_the_sum_computed_by_hand(terms, points):
-    values = compile_terms(terms, COORDINATES)(torch.tensor(points, dtype=torch.float64))
+    values = compile_terms(terms, NAMES)(torch.tensor(points, dtype=torch.float64))
     assert values.shape == (len(points), len(terms))
     expected = [[by_hand(t, q) for t in terms] for q in points]
     torch.testing.assert_close(values, torch.tensor(expected, dtype=torch.float64), rtol=1e-9, atol=1e-9)
 
 
 def test_compiled_terms_keep_leading_batch_dimensions():
-    compiled = compile_terms([TermDefinition((PartDefinition("sin", 2.0, (1.0, 0.0, 0.0)),))], COORDINATES)
+    compiled = compile_terms([2 * Term.sin(x=1)], NAMES)
     assert compiled(torch.zeros(4, 5, 3, dtype=torch.float64)).shape == (4, 5, 1)
 
 
@@ -58,12 +66,12 @@ def test_a_half_turn_wraps_to_minus_pi():
     torch.testing.assert_close(wrap(torch.tensor([math.pi, -math.pi])), torch.tensor([-math.pi, -math.pi]))
 
 
-def x_is(relation, value):
-    return InequalityDefinition(TermDefinition((PartDefinition("linear", 1.0, (1.0, 0.0)),)), relation, value)
+def angle_is(relation, value):
+    return Inequality(term=Term.linear(theta=1), relation=relation, value=value)
 
 
 def speed_is(relation, value):
-    return InequalityDefinition(TermDefinition((PartDefinition("linear", 1.0, (0.0, 1.0)),)), relation, value)
+    return Inequality(term=Term.linear(speed=1), relation=relation, value=value)
 
 
 @pytest.mark.parametrize(
@@ -73,13 +81,13 @@ def speed_is(relation, value):
 def test_each_inequality_relation_is_evaluated_exactly_at_its_bound(
     pendulum_definition: EnvironmentDefinition, relation, ends
 ):
-    definition = replace(pendulum_definition, termination_groups=((x_is(relation, 1.0),),))
+    definition = replace(pendulum_definition, termination_groups=((angle_is(relation, 1.0),),))
     q = torch.tensor([[0.5, 0.0], [1.0, 0.0], [1.5, 0.0]], dtype=torch.float64)
     assert definition.terminated(q).tolist() == [bool(e) for e in ends]
 
 
 def test_an_episode_terminates_when_all_conditions_of_any_group_hold(pendulum_definition: EnvironmentDefinition):
-    groups = ((x_is(">", 1.0), speed_is(">", 0.0)), (speed_is("<", -5.0),))
+    groups = ((angle_is(">", 1.0), speed_is(">", 0.0)), (speed_is("<", -5.0),))
     definition = replace(pendulum_definition, termination_groups=groups)
     q = torch.tensor([[2.0, 1.0], [2.0, -1.0], [0.0, 1.0], [0.0, -6.0]], dtype=torch.float64)
     assert definition.terminated(q).tolist() == [True, False, False, True]

@@ -120,7 +120,7 @@ def test_points_in_terminal_states_are_redrawn_and_the_others_kept():
 
 def test_points_are_kept_if_the_whole_sampling_range_is_terminal():
     definition = definition_from_spec(acrobot())
-    everywhere = replace(definition.termination_groups[0][0], value=-10.0)
+    everywhere = definition.termination_groups[0][0].model_copy(update={"value": -10.0})
     definition = replace(definition, termination_groups=((everywhere,),))
     q, u = random_points(definition, 5, np.random.default_rng(0))
     assert len(going_on(definition, q, u, np.random.default_rng(0))[0]) == 5

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from surrogym_server.compiled.elementary import exponential
 from surrogym_server.compiled.tables import TablesBuilder, matrix
 from surrogym_server.environment.compiled.terms import add_conditions, add_terms, evaluate, holding
-from surrogym_server.environment.declared_reward import DeclaredRewardDefinition
+from surrogym_server.environment.declared_reward import RewardFunction
 from surrogym_shared.compiled.jit import inlined
 
 Floats = NDArray[np.float64]
@@ -22,12 +22,11 @@ ONE, LINEAR, ABSOLUTE, SQUARE, BUMP, BALL = SHAPES.values()
 HEAD, WEIGHTS, TERMS = range(3)
 
 
-def add_reward(tables: TablesBuilder, reward: DeclaredRewardDefinition) -> int:
+def add_reward(tables: TablesBuilder, reward: RewardFunction) -> int:
     """Append the matrices of a declared reward to the tables, and return the index of the first one."""
-    values, weights, conditions = reward._compiled
-    head = [add_terms(tables, values), add_conditions(tables, conditions)]
-    terms = [(term.weight, SHAPES[term.shape], len(term.of)) for term in reward.terms]
-    return tables.add(head, weights, np.array(terms).reshape(-1, 3))
+    head = [add_terms(tables, reward.values), add_conditions(tables, reward.conditions)]
+    terms = [(term.weight, SHAPES[term.shape], len(term.of)) for term in reward.declared.terms]
+    return tables.add(head, reward.weights, np.array(terms).reshape(-1, 3))
 
 
 @inlined

@@ -15,7 +15,7 @@ from surrogym_server.errors import InvalidInput
 from surrogym_server.gp import fit, sparse, subsets
 from surrogym_server.models.files import from_bytes, to_bytes
 from surrogym_server.models.gaussian_process.learning import output_learner
-from surrogym_shared.spec import BoxAction, Coordinate, Design, EnvironmentSpec, ObservationEntry, Term, Uniform
+from surrogym_shared.spec import BoxAction, Coordinate, Design, EnvironmentSpec, ObservationEntry, Reward, Term, Uniform
 
 PAPER = pendulum().model_copy(update={"design": Design(preset="paper")})
 
@@ -73,7 +73,7 @@ def test_reward_timing_before_or_after_the_step_is_selected_by_evidence(pendulum
     steps = random_steps(pendulum(), 24, seed=seed)
     state = steps.q_next if after else steps.q
     paying = replace(steps, reward=-state[:, 0].square() - 0.1 * state[:, 1].square())
-    reward = learn(replace(pendulum_definition, reward_timing="auto"), paying).model.reward
+    reward = learn(replace(pendulum_definition, reward=Reward(timing="auto")), paying).model.reward
     assert reward.feature_map.after == after
     scores = dict(reward.scores)
     assert {", after" in name for name in scores} == {False, True}

@@ -8,7 +8,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from surrogym_server.environment.declared_reward import DeclaredRewardDefinition
+from surrogym_server.environment.declared_reward import RewardFunction
 from surrogym_server.environment.definition import REWARD, EnvironmentDefinition
 from surrogym_server.environment.features import FeatureMap, encode
 from surrogym_server.environment.samples import Samples
@@ -74,7 +74,7 @@ def _without_action(definition: EnvironmentDefinition, samples: Samples) -> dict
     }
 
 
-def _declared(reward: DeclaredRewardDefinition, samples: Samples) -> OutputModel:
+def _declared(reward: RewardFunction, samples: Samples) -> OutputModel:
     """Return the reward's output for a declared reward. It has no process. Its score is the largest difference between
     declared rewards and rewards of samples."""
     rewards = reward(samples.q_next if reward.after else samples.q, samples.u) + reward.terminal * samples.terminated

@@ -16,9 +16,10 @@ from torch import Tensor
 
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.features import encode
-from surrogym_server.environment.terms import PartDefinition, TermDefinition, TermSet, compile_terms
+from surrogym_server.environment.terms import TermSet, compile_terms, parts_of
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 from surrogym_server.tensors import cached, to_device
+from surrogym_shared.spec import Term
 
 TERMINATION = "termination"  # name of the region where episodes end, in keys of warm starts and of stored arrays
 Side = Literal["above", "below", "beyond"]  # side of a threshold on a value t: t > level, -t > level, or |t| > level
@@ -37,13 +38,14 @@ class Axes:
     def of(cls, definition: EnvironmentDefinition) -> Axes:
         """Build the axes for the moving coordinates, and for those observation entries that differ from all of these
         coordinates."""
-        size, names = len(definition.coordinates), {}
-        for index in definition.moving:
-            weights = tuple(float(i == index) for i in range(size))
-            names[TermDefinition((PartDefinition("linear", 1.0, weights),))] = definition.coordinates[index].name
-        for name, term in zip(definition.observation_names, definition.observation_terms, strict=True):
-            names.setdefault(term, name)
-        return cls(tuple(names.values()), to_device(compile_terms(list(names), size), definition.device))
+        coordinates = definition.coordinate_names
+        shown = [(coordinates[i], Term.linear(**{coordinates[i]: 1.0})) for i in definition.moving]
+        shown += [(entry.name, entry.term) for entry in definition.observation]
+        different: dict[object, tuple[str, Term]] = {}
+        for name, term in shown:
+            different.setdefault((parts_of(term, coordinates), term.low, term.high), (name, term))
+        names, terms = zip(*different.values(), strict=True)
+        return cls(names, to_device(compile_terms(terms, coordinates), definition.device))
 
     def __len__(self) -> int:
         return 3 * len(self.names)
