@@ -29,7 +29,7 @@ PHASES = ("start", "design", "train", "checks", "evaluate", "total")
 
 def demo(commit: Commit, task: str, seed: int, out: Path, further: Sequence[str]) -> dict[str, Any]:
     """Seconds of the phases of a whole demo, and what it came to."""
-    command = [sys.executable, "-m", "surrogym", "demo", task, "--seed", str(seed), "--out", str(out)]
+    command = [sys.executable, "-m", commit.program, "demo", task, "--seed", str(seed), "--out", str(out)]
     environment = os.environ | {"PYTHONPATH": commit.path}
     subprocess.run(
         [*command, "--no-pictures", "--quiet", *further],
