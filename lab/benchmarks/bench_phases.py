@@ -1,7 +1,8 @@
 """Seconds of each phase of a whole demo, from cold to the evaluated policy, of two commits in turns.
 
-Phases: start of the server, design, training without its checks, checks of the imagined return, evaluation. Nothing
-but commands and run folders is used, so a commit may move its modules. Run by ``make bench ARGS="--parts phases"``; it
+Phases: start of the server, design, training without its checks, checks of the imagined return, evaluation. ``cpu`` are
+the processor seconds of all programs of the demo, which other programs on the machine hardly change. Nothing but
+commands and run folders is used, so a commit may move its modules. Run by ``make bench ARGS="--parts phases"``; it
 takes an hour on free cores, so ``make bench`` alone leaves it out.
 """
 
@@ -9,6 +10,7 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import statistics
 import subprocess
 import sys
@@ -24,13 +26,13 @@ from compare_commits import Commit, unpacked
 BEFORE, AFTER = "f7caf9c", "HEAD"  # the commit before PPO in NumPy
 TASKS = ("pendulum", "cartpole", "swingup", "acrobot", "doublependulum", "reacher")
 CHECKS = 12  # in the steps that a training was planned to take
-PHASES = ("start", "design", "train", "checks", "evaluate", "total")
+PHASES = ("start", "design", "train", "checks", "evaluate", "total", "cpu")
 
 
 def demo(commit: Commit, task: str, seed: int, out: Path, further: Sequence[str]) -> dict[str, Any]:
     """Seconds of the phases of a whole demo, and what it came to."""
     command = [sys.executable, "-m", commit.program, "demo", task, "--seed", str(seed), "--out", str(out)]
-    environment = os.environ | {"PYTHONPATH": commit.path}
+    environment, before = os.environ | {"PYTHONPATH": commit.path}, cpu_of_children()
     subprocess.run(
         [*command, "--no-pictures", "--quiet", *further],
         cwd=commit.folder,
@@ -43,7 +45,15 @@ def demo(commit: Commit, task: str, seed: int, out: Path, further: Sequence[str]
     seconds = dict(metrics["seconds"])
     seconds["checks"] = seconds_of_checks(lines)
     seconds["train"] -= seconds["checks"]
-    return {"seconds": seconds, "real": metrics["real_return"]["mean"], "reached": metrics["reached"]}
+    seconds["cpu"] = cpu_of_children() - before
+    steps = metrics["virtual_steps"]
+    return {"seconds": seconds, "real": metrics["real_return"]["mean"], "reached": metrics["reached"], "steps": steps}
+
+
+def cpu_of_children() -> float:
+    """Processor seconds of all child processes that have ended, and of theirs."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def seconds_of_checks(lines: Sequence[Mapping[str, Any]]) -> float:
@@ -82,6 +92,7 @@ def main() -> None:
                     found = demo(commit, task, seed, folder / f"{task}-{seed}-{side}", further)
                     rows.append({"task": task, "seed": seed, "side": side, **found})
                     taken = ", ".join(f"{phase} {found['seconds'][phase]:.1f}" for phase in PHASES)
+                    taken += f"; {found['steps']:,} virtual steps"
                     print(f"{task}, seed {seed}, {side}: {taken}; real {found['real']:.1f}")
     write(options.out, "phases", {"before": options.before, "after": options.after, "runs": rows})
 
