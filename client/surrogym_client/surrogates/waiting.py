@@ -9,10 +9,13 @@ from surrogym_client.errors import ServerUnreachable, SurrogymClientError, Unkno
 from surrogym_client.surrogates.phases import COMPLETED, IN_WORDS
 from surrogym_client.transport.api import Api
 from surrogym_shared.wire import SurrogateView
+from surrogym_shared.words import counted
 
 LOOK_SECONDS = 0.25
-MANY = 1_500  # number of samples from which the time of a fit by the default model hardly grows
-USUAL_FIT = "such a fit takes about 15 s with noise, and up to 100 s without, on two free cores"
+MANY = 1_500  # number of samples from which the expected time of a fit is shown
+# Seconds of a free core that a fit of ``MANY`` to 20,000 samples by the default model takes for each output: least and
+# most with noise, and most without noise.
+NOISY_SECONDS, NOISE_FREE_SECONDS = (1, 3), 20
 FIRST_LEASE_SECONDS = 5.0  # time for a sampler to begin a query, which a running sampler does within a second
 
 
@@ -34,8 +37,17 @@ def words_of_design(view: SurrogateView) -> str:
 def words_of_long_fit(view: SurrogateView, seconds: float) -> str:
     """Describe a fit that has taken ``seconds`` so far: its samples, and how long such a fit usually takes."""
     waited = f" for {seconds:.0f} s" if view.phase == "fitting" else ""
-    usual = f"; {USUAL_FIT}" if waited and view.samples >= MANY else ""
+    usual = f"; {_usual_seconds(len(view.outputs))}" if waited and view.samples >= MANY else ""
     return f"{words_of_design(view)}{waited}{usual}"
+
+
+def _usual_seconds(outputs: int) -> str:
+    """Describe how long a fit of many samples usually takes, by its number of outputs."""
+    least, most = (outputs * seconds for seconds in NOISY_SECONDS)
+    return (
+        f"{counted(outputs, 'output')} of noisy steps take {least} to {most} s of a free core, without noise up to "
+        f"{outputs * NOISE_FREE_SECONDS} s, and several times as long beside other programs"
+    )
 
 
 def words_of_audit(view: SurrogateView) -> str:
