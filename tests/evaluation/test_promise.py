@@ -80,9 +80,7 @@ def test_the_promised_return_interval_covers_90_percent_of_new_mean_returns(betw
 def test_a_promised_return_ignores_reward_penalties_and_is_reproducible(pendulum_server):
     with HttpSurrogate(pendulum_server.url, "pendulum") as port:
         still = lambda observation: np.zeros((len(observation), 1))  # noqa: E731
-        plain, penalised, again = (
-            promise_of(port, still, 3, options) for options in ({}, {"penalty": 5.0, "caution": 2.0}, {})
-        )
+        plain, penalised, again = (promise_of(port, still, 3, options) for options in ({}, {"penalty": 5.0}, {}))
         other = promise_of(port, still, 4)
     assert plain == penalised == again
     assert plain != other

@@ -119,15 +119,6 @@ class SessionOptions:
             "output's standard deviation in the samples. [default: no limit]"
         ),
     ] = None
-    caution: Annotated[
-        float | None,
-        typer.Option(
-            min=0,
-            help="Subtract CAUTION times the model's doubt from each reward. The doubt is the largest ratio, over the "
-            "outputs, of predicted standard deviation to that in the samples, times the reward's standard "
-            "deviation in the samples. [default: 0]",
-        ),
-    ] = None
     penalty: Annotated[
         float | None,
         typer.Option(

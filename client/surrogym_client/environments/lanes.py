@@ -109,7 +109,7 @@ class Lanes:
     @property
     def penalised(self) -> bool:
         """Whether the session subtracts a penalty from rewards where the model is uncertain."""
-        return self.view.penalty > 0 or self._request.caution > 0
+        return self.view.penalty > 0
 
     @property
     def mode(self) -> AutoresetMode:

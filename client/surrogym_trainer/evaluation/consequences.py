@@ -63,7 +63,7 @@ def changes_of(
     outputs = [coordinate.name for coordinate in spec.coordinates if coordinate.moves] + ["reward"]
     placed = np.zeros((len(weights), len(outputs), weights.shape[2]))
     placed[:, [outputs.index(name) for name in shifted.names]] = weights
-    left_out = {"variant", "functions", "penalty", "caution", *OF_PARTICLES}
+    left_out = {"variant", "functions", "penalty", *OF_PARTICLES}
     options = {name: value for name, value in session.items() if name not in left_out}
     options |= {"variant": "deterministic", "penalty": 0.0, "model": version}
     lanes = len(weights) * starts

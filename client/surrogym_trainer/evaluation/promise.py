@@ -43,11 +43,11 @@ def promise_of(
         port: the surrogate.
         predict: the policy; function from observations (N, D) to actions.
         seed: seed of functions and starts.
-        session: fields of ``OpenSession`` that the policy was trained with. The fields ``variant``,
-            ``penalty`` and ``caution``, and those of particles, are ignored.
+        session: fields of ``OpenSession`` that the policy was trained with. The fields ``variant`` and
+            ``penalty``, and those of particles, are ignored.
         floor: return of an untrained policy; None if it was not measured.
     """
-    left_out = {"variant", "penalty", "caution", *OF_PARTICLES}
+    left_out = {"variant", "penalty", *OF_PARTICLES}
     options = {name: value for name, value in (session or {}).items() if name not in left_out}
     options |= {"variant": "pathwise", "functions": FUNCTIONS, "penalty": 0.0}
     imagined = imagine(port, predict, FUNCTIONS * STARTS, seed, **options)

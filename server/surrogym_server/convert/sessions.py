@@ -34,7 +34,6 @@ def opening(request: replies.OpenSession) -> Opening:
         process_noise=request.process_noise,
         sensor_noise=tuple(sorted(request.sensor_noise.items())),
         trust=request.trust,
-        caution=request.caution,
         particles=request.particles,
         propagation=request.propagation,
         weighting=request.weighting,

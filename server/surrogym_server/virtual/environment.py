@@ -55,16 +55,14 @@ class VirtualSettings:
     # An episode is truncated if the predicted standard deviation of any output exceeds this multiple of the output's
     # standard deviation over the samples. None: no episode is truncated for this reason.
     trust: float | None = None
-    # Each reward is reduced by this times the largest relative standard deviation of an output (see ``_doubted``).
-    caution: float = 0.0
     compiled: bool = False  # whether steps use the model's compiled code; decided when the session opens
     # (k, C) the coordinates of k real steps; the share ``start_visited`` of the episodes starts at one of these states.
     visited: Tensor | None = field(default=None, compare=False, repr=False)
 
     @property
     def doubts(self) -> bool:
-        """Whether steps need the standard deviations of all outputs, because ``trust`` or ``caution`` is used."""
-        return self.trust is not None or self.caution > 0
+        """Whether steps need the standard deviations of all outputs, because ``trust`` is used."""
+        return self.trust is not None
 
 
 @dataclass(frozen=True)
@@ -166,7 +164,6 @@ def step(
     moved = _move(model, settings, active, action, stds, particle_steps)
     if settings.residual is not None:
         moved = with_residual(model, settings.residual, active, action, moved)
-    moved = _doubted(model, settings, moved)
     untrusted = _untrusted(model, settings, moved)
     left = _left(definition, active.q, moved, untrusted)
     if left is not None:
@@ -263,19 +260,6 @@ def _move(
         paths=lanes.path if settings.variant == "pathwise" else None,
         functions=settings.functions,
     )
-
-
-def _doubted(model: DynamicsModel, settings: VirtualSettings, moved: Moved) -> Moved:
-    """Subtract ``caution`` times the doubt about each lane's step from its reward.
-
-    The doubt is the largest ratio of an output's predicted standard deviation to its standard deviation over the
-    samples, times the standard deviation of the reward over the samples.
-    """
-    if settings.caution == 0:
-        return moved
-    assert moved.std is not None
-    doubt = (moved.std / model.scales).amax(1) * model.scales[-1]
-    return replace(moved, reward=moved.reward - settings.caution * doubt)
 
 
 def _untrusted(model: DynamicsModel, settings: VirtualSettings, moved: Moved) -> Tensor | None:

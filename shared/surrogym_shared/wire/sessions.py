@@ -98,12 +98,6 @@ class OpenSession(Request):
         description="truncate an episode if the predicted standard deviation of an output exceeds this factor times "
         "the output's standard deviation in the samples; null: no such limit",
     )
-    caution: Annotated[float, Field(ge=0, le=1_000)] = Field(
-        default=0.0,
-        description="factor c: c times r times s is subtracted from each reward. r is the largest ratio of an output's "
-        "predicted standard deviation to its standard deviation in the samples, and s is the standard deviation "
-        "of the reward in the samples",
-    )
     particles: Annotated[int, Field(ge=1, le=MAX_PARTICLES)] = Field(
         default=1_000, description="variant probabilistic: number of particles in each lane"
     )

@@ -90,7 +90,7 @@ def test_a_restored_session_continues_bit_for_bit(
     opened: Open, fitted: Fitted, definition: EnvironmentDefinition, variant: str, compiled: bool
 ):
     chosen = {"variant": variant, "particles": 8, "trust": 2.0, "process_noise": True, "compiled": compiled}
-    chosen |= {"autoreset_mode": "same_step", "time_limit": 3, "start_visited": 0.5, "caution": 0.5}
+    chosen |= {"autoreset_mode": "same_step", "time_limit": 3, "start_visited": 0.5}
     chosen["visited"] = torch.linspace(-1, 1, 5 * len(definition.coordinates), dtype=torch.float64).reshape(5, -1)
     chosen["sensor_noise"] = ((definition.coordinate_names[0], 0.1),)
     session, _ = reset_session(opened(occupancy=True, **chosen), 11, None, 1)

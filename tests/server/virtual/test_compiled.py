@@ -46,8 +46,7 @@ CHOICES: dict[str, dict[str, Any]] = {
     },
     "particles by the mean": {"variant": "probabilistic", "particles": 3, "propagation": "mean", "trust": 0.5},
     "noisy sensors": {"process_noise": True, "autoreset_mode": "same_step", "time_limit": 2},
-    "caution": {"caution": 2.0, "penalty": 1.0, "autoreset_mode": "same_step", "time_limit": 3},
-    "draws with caution": {"variant": "probabilistic", "particles": 1, "spread": 0.0, "caution": 2.0},
+    "visited starts": {"penalty": 1.0, "autoreset_mode": "same_step", "time_limit": 3},
     "noise, trust, box": {"process_noise": True, "trust": 0.05, "start_box": 0.5, "time_limit": 2},
 }
 CASES = {f"case: {case}": case for case in model_cases("gaussian_process")}
@@ -97,7 +96,7 @@ def test_compiled_steps_agree_with_torch(model, choice):
         first = model.definition.coordinate_names[model.definition.moving[0]]
         settings = replace(settings, sensor_noise=((first, 0.1),))
     lanes, _ = reset(model.definition, settings, create(model.definition, settings, 0))
-    if choice == "caution":  # its episodes begin at visited states, which compiled code must find again
+    if choice == "visited starts":  # which compiled code must find again
         settings = replace(settings, start_visited=0.5, visited=lanes.q + 0.01)
     for count in range(STEPS):
         u = actions(model, rng)

@@ -24,7 +24,6 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "deterministic": {"penalty": 3.0},
     "noisy, trusted": {"process_noise": True, "trust": 10.0, "start_box": 0.5},
     "probabilistic": {"variant": "probabilistic", "particles": 8},
-    "cautious": {"caution": 2.0, "start_box": 0.5},
     "pathwise": {"variant": "pathwise"},
 }
 

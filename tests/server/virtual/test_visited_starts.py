@@ -1,15 +1,12 @@
-"""A share of episodes starts at states of real steps, and rewards are lowered where the model doubts."""
+"""A share of episodes starts at states of real steps."""
 
 from __future__ import annotations
-
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
 from support.exact_models import ExactModel
-from surrogym_server.virtual import step
 
 VISITED = torch.tensor([[2.0, 5.0], [-2.5, 6.0], [3.0, -7.0]], dtype=torch.float64)  # declared starts are slower
 STATES = {tuple(row) for row in VISITED.tolist()}
@@ -40,34 +37,3 @@ def test_start_visited_0_leaves_start_states_unchanged(pendulum_model: ExactMode
             started(pendulum_model, 50, start_box=share, visited=None, start_visited=0.0)[1],
         )
         np.testing.assert_array_equal(plain.q, beside.q)
-
-
-def test_the_option_caution_lowers_the_reward_by_the_models_uncertainty(pendulum_model: ExactModel, started):
-    """The dynamics deviate by 0.5 and the reward by the angle, in deviations of 1 over the samples."""
-    unsure = replace(pendulum_model, std=0.5, reward_std=lambda q: q[:, 0].abs())
-    settings, lanes = started(unsure, 3, caution=2.0)
-    q = torch.tensor([[0.1, 0.0], [0.8, 0.0], [-2.0, 0.0]], dtype=torch.float64)
-    _, transition = step(unsure, settings, replace(lanes, q=q), np.zeros((3, 1)))
-    np.testing.assert_allclose(transition.reward_mean - transition.reward, [1.0, 1.6, 4.0])
-    assert transition.std is None, "nobody asked for it"
-    _, sure = step(pendulum_model, settings, replace(lanes, q=q), np.zeros((3, 1)))
-    np.testing.assert_array_equal(sure.reward, sure.reward_mean)
-
-
-def test_the_caution_penalty_is_relative_to_the_deviation_of_the_samples(pendulum_model: ExactModel, started):
-    class Wider(ExactModel):
-        @property
-        def scales(self) -> torch.Tensor:
-            return torch.tensor([1.0, 10.0, 4.0], dtype=torch.float64)
-
-    wider = Wider(**{name: getattr(pendulum_model, name) for name in pendulum_model.__dataclass_fields__})
-    settings, lanes = started(replace(wider, std=0.5), 2, caution=1.0)
-    _, transition = step(replace(wider, std=0.5), settings, lanes, np.zeros((2, 1)))
-    np.testing.assert_allclose(transition.reward_mean - transition.reward, 0.5 / 1.0 * 4.0)
-
-
-def test_the_option_caution_lowers_rewards_of_the_particle_variant_too(pendulum_model: ExactModel, started):
-    unsure = replace(pendulum_model, std=0.5)
-    settings, lanes = started(unsure, 2, caution=2.0, variant="probabilistic", particles=3)
-    _, transition = step(unsure, settings, lanes, np.zeros((2, 1)))
-    np.testing.assert_allclose(transition.reward_mean - transition.reward, 1.0)

@@ -47,29 +47,6 @@ def _exceeds(std: Floats, trust: float, scales: Floats) -> bool:
 
 
 @inlined
-def _doubt(std: Floats, scales: Floats) -> float:
-    """Return the doubt about a step: the largest of the O ratios ``std / scales``, times the reward's entry of
-    ``scales``. ``std`` (O,) are predicted standard deviations of the outputs, ``scales`` (O,) those over the samples.
-    """
-    most = 0.0
-    for o in range(len(std)):
-        most = max(most, std[o] / scales[o])
-    return float(most * scales[-1])
-
-
-@inlined
-def _penalised(mean: float, std: Floats, penalty: float, caution: float, scales: Floats) -> float:
-    """Return a mean reward less two penalties: ``penalty`` times the reward's standard deviation, and ``caution`` times
-    the doubt about the step (see ``_doubt``). ``std`` (O,) are the predicted standard deviations of the O outputs, the
-    reward's last.
-
-    ``std`` is not read where ``penalty`` and ``caution`` are 0.
-    """
-    paid = mean if penalty == 0 else mean - penalty * std[-1]
-    return float(paid - caution * _doubt(std, scales) if caution > 0 else paid)
-
-
-@inlined
 def _is_outside(q: Floats, inside: Floats) -> bool:
     outside = False
     for c in range(len(q)):
@@ -85,7 +62,6 @@ def _is_outside(q: Floats, inside: Floats) -> bool:
     types.boolean[::1],
     types.boolean[::1],
     types.float64[::1],
-    types.float64,
     types.float64,
     types.float64,
     types.float64,
@@ -109,7 +85,6 @@ def conclude(
     terminal_reward: float,
     penalty: float,
     trust: float,
-    caution: float,
     time_limit: int,
     inside: Floats,
     outside_reward: float,
@@ -130,7 +105,7 @@ def conclude(
         fallen: (K,) lanes that end because the fallback action of the limits would take over; (0,) without limits.
         scales: (O,) standard deviation of each output over the samples.
         terminal_reward: reward that terminating steps pay in addition.
-        penalty, trust, caution, time_limit: as in ``VirtualSettings``; trust is infinite and time_limit -1 for None.
+        penalty, trust, time_limit: as in ``VirtualSettings``; trust is infinite and time_limit -1 for None.
         inside: lower and upper ends of the sampling range, (2, C), if an episode ends when it leaves this range,
             otherwise (0, 0).
         outside_reward: reward of a lane whose episode ended early: outside the sampling range, where the model is too
@@ -155,7 +130,7 @@ def conclude(
         left = len(inside) > 0 and (doubtful or _is_outside(q_next[row], inside))
         left = not over[row] and (left or (len(fallen) > 0 and fallen[row]))
         rewards[1, n] = mean
-        rewards[0, n] = _penalised(mean, std[row], penalty, caution, scales)
+        rewards[0, n] = mean if penalty == 0 else mean - penalty * std[row, -1]
         if left:
             lacking = max(time_limit - elapsed[n], 1) if time_limit >= 0 else 1
             rewards[0, n] = rewards[1, n] = outside_reward * lacking

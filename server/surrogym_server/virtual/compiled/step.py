@@ -184,7 +184,6 @@ def _concluded(
         model.terminal_reward,
         settings.penalty,
         np.inf if trust is None else trust,
-        settings.caution,
         -1 if limit is None else limit,
         ANYWHERE if outside is None else torch.stack(model.definition.sampled).numpy(),
         paid_outside(model.definition, settings),
