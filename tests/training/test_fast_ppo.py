@@ -277,8 +277,12 @@ def test_training_cycles_continue_while_the_last_one_improved(
     learned(monkeypatch, True)
     monkeypatch.setattr(Checks, "gained", lambda *_: gained)
     settings = TrainSettings(algorithm="fastppo", total_steps=3_072, num_envs=16, hyperparameters=SMALL, prolong=True)
-    result = train(surrogate, tmp_path / "policy.zip", settings)
+    seen: list[TrainProgress] = []
+    result = train(surrogate, tmp_path / "policy.zip", settings, seen.append)
     assert [one["stage"] for one in result.settings["cycles"]] == ["learn"] * cycles + ["refine"]
+    totals = list(dict.fromkeys(now.total_steps for now in seen))
+    assert len(totals) == cycles, "the total grows with a further cycle alone"
+    assert totals[-1] == seen[-1].steps
     assert result.gaining is gained
 
 

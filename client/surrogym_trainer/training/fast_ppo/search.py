@@ -164,6 +164,17 @@ class _Training:
         """Number of rollouts after which a network that has learned nothing is replaced."""
         return max(self._planned // CYCLES, PATIENT_ROLLOUTS)
 
+    @property
+    def _looks(self) -> int:
+        """Number of rollouts with which the stage ``refine`` begins, in which it only collects observations."""
+        episode = -(-(self._spec.time_limit or LONGEST_EPISODE) // self._search.n_steps)
+        return max(min(episode, int(LOOKS * self._planned)), 1)
+
+    @property
+    def _refining(self) -> int:
+        """Number of rollouts of the cycle of the stage ``refine``."""
+        return max(int(REFINING * self._cycle), 1)
+
     def _learn(self, learner: Learner, hold: int) -> None:
         """Train a network in cycles, as long as it gains; its noise stays the same for ``hold`` steps."""
         own, stage = 0, learn(self._task)
@@ -179,8 +190,7 @@ class _Training:
         assert self._kept is not None
         learner, stage = self._made(), refine(self._task)
         learner.take_up(self._kept)
-        episode = -(-(self._spec.time_limit or LONGEST_EPISODE) // self._search.n_steps)
-        looks, cycle = max(min(episode, int(LOOKS * self._planned)), 1), max(int(REFINING * self._cycle), 1)
+        looks, cycle = self._looks, self._refining
         rate = LEARNING_RATE if self._search.learning_rate is None else self._search.learning_rate
         with self._open(stage):
             self._expect(looks + CRITIC_ROLLOUTS + cycle)
@@ -204,7 +214,8 @@ class _Training:
             hold: number of steps for which the noise of its actions stays the same.
         """
         fine, noise, before = stage.name == "refine", learner.further.copy(), self._checks.returns_of_best
-        self._expect(rollouts + (self._task.prolong and not fine) * int(REFINING * self._cycle))
+        further = self._looks + CRITIC_ROLLOUTS + self._refining if self._task.prolong and not fine else 0
+        self._expect(rollouts + further)
         for number in range(1, rollouts + 1):
             rows = self._collect(learner, hold)
             if self._checks.saturated or self._hopeless(own + number, rollouts - number):
