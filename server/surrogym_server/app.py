@@ -30,10 +30,8 @@ from surrogym_server.api import (
     sessions,
     surrogates,
 )
-from surrogym_server.api.auth import Gate, fingerprint
-from surrogym_server.api.concurrency import ConcurrencyLimit, Waiting
-from surrogym_server.api.guards import BodyLimit, KnownHosts, OwnPages
-from surrogym_server.api.observe import Observed
+from surrogym_server.api.door import ConcurrencyLimit, Gate, Waiting, fingerprint
+from surrogym_server.api.middleware import BodyLimit, KnownHosts, Observed, OwnPages
 from surrogym_server.api.state import Services
 from surrogym_server.api.stepping.routes import StepDoor
 from surrogym_server.api.stepping.routes import router as stepping

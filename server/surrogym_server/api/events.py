@@ -9,9 +9,7 @@ from typing import Annotated
 from fastapi import APIRouter, Header, Query, Request
 from fastapi.responses import StreamingResponse
 
-from surrogym_server.api.auth import READ
-from surrogym_server.api.concurrency import Waiting
-from surrogym_server.api.door import DoorRoute
+from surrogym_server.api.door import READ, DoorRoute, Waiting
 from surrogym_server.api.problems import documented
 from surrogym_server.api.state import Use
 from surrogym_server.convert import resources

@@ -7,10 +7,7 @@ from typing import Annotated
 from fastapi import APIRouter, Request
 
 from surrogym_server.api import examples
-from surrogym_server.api.auth import ADMIN, SAMPLE
-from surrogym_server.api.concurrency import ConcurrencyLimit
-from surrogym_server.api.door import DoorRoute, json_up_to
-from surrogym_server.api.json_body import example
+from surrogym_server.api.door import ADMIN, SAMPLE, ConcurrencyLimit, DoorRoute, example, json_up_to
 from surrogym_server.api.problems import documented
 from surrogym_server.api.state import Services, Use
 from surrogym_server.convert import logs

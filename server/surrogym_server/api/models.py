@@ -10,10 +10,7 @@ from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import Response
 
 from surrogym_server.api import examples
-from surrogym_server.api.auth import ADMIN, READ
-from surrogym_server.api.concurrency import ConcurrencyLimit
-from surrogym_server.api.door import DoorRoute
-from surrogym_server.api.json_body import example
+from surrogym_server.api.door import ADMIN, READ, ConcurrencyLimit, DoorRoute, example
 from surrogym_server.api.problems import documented
 from surrogym_server.api.state import Use
 from surrogym_server.convert import resources

@@ -5,10 +5,8 @@ from __future__ import annotations
 from fastapi import APIRouter, Request
 from fastapi.responses import HTMLResponse, JSONResponse
 
-from surrogym_server.api import reference
-from surrogym_server.api.auth import PUBLIC, READ, Gate, bearer_token
-from surrogym_server.api.door import DoorRoute
-from surrogym_server.api.openapi import describe
+from surrogym_server.api.door import PUBLIC, READ, DoorRoute, Gate, bearer_token
+from surrogym_server.api.openapi import HEADERS, describe, page
 from surrogym_server.api.problems import documented
 from surrogym_server.api.state import Use
 from surrogym_shared.codes import Code
@@ -48,4 +46,4 @@ async def openapi(request: Request) -> JSONResponse:
 
 @router.get("/docs", include_in_schema=False, dependencies=[READ])
 async def docs(request: Request) -> HTMLResponse:
-    return HTMLResponse(reference.page(describe(request.app)), headers=reference.HEADERS)
+    return HTMLResponse(page(describe(request.app)), headers=HEADERS)

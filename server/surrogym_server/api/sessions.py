@@ -8,9 +8,7 @@ from fastapi import APIRouter
 from fastapi.responses import Response
 
 from surrogym_server.api import examples
-from surrogym_server.api.auth import READ, TRAIN
-from surrogym_server.api.door import DoorRoute
-from surrogym_server.api.json_body import example
+from surrogym_server.api.door import READ, TRAIN, DoorRoute, example
 from surrogym_server.api.problems import documented
 from surrogym_server.api.state import Use
 from surrogym_server.convert import sessions

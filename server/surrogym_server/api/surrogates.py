@@ -8,9 +8,7 @@ from fastapi import APIRouter, Query, Request
 from fastapi.responses import Response
 
 from surrogym_server.api import examples
-from surrogym_server.api.auth import ADMIN, READ, TRAIN, role_of
-from surrogym_server.api.door import DoorRoute, json_up_to
-from surrogym_server.api.json_body import example
+from surrogym_server.api.door import ADMIN, READ, TRAIN, DoorRoute, example, json_up_to, role_of
 from surrogym_server.api.problems import documented
 from surrogym_server.api.state import Use
 from surrogym_server.convert import default_budget, resources

@@ -46,7 +46,7 @@ class Runner(uvicorn.Server):
             http=patient(settings.request_seconds, connections_within(settings.max_connections)),
             ws=prompt(settings.request_seconds, settings.max_bodies_bytes),
             log_config=None,
-            access_log=False,  # replaced by the log of ``api.observe``, which has the request's id and sender
+            access_log=False,  # replaced by the log of ``api.middleware``, which has the request's id and sender
             server_header=False,
             ssl_certfile=settings.tls_certificate,
             ssl_keyfile=settings.tls_key,

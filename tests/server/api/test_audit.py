@@ -13,8 +13,8 @@ import pytest
 from support import pendulum
 from support.noting import until
 from support.server import ServerProcess, running_server
-from surrogym_server.api.auth import fingerprint
-from surrogym_server.api.observe import CHANGING, FREQUENT
+from surrogym_server.api.door import fingerprint
+from surrogym_server.api.middleware import CHANGING, FREQUENT
 
 TOKENS = {role: f"the-token-to-{role}" for role in ("sample", "train", "admin")}
 Send = Callable[..., httpx.Response]

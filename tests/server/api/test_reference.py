@@ -8,7 +8,7 @@ from html import unescape
 import httpx
 import pytest
 
-from surrogym_server.api.reference import page
+from surrogym_server.api.openapi import page
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ from contextlib import ExitStack
 import pytest
 from fastapi import Request
 
-from surrogym_server.api.concurrency import Waiting
+from surrogym_server.api.door import Waiting
 from surrogym_server.errors import Overloaded
 
 

@@ -1,21 +1,53 @@
-"""Reading and writing of the requests reset, step and rollout in their two forms, JSON and binary frames."""
+"""Reading and writing of the requests reset, step and rollout in their two forms, JSON and binary frames.
+
+The header ``x-deadline-ms`` says how long a caller waits for a reply. If the reply would come later, the step is not
+computed.
+"""
 
 from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Mapping
-from typing import Literal
+from typing import Any, Literal
 
 import msgspec
 
-from surrogym_server.api.json_body import parse_as
+from surrogym_server.api.door import parse_as
+from surrogym_server.api.problems import shown
 from surrogym_server.convert import sessions
 from surrogym_server.convert.numbers import numbers
 from surrogym_server.engine.port import SessionEngine
 from surrogym_server.engine.requests import Advance, PolicySteps, Reply, Reset, Rollout, Step
 from surrogym_server.engine.session import steps_of
+from surrogym_server.errors import InvalidInput
 from surrogym_shared import frames
 from surrogym_shared.wire import ResetSession, RolloutSession, StepSession
+
+HEADER = "x-deadline-ms"
+LONGEST_DIGITS = 9
+
+PARAMETER: dict[str, Any] = {
+    "name": HEADER,
+    "in": "header",
+    "required": False,
+    "description": "How many milliseconds the caller waits for the reply. If it would come later, the step is refused.",
+    "schema": {"type": "integer", "minimum": 1, "maximum": 10**LONGEST_DIGITS - 1},
+}
+
+
+def seconds_left(headers: Mapping[str, str]) -> float | None:
+    """Return how long the caller of a request waits, in seconds; None if the header is missing.
+
+    Raises:
+        InvalidInput: the header is not a whole number of milliseconds.
+    """
+    given = headers.get(HEADER)
+    if given is None:
+        return None
+    if not (given.isascii() and given.isdigit() and len(given) <= LONGEST_DIGITS and int(given)):
+        raise InvalidInput(f"{HEADER}: expected a whole number of milliseconds, at least 1, got {shown(given)}")
+    return int(given) / 1e3
+
 
 Operation = Literal["reset", "step", "rollout"]
 Writers = Mapping[type[Advance], Callable[[Reply], bytes]]  # functions that write the reply to each kind of request

@@ -15,12 +15,10 @@ from starlette.routing import WebSocketRoute
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from surrogym_server.api import examples
-from surrogym_server.api.auth import TRAIN
-from surrogym_server.api.door import MEDIA_TYPE, Door, door_of, json_up_to
-from surrogym_server.api.json_body import BINARY, JSON, described, take_turn
+from surrogym_server.api.door import BINARY, JSON, MEDIA_TYPE, TRAIN, Door, described, door_of, json_up_to, take_turn
 from surrogym_server.api.problems import answer_to, documented
 from surrogym_server.api.stepping import forms
-from surrogym_server.api.stepping.deadline import PARAMETER, seconds_left
+from surrogym_server.api.stepping.forms import PARAMETER, seconds_left
 from surrogym_server.api.stepping.stream import StepStream
 from surrogym_server.convert import sessions
 from surrogym_server.engine.port import SessionEngine

@@ -17,10 +17,9 @@ from contextvars import copy_context
 from starlette.datastructures import Headers
 from starlette.types import Receive, Scope, Send
 
-from surrogym_server.api.auth import Gate, bearer_token
+from surrogym_server.api.door import Gate, bearer_token
 from surrogym_server.api.problems import problem_of, response_of
-from surrogym_server.api.stepping.deadline import seconds_left
-from surrogym_server.api.stepping.forms import AS_FRAME, carried_out, request_in_frame
+from surrogym_server.api.stepping.forms import AS_FRAME, carried_out, request_in_frame, seconds_left
 from surrogym_server.convert import sessions
 from surrogym_server.engine.port import SessionEngine
 from surrogym_server.errors import SurrogymError

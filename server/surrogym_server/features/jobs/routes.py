@@ -7,10 +7,7 @@ from typing import Annotated
 
 from fastapi import APIRouter, Path, Request
 
-from surrogym_server.api.auth import READ, TRAIN
-from surrogym_server.api.concurrency import require_present
-from surrogym_server.api.door import DoorRoute
-from surrogym_server.api.json_body import example
+from surrogym_server.api.door import READ, TRAIN, DoorRoute, example, require_present
 from surrogym_server.api.problems import documented
 from surrogym_server.feature import part
 from surrogym_server.features.jobs import forms

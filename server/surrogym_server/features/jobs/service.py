@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from typing import NamedTuple, Self
 
-from surrogym_server.api.concurrency import Waiting
+from surrogym_server.api.door import Waiting
 from surrogym_server.errors import UnknownPolicy
 from surrogym_server.feature import Core
 from surrogym_server.features.jobs.records import JobProgress, JobRecord, JobResult, LeasedJob, NewJob

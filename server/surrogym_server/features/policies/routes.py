@@ -8,9 +8,17 @@ from fastapi import APIRouter, Path, Query, Request
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import Response
 
-from surrogym_server.api.auth import ADMIN, READ, TRAIN, TRAIN_OR_SAMPLE, holder, role_of
-from surrogym_server.api.door import DoorRoute, json_up_to
-from surrogym_server.api.json_body import example
+from surrogym_server.api.door import (
+    ADMIN,
+    READ,
+    TRAIN,
+    TRAIN_OR_SAMPLE,
+    DoorRoute,
+    example,
+    holder,
+    json_up_to,
+    role_of,
+)
 from surrogym_server.api.problems import documented
 from surrogym_server.feature import part
 from surrogym_server.features.policies import forms

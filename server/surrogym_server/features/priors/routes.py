@@ -8,8 +8,7 @@ from fastapi import APIRouter, Request
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import Response
 
-from surrogym_server.api.auth import ADMIN, READ
-from surrogym_server.api.door import DoorRoute
+from surrogym_server.api.door import ADMIN, READ, DoorRoute
 from surrogym_server.api.problems import documented
 from surrogym_server.convert.stored import read_stored
 from surrogym_server.feature import part

@@ -21,7 +21,7 @@ from websockets.sync.client import ClientConnection, connect
 
 from support import pendulum
 from support.server import ServerProcess, start_server
-from surrogym_server.api.auth import Gate
+from surrogym_server.api.door import Gate
 from surrogym_server.api.stepping.stream import StepStream
 from surrogym_shared import frames, wire
 from surrogym_shared.codes import Code, Problem
