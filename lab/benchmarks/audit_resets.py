@@ -48,8 +48,8 @@ from surrogym_shared.spec import (
     Uniform,
     with_history,
 )
+from surrogym_trainer.evaluation.baselines import baseline, default_baseline
 from surrogym_trainer.evaluation.evaluator import EvaluationSettings, evaluate
-from surrogym_trainer.evaluation.uncontrolled import baseline, default_baseline
 from surrogym_trainer.policies import load_policy
 from surrogym_trainer.policies.predict import Predict
 from surrogym_trainer.training import TrainSettings, train

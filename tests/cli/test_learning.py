@@ -20,7 +20,7 @@ from surrogym_sampler.logs.importing import Options
 from surrogym_shared.archives import stored
 from surrogym_shared.wire import NewSample
 from surrogym_trainer.evaluation.evaluator import Evaluation, EvaluationSettings, Trace
-from surrogym_trainer.evaluation.unsent_steps import as_logged, write_steps
+from surrogym_trainer.evaluation.reporting import as_logged, write_steps
 from surrogym_trainer.policies import PolicyCard
 
 MACHINE = ("--env", "support.machine:Machine")

@@ -10,8 +10,15 @@ import pytest
 from support.moody import SPEC
 from surrogym.cli.disagreement import Differing
 from surrogym_trainer.evaluation.audit import Compared
-from surrogym_trainer.evaluation.comparing import MOST, Disagreements, disagreements, samples_of, steady, steps_of
-from surrogym_trainer.evaluation.consequences import effects_of
+from surrogym_trainer.evaluation.comparing import (
+    MOST,
+    Disagreements,
+    disagreements,
+    effects_of,
+    samples_of,
+    steady,
+    steps_of,
+)
 from surrogym_trainer.evaluation.evaluator import Trace
 
 NAMES = ("x", "reward")

@@ -11,8 +11,7 @@ from support.limited import RAIL, SPEC, Cart, PatientCart, with_limits
 from support.rated import RATED, RatedRail
 from surrogym_sampler.original.episodes import open_episode
 from surrogym_shared.spec import Limits, Term
-from surrogym_trainer.evaluation.evaluator import Evaluation, EvaluationSettings, evaluate
-from surrogym_trainer.evaluation.limits import LimitsKept, limits_kept
+from surrogym_trainer.evaluation.evaluator import Evaluation, EvaluationSettings, LimitsKept, evaluate, limits_kept
 
 
 def pushed_right(*, limited: bool) -> Evaluation:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from surrogym_sampler.original.classic import pendulum
-from surrogym_trainer.evaluation.ranges import LITTLE, range_left
+from surrogym_trainer.evaluation.out_of_distribution import LITTLE, range_left
 from surrogym_trainer.policies.evidence import Audit, Promise, RangeLeft
 from surrogym_trainer.training.handover import Handover
 from surrogym_trainer.training.words import words_of_handover

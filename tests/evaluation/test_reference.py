@@ -13,8 +13,8 @@ from surrogym.cli.groups import PolicyReading
 from surrogym_sampler.original.episodes import open_episode
 from surrogym_sampler.original.errors import PolicyMisfit, UnknownEnvironment
 from surrogym_sampler.original.loading import make
+from surrogym_trainer.evaluation.baselines import load_reference
 from surrogym_trainer.evaluation.evaluator import EvaluationSettings, evaluate
-from surrogym_trainer.evaluation.reference import load_reference
 from surrogym_trainer.policies.card import PolicyCard
 
 MODULE = """

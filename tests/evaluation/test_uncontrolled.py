@@ -8,9 +8,9 @@ import pytest
 from surrogym_sampler.original.actions import decode_actions
 from surrogym_sampler.original.classic import cartpole, pendulum
 from surrogym_shared.spec import BoxAction
+from surrogym_trainer.evaluation.baselines import baseline, default_baseline
 from surrogym_trainer.evaluation.evaluator import Evaluation, EvaluationSettings, Trace
 from surrogym_trainer.evaluation.reporting import as_reported, paired_start
-from surrogym_trainer.evaluation.uncontrolled import baseline, default_baseline
 
 
 def test_the_uncontrolled_baseline_uses_zero_actions_or_random_discrete_ones():

@@ -13,7 +13,7 @@ from surrogym_sampler.logs.importing import Options
 from surrogym_shared.logs.writing import npz_of_steps
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import NewSample
-from surrogym_trainer.evaluation.unsent_steps import rewrite_steps, write_steps
+from surrogym_trainer.evaluation.reporting import rewrite_steps, write_steps
 
 
 def steps_from(first: float, count: int = 50) -> list[NewSample]:

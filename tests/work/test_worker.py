@@ -22,7 +22,7 @@ from surrogym_client.transport import Api
 from surrogym_sampler.original.classic import pendulum
 from surrogym_sampler.original.episodes import GymnasiumEpisode, open_episode
 from surrogym_shared import wire
-from surrogym_trainer.evaluation.reference import Reference
+from surrogym_trainer.evaluation.baselines import Reference
 from surrogym_trainer.policies import load_policy
 from surrogym_trainer.work.reporter import JobStopped, Stand
 from surrogym_trainer.work.tasks import Gathered, run_episodes

@@ -92,7 +92,7 @@ def spec_of_reference(given: str) -> EnvironmentSpec | None:
 
 def _baseline(opener: Callable[[], Episode], compare: Compare) -> Predict:
     from surrogym.cli.errors import CommandError
-    from surrogym_trainer.evaluation.uncontrolled import baseline
+    from surrogym_trainer.evaluation.baselines import baseline
 
     episode = opener()
     try:
@@ -110,7 +110,7 @@ def reference_of(given: str, reading: PolicyReading) -> Acting:
         CommandError, OriginalError, UnusablePolicy: there is no controller of this name, or it can't be used.
     """
     from surrogym.cli.errors import CommandError
-    from surrogym_trainer.evaluation.reference import load_reference
+    from surrogym_trainer.evaluation.baselines import load_reference
     from surrogym_trainer.policies.card import read_card
 
     if Path(given).exists():

@@ -14,8 +14,7 @@ if TYPE_CHECKING:
     from surrogym_client.transport.api import Api
     from surrogym_shared.spec import EnvironmentSpec
     from surrogym_shared.wire import SurrogateView
-    from surrogym_trainer.evaluation.comparing import Disagreement, Disagreements
-    from surrogym_trainer.evaluation.consequences import Effect
+    from surrogym_trainer.evaluation.comparing import Disagreement, Disagreements, Effect
     from surrogym_trainer.evaluation.evaluator import Evaluation, EvaluationSettings
     from surrogym_trainer.evaluation.systematic import Systematic
     from surrogym_trainer.policies.card import PolicyCard
@@ -179,7 +178,7 @@ class Imagining:
         """Return the changes (K,) of the mean return of virtual episodes that K errors of the surrogate's model cause.
         ``shifted`` and ``weights`` describe the errors, as in ``changes_of``."""
         from surrogym_client.transport import HttpSurrogate
-        from surrogym_trainer.evaluation.consequences import EFFECT_STARTS, changes_of
+        from surrogym_trainer.evaluation.comparing import EFFECT_STARTS, changes_of
         from surrogym_trainer.training.cards import session_of
 
         assert view.model_version is not None
@@ -195,8 +194,14 @@ def _compare(api: Api, surrogate: str, result: Evaluation, first_seed: int, imag
     coordinates are not those of the episodes."""
     import numpy as np
 
-    from surrogym_trainer.evaluation.comparing import Disagreements, compared, disagreements, steady, steps_of
-    from surrogym_trainer.evaluation.consequences import effects_of
+    from surrogym_trainer.evaluation.comparing import (
+        Disagreements,
+        compared,
+        disagreements,
+        effects_of,
+        steady,
+        steps_of,
+    )
 
     view = api.surrogate(surrogate)
     if view.fidelity is None or result.trace.coordinates.shape[1] != len(view.spec.coordinates):

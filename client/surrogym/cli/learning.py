@@ -116,7 +116,7 @@ class Steps:
 
     def choose(self, samples: Sequence[NewSample]) -> None:
         """Replace the steps to send by ``samples``, also in the file. Raises ``OSError`` if it can't be written."""
-        from surrogym_trainer.evaluation.unsent_steps import as_logged, rewrite_steps
+        from surrogym_trainer.evaluation.reporting import as_logged, rewrite_steps
 
         self.samples = as_logged(self.learning.spec, samples)
         if self.file is not None and self.samples:
@@ -164,7 +164,7 @@ def kept(learning: Learning | None, policy: Path, result: Evaluation, *, quiet: 
     After an error or Ctrl-C, it prints where the steps are. Yields None if no surrogate learns from the steps.
     """
     from surrogym_shared.terminal import say
-    from surrogym_trainer.evaluation.unsent_steps import write_steps
+    from surrogym_trainer.evaluation.reporting import write_steps
 
     if learning is None:
         yield None
@@ -189,7 +189,7 @@ def _learnable(spec: EnvironmentSpec, result: Evaluation, *, quiet: bool) -> lis
     from surrogym_shared.terminal import say
     from surrogym_shared.words import counted
     from surrogym_trainer.evaluation.comparing import as_samples, steady, steps_of
-    from surrogym_trainer.evaluation.unsent_steps import as_logged, is_storable
+    from surrogym_trainer.evaluation.reporting import as_logged, is_storable
 
     taken = steps_of(result.traces, result.steps)
     sound = [step for step in taken if is_storable(step)]

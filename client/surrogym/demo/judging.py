@@ -16,8 +16,8 @@ from surrogym_sampler.original.episodes import open_episode
 from surrogym_shared.terminal import progress
 from surrogym_shared.wire import Controller
 from surrogym_shared.words import counted
+from surrogym_trainer.evaluation.baselines import baseline, default_baseline
 from surrogym_trainer.evaluation.evaluator import Evaluation, EvaluationSettings, evaluate
-from surrogym_trainer.evaluation.uncontrolled import baseline, default_baseline
 from surrogym_trainer.policies.card import read_card
 from surrogym_trainer.policies.files import load_policy
 

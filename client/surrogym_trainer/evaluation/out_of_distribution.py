@@ -1,4 +1,5 @@
-"""Measurement of how many of a policy's states are far from the data of a log. All functions are pure.
+"""Measurement of how many of a policy's states are far from the data of a log, and search for an end of a sampling
+range that a policy often exceeds. All functions are pure.
 
 Shapes: n logged steps, m steps of the policy, C coordinates, F action entries.
 """
@@ -10,13 +11,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from surrogym_shared.kinds import Side
 from surrogym_shared.spec import EnvironmentSpec
+from surrogym_shared.spec.coordinates import Coordinate, limits
 from surrogym_trainer.evaluation.audit import on_one_scale
+from surrogym_trainer.policies.evidence import RangeLeft
 
 USUAL = 0.99  # the spacing of a log is this quantile of the distances from each logged step to the nearest other one
 # a step of the policy lies outside the log if every logged step is farther away than this multiple of the log's spacing
 FARTHER = 2.0
-LITTLE = 0.05  # no warning is given if at most this share of the policy's steps lies outside the log
+# no warning is given if at most this share of the policy's steps lies outside the log, or of its states beyond an end
+# of a sampling range
+LITTLE = 0.05
 MOST = 2_000  # at most this number of logged steps is compared with at most this number of steps of the policy
 AT_ONCE = 256  # to limit memory, distances are computed for this number of steps at once
 
@@ -101,3 +107,51 @@ def _nearest(points: Array, to: Array, *, itself: bool = False) -> Array:
             squares[np.arange(len(rows)), first + np.arange(len(rows))] = np.inf
         found[first : first + len(rows)] = np.sqrt(np.maximum(squares.min(1), 0.0))
     return found
+
+
+# no warning is given if the original environment can be set to all but this share of a policy's states
+MOST_UNTESTABLE = 0.2
+SIDES: tuple[Side, ...] = ("lower", "upper")
+
+
+def range_left(spec: EnvironmentSpec, q: Array) -> RangeLeft | None:
+    """Return the end of a sampling range that a policy's states q (m, C) exceed most often; None if no end is exceeded
+    by more than a share of ``LITTLE`` of the states.
+
+    Angles have no ends. Constants and lags are not tested, because they follow from the other coordinates.
+    """
+    found = [_left(coordinate, values, side) for coordinate, values in _with_ends(spec, q) for side in SIDES]
+    worst = max(found, key=lambda one: one.share, default=None)
+    return worst if worst is not None and worst.share > LITTLE else None
+
+
+def untestable(spec: EnvironmentSpec, q: Array) -> tuple[str, float] | None:
+    """Return the coordinate that most often prevents the original environment from being set to a policy's states q (m,
+    C), and the share of these states, which no audit can test.
+
+    None if the share is at most ``MOST_UNTESTABLE``, or if the environment can't be set to any state. Angles, constants
+    and lags are left out.
+    """
+    if spec.query == "rollout":
+        return None
+    found = [(coordinate.name, _beyond(coordinate.settable, values)) for coordinate, values in _with_ends(spec, q)]
+    worst = max(found, key=lambda one: one[1], default=None)
+    return worst if worst is not None and worst[1] > MOST_UNTESTABLE else None
+
+
+def _with_ends(spec: EnvironmentSpec, q: Array) -> list[tuple[Coordinate, Array]]:
+    """Return the coordinates whose sampling range has ends, each with its values (m,)."""
+    return [(c, q[:, i]) for i, c in enumerate(spec.coordinates) if c.kind == "linear" and c.moves]
+
+
+def _beyond(ends: tuple[float, float], values: Array) -> float:
+    return float(((values < ends[0]) | (values > ends[1])).mean())
+
+
+def _left(coordinate: Coordinate, values: Array, side: Side) -> RangeLeft:
+    low, high = limits(coordinate.sampling)
+    end, beyond = (low, values < low) if side == "lower" else (high, values > high)
+    farthest = values.min() if side == "lower" else values.max()
+    return RangeLeft(
+        coordinate=coordinate.name, side=side, end=end, share=float(beyond.mean()), farthest=float(farthest)
+    )

@@ -34,15 +34,13 @@ from surrogym_trainer.evaluation.audit import (
     untested,
     wider,
 )
-from surrogym_trainer.evaluation.comparing import compared, steady, steps_of
-from surrogym_trainer.evaluation.consequences import DRAWS, changes_of
+from surrogym_trainer.evaluation.baselines import baseline
+from surrogym_trainer.evaluation.comparing import DRAWS, changes_of, compared, steady, steps_of
 from surrogym_trainer.evaluation.evaluator import Evaluation
 from surrogym_trainer.evaluation.imagined import WHOLE
-from surrogym_trainer.evaluation.out_of_distribution import Outside, outside_of
+from surrogym_trainer.evaluation.out_of_distribution import Outside, outside_of, range_left, untestable
 from surrogym_trainer.evaluation.promise import UNNOTICED, promise_of
-from surrogym_trainer.evaluation.ranges import range_left, untestable
 from surrogym_trainer.evaluation.systematic import Inputs
-from surrogym_trainer.evaluation.uncontrolled import baseline
 from surrogym_trainer.policies.evidence import Audit, Promise
 from surrogym_trainer.policies.predict import Predict
 

@@ -15,9 +15,9 @@ from surrogym_sampler.original.errors import EvaluationFailed
 from surrogym_shared import wire
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.words import counted
+from surrogym_trainer.evaluation.baselines import baseline
 from surrogym_trainer.evaluation.evaluator import Evaluation, EvaluationInterrupted, EvaluationSettings, evaluate
 from surrogym_trainer.evaluation.reporting import as_reported, paired_start, words_of
-from surrogym_trainer.evaluation.uncontrolled import baseline
 from surrogym_trainer.evaluation.videos import record
 from surrogym_trainer.policies.card import write_card
 from surrogym_trainer.policies.files import load_policy

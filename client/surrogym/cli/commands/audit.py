@@ -185,8 +185,8 @@ def _of_another(card: PolicyCard) -> PolicyCard:
 def _floor(port: SurrogatePort, seed: int, session: dict[str, object]) -> float:
     """Return the mean imagined return without a policy: with an action of zero, or with random actions. The promised
     return is compared with it if the card does not contain the return of an untrained policy."""
+    from surrogym_trainer.evaluation.baselines import baseline, default_baseline
     from surrogym_trainer.evaluation.imagined import imagined_returns
-    from surrogym_trainer.evaluation.uncontrolled import baseline, default_baseline
     from surrogym_trainer.training.settings import CHECK_EPISODES
 
     spec = port.spec()
