@@ -14,7 +14,4 @@ Side = Literal["lower", "upper"]  # lower or upper end of a range
 
 Variant = Literal["deterministic", "probabilistic", "pathwise"]
 AutoresetMode = Literal["next_step", "same_step", "disabled"]
-# Whether a particle moves by the model's mean, or by a sample of its own from the posterior.
-Propagation = Literal["mean", "sample"]
-Weighting = Literal["inverse_variance", "uniform"]  # how the rewards of a lane's particles are averaged
 Activation = Literal["tanh", "relu"]  # activation function of the hidden layers of a policy

@@ -21,7 +21,11 @@ REMOVED: Mapping[str, Mapping[str, str]] = {
     "option of audit": {"--trust": TRUST_POLICY},
     "option of evaluate": {"--trust": TRUST_POLICY},
     "option of export-policy": {"--trust": TRUST_POLICY},
-    "option of train": {"--caution": "use --penalty, or --trust to end episodes"},
+    "option of train": {
+        "--caution": "use --penalty, or --trust to end episodes",
+        "--propagation": "leave it out, each particle moves by a sample of its own",
+        "--weighting": "leave it out, the particles' rewards are weighted by inverse variance",
+    },
     "option of register": {"--teleport": "use --access any", "--no-teleport": "use --access reset"},
     "model": {
         "bayesian_last_layer": "use 'gaussian_process' for few real steps, 'ensemble' for contacts and many steps",

@@ -32,7 +32,7 @@ ADVANCED: Mapping[str, frozenset[str]] = {  # for each command, the options for 
     ),
     "serve": frozenset({"--synchronous", "--engine", "--ray-address", "--ray-hosts", "--ready-file"}),
     "train": frozenset(
-        {"--variant", "--particles", "--propagation", "--weighting", "--spread", "--process-noise", "--start-box"}
+        {"--variant", "--particles", "--spread", "--process-noise", "--start-box"}
         | {"--start-visited", "--horizon", "--penalty", "--trust", "--num-envs", "--audit-steps"}
         | {"--tensorboard"}
     ),

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from surrogym_shared.kinds import Propagation, Variant, Weighting
+from surrogym_shared.kinds import Variant
 
 if TYPE_CHECKING:
     from surrogym_shared.spec import EnvironmentSpec
@@ -84,19 +84,6 @@ class SessionOptions:
     particles: Annotated[
         int | None,
         typer.Option(min=1, help="Number of particles of each virtual environment, for variant probabilistic."),
-    ] = None
-    propagation: Annotated[
-        Propagation | None,
-        typer.Option(
-            help="How a particle moves: to the predicted mean, or to a sample of the prediction. [default: sample]"
-        ),
-    ] = None
-    weighting: Annotated[
-        Weighting | None,
-        typer.Option(
-            help="How to average the particles' rewards: by inverse variance, or with equal weights. [default: "
-            "inverse_variance]"
-        ),
     ] = None
     spread: Annotated[
         float | None,

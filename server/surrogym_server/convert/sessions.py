@@ -35,8 +35,6 @@ def opening(request: replies.OpenSession) -> Opening:
         sensor_noise=tuple(sorted(request.sensor_noise.items())),
         trust=request.trust,
         particles=request.particles,
-        propagation=request.propagation,
-        weighting=request.weighting,
         spread=request.spread,
         functions=request.functions,
         residual=None if request.residual is None else residual(request.residual),

@@ -15,7 +15,6 @@ from surrogym_server.models.abilities import ArraySteps
 from surrogym_server.models.draws import function_draws
 from surrogym_server.models.guard import require_shapes
 from surrogym_server.models.port import DynamicsModel, Transition
-from surrogym_shared.kinds import Weighting
 
 # Particles are weighted by 1 / (variance of the particle's reward). This share of the reward's variance over the
 # samples is added to each variance, so that no weight is infinite.
@@ -78,7 +77,6 @@ def move_particles(
     u: Tensor,
     penalty: float,
     noise: Tensor | None,
-    weighting: Weighting,
     *,
     process: Tensor | None = None,
     steps: ArraySteps | None = None,
@@ -95,7 +93,6 @@ def move_particles(
         u: actions.
         penalty: number of standard deviations to subtract from each particle's reward (eq. 14).
         noise: (N, P, M) standard normal numbers by which each particle samples its next state; None for the mean.
-        weighting: weights of the particles' rewards; `uniform` replaces 1/U by equal weights.
         process: (N, P, M) standard normal numbers, by which the learned noise moves each particle, or None for no
             noise.
         steps: compiled steps of the model, or None to use ``DynamicsModel.transition``.
@@ -114,7 +111,7 @@ def move_particles(
     output = mean_state(model.definition, moved)
     over = model.terminated(output)
     mean = paid(model.terminal_reward, transition.reward, over.repeat_interleave(count))
-    weight = _weights(spread.reshape(lanes, count), model.scales[-1], weighting)
+    weight = _weights(spread.reshape(lanes, count), model.scales[-1])
     std = torch.cat([transition.std, spread[:, None]], -1).reshape(lanes, count, len(model.definition.outputs))
     return Moved(
         output,
@@ -167,14 +164,12 @@ def mean_state(definition: EnvironmentDefinition, particles: Tensor) -> Tensor:
     return mean
 
 
-def _weights(spread: Tensor, scale: Tensor, weighting: Weighting) -> Tensor:
-    """Return weights (N, P) of the P particles of each of N lanes: equal ones for ``uniform``, else proportional to
-    1 / ``spread`` ** 2. The weights of a lane add up to 1.
+def _weights(spread: Tensor, scale: Tensor) -> Tensor:
+    """Return weights (N, P) of the P particles of each of N lanes, proportional to 1 / ``spread`` ** 2. The weights of
+    a lane add up to 1.
 
     ``spread`` (N, P) has the standard deviation of each particle's reward, and ``scale`` is that of the reward over
     the samples.
     """
-    if weighting == "uniform":
-        return torch.full_like(spread, 1 / spread.shape[1])
     precision = 1 / (spread.square() + WEIGHT_FLOOR * scale**2).clamp_min(LEAST_VARIANCE)
     return precision / precision.sum(1, keepdim=True)

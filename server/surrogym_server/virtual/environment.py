@@ -22,7 +22,7 @@ from surrogym_server.virtual.paths import with_paths
 from surrogym_server.virtual.residual import Residual, with_residual
 from surrogym_server.virtual.sensors import SensorNoise, driving, sensed
 from surrogym_server.virtual.start import start_coordinates, start_particles
-from surrogym_shared.kinds import AutoresetMode, Propagation, Variant, Weighting
+from surrogym_shared.kinds import AutoresetMode, Variant
 
 Floats = NDArray[np.floating[Any]]
 Bools = NDArray[np.bool_]
@@ -42,8 +42,6 @@ class VirtualSettings:
     start_box: float = 0.0  # share of the episodes that start at a random state of the sampling range
     start_visited: float = 0.0  # share of the episodes that start at a state of a real step, see ``visited``
     particles: int = 1_000
-    propagation: Propagation = "sample"
-    weighting: Weighting = "inverse_variance"
     spread: float = 0.01  # standard deviation of the particles at the start, as a share of each coordinate's range
     # In variant pathwise, episodes follow functions sampled from the posterior. This is the number of functions that
     # the lanes share. If it is None, each episode follows a function of its own.
@@ -237,16 +235,13 @@ def _move(
         process = normal_noise(lanes, Purpose.PROCESS, max(particles, 1), outputs)
         process = driving(model, settings.sensor_noise, process)
     if settings.variant == "probabilistic":
-        noise = None
-        if settings.propagation == "sample":
-            noise = normal_noise(lanes, Purpose.TRANSITION, particles, outputs)
+        noise = normal_noise(lanes, Purpose.TRANSITION, particles, outputs)
         return move_particles(
             model,
             lanes.particles,
             u,
             settings.penalty,
             noise,
-            settings.weighting,
             process=process,
             steps=particle_steps,
         )

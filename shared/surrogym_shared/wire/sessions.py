@@ -7,7 +7,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, FiniteFloat, model_validator
 
 from surrogym_shared.checks import LARGEST
-from surrogym_shared.kinds import Activation, Propagation, Weighting
+from surrogym_shared.kinds import Activation
 from surrogym_shared.policy_sizes import MAX_LAYERS, MAX_UNITS
 from surrogym_shared.spec import MAX_DIMENSIONS
 from surrogym_shared.wire.base import (
@@ -25,7 +25,7 @@ from surrogym_shared.wire.base import (
     Variant,
 )
 
-OF_PARTICLES = ("particles", "propagation", "weighting", "spread")
+OF_PARTICLES = ("particles", "spread")
 
 
 Residuals = Annotated[list[FiniteFloat], Field(min_length=1, max_length=4 * MAX_DIMENSIONS)]
@@ -100,13 +100,6 @@ class OpenSession(Request):
     )
     particles: Annotated[int, Field(ge=1, le=MAX_PARTICLES)] = Field(
         default=1_000, description="variant probabilistic: number of particles in each lane"
-    )
-    propagation: Propagation = Field(
-        default="sample",
-        description="variant probabilistic: whether each particle moves by the mean, or by a random sample of its own",
-    )
-    weighting: Weighting = Field(
-        default="inverse_variance", description="variant probabilistic: how the rewards of the particles are averaged"
     )
     spread: Annotated[float, Field(ge=0, le=1)] = Field(
         default=0.01,

@@ -39,12 +39,11 @@ CHOICES: dict[str, dict[str, Any]] = {
     "particles": {
         "variant": "probabilistic",
         "particles": 4,
-        "weighting": "uniform",
         "process_noise": True,
         "autoreset_mode": "same_step",
         "time_limit": 3,
     },
-    "particles by the mean": {"variant": "probabilistic", "particles": 3, "propagation": "mean", "trust": 0.5},
+    "particles with trust": {"variant": "probabilistic", "particles": 3, "trust": 0.5},
     "noisy sensors": {"process_noise": True, "autoreset_mode": "same_step", "time_limit": 2},
     "visited starts": {"penalty": 1.0, "autoreset_mode": "same_step", "time_limit": 3},
     "noise, trust, box": {"process_noise": True, "trust": 0.05, "start_box": 0.5, "time_limit": 2},

@@ -1,4 +1,4 @@
-"""AUR-D and AUR-P (section 4, eq. 14): penalty, weights, propagation and the mean of particles, worked out by hand."""
+"""AUR-D and AUR-P (section 4, eq. 14): penalty, weights, noise and the mean of particles, worked out by hand."""
 
 import math
 from dataclasses import replace
@@ -67,7 +67,7 @@ def test_without_an_uncertainty_penalty_the_reward_is_the_mean(cart):
 def test_particle_rewards_are_weighted_by_inverse_variance(cart):
     """Rewards 10, 20, 40 deviate by 1, 2, 4: weights 16 : 4 : 1 of 21."""
     particles = torch.tensor([[[1.0], [2.0], [4.0]]], dtype=torch.float64)
-    moved = move_particles(cart, particles, column(0.5), 3.0, None, "inverse_variance")
+    moved = move_particles(cart, particles, column(0.5), 3.0, None)
     assert moved.particles[0, :, 0].tolist() == [1.5, 2.5, 4.5]
     assert float(moved.q) == pytest.approx((1.5 + 2.5 + 4.5) / 3)
     assert float(moved.reward_mean) == pytest.approx((16 * 10 + 4 * 20 + 1 * 40) / 21)
@@ -75,37 +75,30 @@ def test_particle_rewards_are_weighted_by_inverse_variance(cart):
     assert moved.std[0].tolist() == [pytest.approx(0.5), pytest.approx(math.sqrt((1 + 4 + 16) / 3))]
 
 
-def test_particle_rewards_can_be_weighted_uniformly(cart):
-    particles = torch.tensor([[[1.0], [2.0], [4.0]]], dtype=torch.float64)
-    moved = move_particles(cart, particles, column(0.5), 3.0, None, "uniform")
-    assert float(moved.reward_mean) == pytest.approx((10 + 20 + 40) / 3)
-    assert float(moved.reward) == pytest.approx((7 + 14 + 28) / 3)
-
-
 def test_a_particle_with_zero_reward_variance_gets_all_the_weight(cart):
     particles = torch.tensor([[[0.0], [2.0]]], dtype=torch.float64)
-    moved = move_particles(cart, particles, column(0.0), 3.0, None, "inverse_variance")
+    moved = move_particles(cart, particles, column(0.0), 3.0, None)
     assert float(moved.reward) == pytest.approx(0, abs=1e-9)
 
 
 def test_particles_with_equally_certain_rewards_get_equal_weights(cart):
     certain = replace(cart, reward_std=lambda q: 0 * q[:, 0])
     particles = torch.tensor([[[1.0], [2.0]]], dtype=torch.float64)
-    moved = move_particles(certain, particles, column(0.0), 0.0, None, "inverse_variance")
+    moved = move_particles(certain, particles, column(0.0), 0.0, None)
     assert float(moved.reward) == pytest.approx(15)
 
 
 def test_with_noise_each_particle_moves_by_its_own_random_draw(cart):
     particles = torch.tensor([[[1.0], [2.0]], [[0.0], [0.0]]], dtype=torch.float64)
     noise = torch.tensor([[[1.0], [-2.0]], [[0.0], [3.0]]], dtype=torch.float64)
-    moved = move_particles(cart, particles, column(0.0, 1.0), 0.0, noise, "uniform")
+    moved = move_particles(cart, particles, column(0.0, 1.0), 0.0, noise)
     assert moved.particles[..., 0].tolist() == [[1.5, 1.0], [1.0, 2.5]]
     assert moved.q[:, 0].tolist() == [1.25, 1.75]
 
 
 def test_termination_depends_on_the_mean_state_and_not_on_single_particles(cart):
     particles = torch.tensor([[[1.0], [4.0]], [[2.5], [4.0]]], dtype=torch.float64)
-    moved = move_particles(cart, particles, column(0.0, 0.0), 0.0, None, "uniform")
+    moved = move_particles(cart, particles, column(0.0, 0.0), 0.0, None)
     assert moved.terminated.tolist() == [False, True]
 
 
@@ -117,8 +110,8 @@ def test_the_mean_of_particle_angles_is_the_circular_mean(pendulum_model):
     assert mean[:, 1].tolist() == [2.0, 0.5]
 
 
-def test_one_particle_with_mean_propagation_equals_the_deterministic_variant(pendulum_model, started):
-    particle = {"variant": "probabilistic", "particles": 1, "spread": 0.0, "propagation": "mean"}
+def test_one_particle_in_a_certain_model_equals_the_deterministic_variant(pendulum_model, started):
+    particle = {"variant": "probabilistic", "particles": 1, "spread": 0.0}
     runs = [started(pendulum_model, 3, time_limit=20, **chosen) for chosen in ({}, particle)]
     states = [lanes for _, lanes in runs]
     for action in np.random.default_rng(0).uniform(-2, 2, (50, 3, 1)):
@@ -146,12 +139,6 @@ def test_sampled_particle_steps_differ_between_environments_and_repeat_with_the_
     np.testing.assert_array_equal(four[:, :2], run(2))
 
 
-def test_particles_with_mean_propagation_keep_their_distance(cart, started):
-    settings, lanes = started(cart, 1, variant="probabilistic", particles=5, propagation="mean")
-    after, _ = step(cart, settings, lanes, np.full((1, 1), 0.5))
-    torch.testing.assert_close(after.particles, lanes.particles + 0.5)
-
-
 def test_a_step_in_which_every_environment_resets_moves_no_particle(cart, started):
     settings, lanes = started(cart, 2, variant="probabilistic", particles=3, time_limit=1)
     lanes, ended = step(cart, settings, lanes, np.zeros((2, 1)), stds=True)
@@ -174,10 +161,7 @@ def test_compiled_particles_with_a_log_reward_agree_with_torch():
         pytest.skip("steps can't be compiled here")
     noise = torch.randn(5, 6, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     near, u = 0.02 * noise, torch.zeros(5, 1, dtype=torch.float64)
-    ours, theirs = (
-        move_particles(model, near, u, penalty=1.0, noise=noise, weighting="inverse_variance", steps=how)
-        for how in (steps, None)
-    )
+    ours, theirs = (move_particles(model, near, u, penalty=1.0, noise=noise, steps=how) for how in (steps, None))
     assert float(theirs.reward_mean.max()) > 0.1
     for name in ("particles", "reward_mean", "reward", "std"):
         torch.testing.assert_close(getattr(ours, name), getattr(theirs, name), rtol=2e-5, atol=0.0)
@@ -192,6 +176,6 @@ def test_particle_weights_stay_finite_for_tiny_rewards_whose_squares_underflow()
     model = gaussian_processes(definition_from_spec(plane()), drifting(faint, 12))
     assert model.reward.warp is not None
     near, u = torch.zeros(2, 3, 2, dtype=torch.float64), torch.zeros(2, 1, dtype=torch.float64)
-    moved = move_particles(model, near, u, penalty=0.0, noise=None, weighting="inverse_variance")
+    moved = move_particles(model, near, u, penalty=0.0, noise=None)
     assert bool(torch.isfinite(moved.reward).all())
     assert float(moved.reward.min()) > 0

@@ -76,7 +76,7 @@ def test_process_noise_moves_the_state_with_its_learned_deviation(pendulum_model
 
 def test_process_noise_is_independent_for_each_particle(pendulum_model, started):
     shaken = replace(pendulum_model, process_std=0.02)
-    chosen = {"variant": "probabilistic", "particles": 4, "spread": 0.0, "propagation": "mean"}
+    chosen = {"variant": "probabilistic", "particles": 4, "spread": 0.0}
     settings, lanes = started(shaken, 3, process_noise=True, **chosen)
     lanes, _ = step(shaken, settings, lanes, STILL)
     assert len(np.unique(lanes.particles[..., 1])) == 12
