@@ -33,8 +33,9 @@ from surrogym_server.gp.posterior import condition
 from surrogym_server.gp.search import Evidence, blas, minimum
 from surrogym_server.tensors import EDGE, STEEPEST, amplitude, bend
 
-PRIOR = 1.0  # prior standard deviation of a rate g_j, for inputs of standard deviation near 1
-FLAT = 1e-3  # a rate g_j whose absolute value is below this has no effect and is set to 0
+# Prior standard deviation of a rate g_j: how fast the output's changes grow along input j (deviation near 1).
+PRIOR = 1.0
+FLAT = 1e-3  # a rate g_j (growth of the output's changes along input j) of smaller absolute value is set to 0
 
 Array = NDArray[np.float64]
 

@@ -295,7 +295,7 @@ class PriorRecord:
 @dataclass(frozen=True)
 class OccupancyRecord:
     checkpoint: str
-    round: int  # number of rounds that the design had had when the states were submitted
+    round: int  # number of rounds of the design when these visited states were submitted
     created_at: float
     states: Array  # (m, C) coordinates of the m states that policies visited
 

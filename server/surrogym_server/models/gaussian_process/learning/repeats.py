@@ -14,7 +14,7 @@ from surrogym_server.models.gaussian_process.learning.dropping import WIN, map_w
 from surrogym_server.models.gaussian_process.learning.output_learner import OutputLearner, is_unexplained
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 
-ROLES = 4  # outputs are pooled only if the function that they have in common reads at most this many inputs
+ROLES = 4  # outputs share their samples only if the function that they have in common reads at most this many inputs
 # An output that shares samples learns from at most this many; if there are more, samples of other outputs are left out.
 MOST = subsets.FEW
 
