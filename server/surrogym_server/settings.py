@@ -33,6 +33,12 @@ def _without_path(url: str) -> str:
     return url
 
 
+def _http(url: str) -> str:
+    if not re.fullmatch(r"https?://[^/@?#\s]+(/\S*)?", url):
+        raise ValueError("expected an address that begins with http:// or https:// and a host, without a user name")
+    return url
+
+
 class Settings(BaseModel):
     """Settings of a server. Each field can be set by the environment variable ``SURROGYM_<FIELD>``."""
 
@@ -116,6 +122,11 @@ class Settings(BaseModel):
     policies_mib: Annotated[
         int, Field(ge=1, description="largest size of all files of a surrogate's policies together, in MiB")
     ] = 1_024
+    drift_webhook: Annotated[
+        str | None,
+        AfterValidator(_http),
+        Field(description="address to which each report of drift is posted as JSON. None: to no address"),
+    ] = None
     sweep_seconds: Annotated[
         float, Field(gt=0, description="seconds between two searches for expired leases and sessions")
     ] = 1.0

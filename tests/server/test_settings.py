@@ -71,6 +71,8 @@ def test_tokens_are_read_from_the_environment_with_their_roles(tmp_path: Path):
             "setting ray_checkpoint_seconds: .*greater than or equal to 0.01",
         ),
         ({"SURROGYM_RAY_CHECKPOINT_SECONDS": "inf"}, "setting ray_checkpoint_seconds: .*less than or equal to 3600"),
+        ({"SURROGYM_DRIFT_WEBHOOK": "file:///etc/passwd"}, "setting drift_webhook: .*http:// or https://"),
+        ({"SURROGYM_DRIFT_WEBHOOK": "https://name:word@host/x"}, "setting drift_webhook: .*without a user name"),
         ({"SURROGYM_LOG_LEVEL": "loud"}, "setting log_level: .*'info'"),
     ],
 )

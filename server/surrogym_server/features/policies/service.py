@@ -30,6 +30,7 @@ from surrogym_server.features.policies.records import (
     PolicyRecord,
 )
 from surrogym_server.features.policies.store import Policies
+from surrogym_server.features.policies.webhook import Webhook
 from surrogym_server.services.notices import Notices
 from surrogym_server.services.surrogates import Complete, difference, short
 from surrogym_server.storage.port import LATEST, Storage
@@ -64,7 +65,15 @@ class Episodes:
 
 
 class PolicyService:
-    def __init__(self, storage: Storage, blobs: Blobs, complete: Complete, notices: Notices, most_bytes: int) -> None:
+    def __init__(
+        self,
+        storage: Storage,
+        blobs: Blobs,
+        complete: Complete,
+        notices: Notices,
+        most_bytes: int,
+        webhook: Webhook | None = None,
+    ) -> None:
         """Keep the objects of the server that this service needs.
 
         Args:
@@ -73,6 +82,7 @@ class PolicyService:
             complete: adds the fields that a specification (JSON) of an older program lacks.
             notices: notices of this process.
             most_bytes: largest size of all files of one surrogate's policies together.
+            webhook: receives each report of drift; None: nothing does.
         """
         self._storage = storage
         self._policies = storage.part(Policies)
@@ -80,13 +90,15 @@ class PolicyService:
         self._complete = complete
         self._notices = notices
         self._most_bytes = most_bytes
+        self._webhook = webhook
         self._looked_at_files = -ORPHAN_SECONDS
 
     @classmethod
     def start(cls, core: Core) -> Self:
         settings = core.settings
         blobs = open_blobs(core.storage, settings.database_url, settings.files)
-        return cls(core.storage, blobs, core.complete, core.notices, settings.policies_mib * MEBIBYTE)
+        webhook = None if settings.drift_webhook is None else Webhook(settings.drift_webhook)
+        return cls(core.storage, blobs, core.complete, core.notices, settings.policies_mib * MEBIBYTE, webhook)
 
     async def sweep(self) -> None:
         """Every ``ORPHAN_SECONDS``, remove files whose policy was deleted or never stored."""
@@ -208,6 +220,8 @@ class PolicyService:
         _, created, freed = self._policies.evaluate(name, version, new, self._most_bytes)
         if created:
             self._changed(name, freed)
+            if self._webhook is not None:
+                self._webhook.post({"event": "drift", "surrogate": name, "policy_version": version, **drift})
         return self._policies.get(name, str(version))
 
     def episodes(
