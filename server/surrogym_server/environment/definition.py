@@ -162,7 +162,8 @@ class EnvironmentDefinition:
     termination_groups: tuple[tuple[Inequality, ...], ...]
     time_limit: int | None
     reward: Reward | DeclaredReward
-    penalty: float  # k of eq. 14; 0 if the reward is declared
+    # Factor k of eq. 14: a predicted reward is reduced by this multiple of its standard deviation; 0 if it is declared.
+    penalty: float
     tolerances: tuple[tuple[str, float], ...]
     learning: LearningDefinition
     design: DesignDefinition
