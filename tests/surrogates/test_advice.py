@@ -201,13 +201,13 @@ def test_the_advice_does_not_call_an_error_noise_if_noise_explains_only_part(ind
 
 @pytest.mark.parametrize(("index", "error"), [(0.99, 0.042), (0.9988, 0.042)])
 def test_the_tolerance_advised_for_a_noisy_output_is_just_sufficient(index: float, error: float) -> None:
-    """The server's index allows sqrt(tolerance^2 + (1.5 noise)^2), and the leave-one-out error 1.25 times
-    sqrt(tolerance^2 + noise^2). It leaves noise out that is smaller than the tolerance."""
+    """The server's index allows sqrt(tolerance^2 + noise^2), and the leave-one-out error 1.25 times as much. It leaves
+    noise out that is smaller than the tolerance."""
     said = advice(view(noisy_output(index, error)), [])
     tolerance, z = float(said.rsplit("=", 1)[1]), NormalDist().inv_cdf
-    deviation = math.hypot(0.03, 0.06) / z(index)
+    deviation = math.hypot(0.03, 0.04) / z(index)
     noise = 0.04 if tolerance < 0.04 else 0.0
-    assert math.hypot(tolerance, 1.5 * noise) / deviation == pytest.approx(z(TARGET), rel=0.05)
+    assert math.hypot(tolerance, noise) / deviation == pytest.approx(z(TARGET), rel=0.05)
     assert error <= (1.25 if noise else 1.0) * math.hypot(tolerance, noise)
 
 

@@ -18,9 +18,6 @@ MOST_STEPS = 10.0
 NOTICEABLE = 0.9
 FEWEST_MODELS = 4  # the speed of learning is estimated from at least this number of successive models
 NOISY_SLACK = 1.25  # if an output has confirmed noise, its leave-one-out error may be this multiple of its tolerance
-# To estimate which tolerance is within reach, an output's tolerance is widened by this many standard deviations of its
-# noise. The server widens it by one.
-NOISE_BAND = 1.5
 MOSTLY_NOISE = 0.8  # if noise has this share of the squared leave-one-out error, more real steps hardly help
 # An output's tolerance is a share of the spread of its initial samples. If it is below this share of the leave-one-out
 # error, all initial samples had the same value.
@@ -248,12 +245,14 @@ def _within_reach(view: SurrogateView, output: OutputFidelity) -> float:
     """
     z = NormalDist().inv_cdf
     index = min(max(output.confidence_index, 0.5 + 1e-9), 1 - 1e-12)
-    allowed, band = _declarable(output), NOISE_BAND * output.noise
-    by_deviation = hypot(allowed, band) * z(view.target) / z(index) if output.confidence_index < view.target else 0.0
+    allowed = _declarable(output)
+    by_deviation = (
+        hypot(allowed, output.noise) * z(view.target) / z(index) if output.confidence_index < view.target else 0.0
+    )
     if index <= 0.51:
         by_deviation = allowed
     error = output.leave_one_out_error or 0.0
-    beside = max(_beyond(by_deviation, band), _beyond(error / _slack(output), output.noise), allowed)
+    beside = max(_beyond(by_deviation, output.noise), _beyond(error / _slack(output), output.noise), allowed)
     return beside if beside <= output.noise else max(error, by_deviation)
 
 
