@@ -13,9 +13,9 @@ from surrogym_shared.words import counted
 
 LOOK_SECONDS = 0.25
 MANY = 1_500  # number of samples from which the expected time of a fit is shown
-# Seconds of a free core that a fit of ``MANY`` to 20,000 samples by the default model takes for each output: least and
-# most with noise, and most without noise.
-NOISY_SECONDS, NOISE_FREE_SECONDS = (1, 3), 20
+# Seconds of a free core for each output in a fit of ``MANY`` to 20,000 samples by the default model: least, if they
+# are so noisy that few inducing points stand for all of them; most, with little noise or none.
+LEAST_SECONDS, MOST_SECONDS = 1, 30
 FIRST_LEASE_SECONDS = 5.0  # time for a sampler to begin a query, which a running sampler does within a second
 
 
@@ -43,10 +43,9 @@ def words_of_long_fit(view: SurrogateView, seconds: float) -> str:
 
 def _usual_seconds(outputs: int) -> str:
     """Describe how long a fit of many samples usually takes, by its number of outputs."""
-    least, most = (outputs * seconds for seconds in NOISY_SECONDS)
     return (
-        f"{counted(outputs, 'output')} of noisy steps take {least} to {most} s of a free core, without noise up to "
-        f"{outputs * NOISE_FREE_SECONDS} s, and several times as long beside other programs"
+        f"{counted(outputs, 'output')} take {outputs * LEAST_SECONDS} to {outputs * MOST_SECONDS} s of a free core, "
+        "longest without noise, and several times as long beside other programs"
     )
 
 
