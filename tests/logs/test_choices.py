@@ -7,8 +7,7 @@ import pytest
 
 from surrogym_shared.logs.checking import ReadLog, check_log, draft_log
 from surrogym_shared.logs.columns import roles_by_map, roles_by_name
-from surrogym_shared.logs.errors import UnusableLog
-from surrogym_shared.logs.table import Floats, Table
+from surrogym_shared.logs.table import Floats, Table, UnusableLog
 from surrogym_shared.spec import BoxAction, DiscreteAction, EnvironmentSpec, MultiDiscreteAction
 
 DRAWS = range(20)

@@ -11,8 +11,7 @@ import pytest
 
 from surrogym_sampler.logs import ReadLog, UnusableLog, read_log
 from surrogym_sampler.logs.importing import Options
-from surrogym_shared.logs.columns import roles_by_name
-from surrogym_shared.logs.headings import heading
+from surrogym_shared.logs.columns import heading, roles_by_name
 
 ROWS = 24
 UNITS = {

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from surrogym_shared.logs.columns import roles_by_name
-from surrogym_shared.logs.errors import UnusableLog
 from surrogym_shared.logs.rows import rows_of
-from surrogym_shared.logs.table import Floats, Ints, Table
+from surrogym_shared.logs.table import Floats, Ints, Table, UnusableLog
 from surrogym_shared.logs.transitions import Transitions, transitions_of
 
 DRAWS = range(20)

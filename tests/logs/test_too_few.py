@@ -11,7 +11,7 @@ import pytest
 from support import reactor
 from surrogym_sampler.logs import UnusableLog, import_log, read_log
 from surrogym_sampler.logs.importing import Options
-from surrogym_shared.logs.too_few import TooFewSteps
+from surrogym_shared.logs.transitions import TooFewSteps
 
 
 def said(path: Path, text: str) -> str:

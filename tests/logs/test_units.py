@@ -14,9 +14,8 @@ from surrogym_sampler.logs import importing
 from surrogym_sampler.original.classic import pendulum
 from surrogym_shared.logs.checking import ReadLog, check_log
 from surrogym_shared.logs.columns import roles_by_name
-from surrogym_shared.logs.errors import UnusableLog
-from surrogym_shared.logs.table import Table
-from surrogym_shared.logs.units import require_reward_unit, require_units
+from surrogym_shared.logs.rows import require_reward_unit, require_units
+from surrogym_shared.logs.table import Table, UnusableLog
 from surrogym_shared.spec import BoxAction, Coordinate, EnvironmentSpec, ObservationEntry, Term, Uniform
 
 

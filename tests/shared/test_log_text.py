@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from surrogym_shared.logs.errors import UnusableLog
-from surrogym_shared.logs.table import numbers
+from surrogym_shared.logs.table import UnusableLog, numbers
 from surrogym_shared.logs.text import LONGEST_NAME, MOST_COLUMNS, table_of_text
 from surrogym_shared.logs.writing import spreadsheet_cell
 

@@ -23,7 +23,7 @@ def sentence(error: Exception) -> str | None:
     from surrogym_client.runtime.ray_cluster import NoCluster
     from surrogym_sampler.original.errors import OriginalError
     from surrogym_shared.c_compiler import CannotCompile
-    from surrogym_shared.logs.errors import UnusableLog
+    from surrogym_shared.logs.table import UnusableLog
     from surrogym_shared.surrogate_file import NotASurrogateFile
 
     match error:

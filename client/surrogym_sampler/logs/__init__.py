@@ -9,6 +9,6 @@ from __future__ import annotations
 
 from surrogym_sampler.logs.importing import Imported, import_log, read_log, send
 from surrogym_shared.logs.checking import ReadLog
-from surrogym_shared.logs.errors import UnusableLog
+from surrogym_shared.logs.table import UnusableLog
 
 __all__ = ["Imported", "ReadLog", "UnusableLog", "import_log", "read_log", "send"]

@@ -12,10 +12,8 @@ from typing import Any
 import numpy as np
 
 from surrogym_shared.logs.columns import ACTION, SINGLE, STATE
-from surrogym_shared.logs.errors import UnusableLog
-from surrogym_shared.logs.sizes import MOST_COLUMNS, require_sizes
-from surrogym_shared.logs.table import Cells, Table
-from surrogym_shared.logs.text import is_unnamed
+from surrogym_shared.logs.table import Cells, Table, UnusableLog
+from surrogym_shared.logs.text import MOST_COLUMNS, is_unnamed, require_sizes
 
 STATES = ("coordinates", "observations", "observation", "states", "state", "obs", "q")
 ACTIONS = ("actions", "action", "acts", "u")

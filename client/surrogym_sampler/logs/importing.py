@@ -16,12 +16,10 @@ from surrogym_sampler.logs.outputs import rejected_file, require_outputs, write_
 from surrogym_sampler.logs.reading import read
 from surrogym_shared import patterns
 from surrogym_shared.logs.checking import ReadLog, check_log, draft_log, is_of_rejected, write_rejected
-from surrogym_shared.logs.errors import UnusableLog
 from surrogym_shared.logs.roles import read_roles
-from surrogym_shared.logs.table import Floats, Table
-from surrogym_shared.logs.too_few import TooFewSteps
-from surrogym_shared.logs.transitions import Transitions
-from surrogym_shared.logs.units import require_reward_unit
+from surrogym_shared.logs.rows import require_reward_unit
+from surrogym_shared.logs.table import Floats, Table, UnusableLog
+from surrogym_shared.logs.transitions import TooFewSteps, Transitions
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import NewSample
 from surrogym_shared.words import counted

@@ -6,7 +6,7 @@ import os
 from collections.abc import Mapping
 from pathlib import Path
 
-from surrogym_shared.logs.errors import UnusableLog
+from surrogym_shared.logs.table import UnusableLog
 from surrogym_shared.spec import EnvironmentSpec
 
 PICTURES = (".png", ".svg", ".pdf")

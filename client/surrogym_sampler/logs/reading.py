@@ -14,11 +14,8 @@ from gymnasium.spaces import Box, Discrete
 
 from surrogym_sampler.logs.arrays import require_shapes, table_of_arrays
 from surrogym_shared.archives import Header, read_arrays
-from surrogym_shared.logs.decoding import decoded
-from surrogym_shared.logs.errors import UnusableLog
-from surrogym_shared.logs.sizes import LONGEST_CELL, MOST_COLUMNS, require_sizes
-from surrogym_shared.logs.table import Cells, Table
-from surrogym_shared.logs.text import table_of_text
+from surrogym_shared.logs.table import Cells, Table, UnusableLog
+from surrogym_shared.logs.text import LONGEST_CELL, MOST_COLUMNS, decoded, require_sizes, table_of_text
 from surrogym_shared.logs.writing import EVALUATED
 from surrogym_shared.words import listed
 

@@ -14,12 +14,11 @@ from surrogym_sampler.logs.importing import Options
 from surrogym_sampler.logs.reading import format_of
 from surrogym_shared.logs.checking import check_log
 from surrogym_shared.logs.columns import LogMapping
-from surrogym_shared.logs.decoding import decoded
 from surrogym_shared.logs.roles import read_roles
+from surrogym_shared.logs.rows import BEYOND
 from surrogym_shared.logs.table import Ints
-from surrogym_shared.logs.text import table_of_text
-from surrogym_shared.logs.too_few import TooFewSteps
-from surrogym_shared.logs.units import BEYOND
+from surrogym_shared.logs.text import decoded, table_of_text
+from surrogym_shared.logs.transitions import TooFewSteps
 from surrogym_shared.spec import EnvironmentSpec, limits
 from surrogym_trainer.evaluation.comparing import StepOfEpisode
 

@@ -11,9 +11,8 @@ from surrogym_server.storage.records import NewSample
 from surrogym_shared import wire
 from surrogym_shared.logs.checking import ReadLog, check_log, draft_log
 from surrogym_shared.logs.columns import Roles
-from surrogym_shared.logs.errors import UnusableLog
 from surrogym_shared.logs.roles import read_roles
-from surrogym_shared.logs.table import Table
+from surrogym_shared.logs.table import Table, UnusableLog
 from surrogym_shared.logs.text import table_of_text
 from surrogym_shared.spec import EnvironmentSpec
 

@@ -14,13 +14,10 @@ from pydantic import ValidationError
 from surrogym_shared.faults import first_fault
 from surrogym_shared.logs.columns import Roles
 from surrogym_shared.logs.drafting import Draft, declared_choices, draft, lost_ends, wrapped
-from surrogym_shared.logs.errors import UnusableLog
 from surrogym_shared.logs.rewards import declared_reward
-from surrogym_shared.logs.rows import rows_of
-from surrogym_shared.logs.table import Bools, Floats, Table
-from surrogym_shared.logs.too_few import require_steps
-from surrogym_shared.logs.transitions import Transitions, transitions_of
-from surrogym_shared.logs.units import require_units, unit_notes
+from surrogym_shared.logs.rows import require_units, rows_of, unit_notes
+from surrogym_shared.logs.table import Bools, Floats, Table, UnusableLog
+from surrogym_shared.logs.transitions import Transitions, require_steps, transitions_of
 from surrogym_shared.logs.writing import spreadsheet_cell
 from surrogym_shared.spec import BoxAction, DiscreteAction, EnvironmentSpec
 from surrogym_shared.terms import terminates

@@ -1,5 +1,9 @@
 """Find out which column of a table has which role: state, action, reward and so on. A mapping declares the roles;
-without one, the names of the columns and the contents of their cells decide."""
+without one, the names of the columns and the contents of their cells decide.
+
+The cells of a column may be numbers of rows, times of a clock, numbers of episodes, or 0/1 marks. Steps of the format
+RLDS (Reinforcement Learning Datasets) become rows that also have the next observation.
+"""
 
 from __future__ import annotations
 
@@ -7,32 +11,149 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
+
+import numpy as np
 
 from surrogym_shared.logs.columns import (
+    NEXT,
     STATE,
     LogMapping,
     Roles,
+    heading,
     mapping_of,
     roles_by_mapping,
     roles_by_name,
+    timed,
 )
-from surrogym_shared.logs.counting import (
-    Numbering,
-    episodes_by,
-    grows,
-    grows_always,
-    is_in_blocks,
-    is_mark,
-    is_steady,
-    is_unordered,
-    numbering,
+from surrogym_shared.logs.table import (
+    DATES,
+    DURATIONS,
+    Bools,
+    Cells,
+    Floats,
+    Table,
+    UnusableLog,
+    flags,
+    groups,
+    numbers,
+    stamps,
+    times,
 )
-from surrogym_shared.logs.errors import UnusableLog
-from surrogym_shared.logs.headings import heading, timed
-from surrogym_shared.logs.rlds import from_rlds
-from surrogym_shared.logs.table import Cells, Table
-from surrogym_shared.words import listed
+from surrogym_shared.words import has, listed
+
+Numbering = Literal["rows", "episodes", "gaps"]
+
+FEWEST = 4  # in a log with fewer rows, the meaning of a column is not inferred from its cells
+MOST_TURNS = 0.5  # a column numbers episodes, or is a clock, if it changes or restarts in at most this share of rows
+# A column grows steadily, as a clock, if its increments differ from their median by at most this share of the median.
+EQUAL = 1e-6
+
+
+def measured(cells: Cells) -> Floats | None:
+    """Return a column of numbers or times as numbers (n,); None if a cell is neither, or with fewer than 4 cells."""
+    try:
+        values, faults = times("", cells)
+    except UnusableLog:
+        return None
+    return None if faults or len(values) < FEWEST else values
+
+
+def numbering(cells: Cells) -> Numbering | None:
+    """Return what a column of whole numbers counts; None if it counts nothing.
+
+    ``rows``: it numbers all rows. ``episodes``: it numbers the rows of each episode, and restarts with the next one.
+    ``gaps``: it numbers rows in one of these two ways, but some numbers are missing.
+    """
+    values = measured(cells)
+    if values is None or cells.dtype.kind in (DATES, DURATIONS) or (values != np.floor(values)).any():
+        return None
+    plain, faults = numbers("", cells)
+    if faults or stamps(plain) is not None:  # dates such as 20240331 are whole numbers, but don't number rows
+        return None
+    change = np.diff(values)
+    if (change == 1).all():
+        return "rows"
+    restarts = change != 1
+    again = values[1:][restarts]
+    if restarts.mean() <= MOST_TURNS and (change[restarts] <= 0).all() and (again == values[0]).all():
+        return "episodes"
+    return "gaps" if grows(cells) and (change != 0).all() and not is_unordered(cells) else None
+
+
+def is_unordered(cells: Cells) -> bool:
+    """Whether a column has a different whole number in each row, not in ascending order, as the index of shuffled rows
+    has."""
+    values = measured(cells)
+    whole = values is not None and bool((values == np.floor(values)).all())
+    return values is not None and whole and len(np.unique(values)) == len(values) and bool((np.diff(values) < 0).any())
+
+
+def grows_always(cells: Cells) -> bool:
+    """Whether a column is larger in each row than in the one before."""
+    values = measured(cells)
+    return values is not None and bool((np.diff(values) > 0).all())
+
+
+def grows(cells: Cells) -> bool:
+    """Whether a column grows, and falls only back to about its first value, as a time that restarts does."""
+    values = measured(cells)
+    if values is None:
+        return False
+    change = np.diff(values)
+    if not (change > 0).any() or (change < 0).mean() > MOST_TURNS:
+        return False
+    began = values[0] + 1.5 * np.median(change[change > 0])
+    return bool((values[1:][change < 0] <= began).all())
+
+
+def is_steady(cells: Cells) -> bool:
+    """Whether a column grows by the same amount in each row, whatever the actions are, as a clock does."""
+    values = measured(cells)
+    if values is None or len(values) < 2 * FEWEST:
+        return False
+    change = np.diff(values)
+    step = float(np.median(change))
+    return bool(step > 0 and (np.abs(change - step) <= EQUAL * max(step, np.abs(values).max() * 1e-9)).all())
+
+
+def is_mark(cells: Cells) -> bool:
+    """Whether all cells are 0 or 1, or true or false."""
+    try:
+        return not flags("", cells)[1]
+    except UnusableLog:
+        return False
+
+
+def is_in_blocks(cells: Cells) -> bool:
+    """Whether a column keeps a whole number or a text for several rows before it changes, as names of episodes do."""
+    numbers = groups(cells)
+    if len(numbers) < FEWEST or numbers[-1] == numbers[0]:
+        return False
+    values = measured(cells)
+    whole = values is None or bool((values == np.floor(values)).all())
+    return whole and bool((np.diff(numbers) != 0).mean() <= MOST_TURNS)
+
+
+def episodes_by(name: str, cells: Cells) -> Cells:
+    """Return the number of each row's episode (n,), from a column that marks first rows or restarts with each episode.
+
+    Raises:
+        UnusableLog: the column has neither marks nor numbers.
+    """
+    if is_mark(cells):
+        return np.cumsum(flags(name, cells)[0])
+    values = measured(cells)
+    if values is None:
+        raise UnusableLog(
+            f"{name}: expected 1 in the first row of each episode and 0 in the others, or a number that restarts in "
+            "each episode, got other cells: correct the column, or leave it out with a mapping file (--map)"
+        )
+    return np.cumsum(np.concatenate([[0], np.diff(values) <= 0]))
+
+
+FIRST, LAST, TERMINAL = "is_first", "is_last", "is_terminal"
+
 
 BY = "episodes by "  # prefix of the name of a column of episode numbers that was derived from another column
 STARTS = ("is_first", "episode_start", "episode_starts")  # names of columns that mark the first step of each episode
@@ -190,3 +311,58 @@ def _likely(name: str, cells: Cells, roles: Roles) -> str | None:
         if (by_name or words.intersection(one.words)) and has_cells_of(cells):
             return role
     return None
+
+
+def from_rlds(table: Table) -> Table:
+    """Convert a log in the format RLDS to rows with their next state and end; return any other log unchanged.
+
+    A step of RLDS has an observation, the action taken there, and the reward for it. The last step of an episode
+    (``is_last``) has only the observation. Its action and reward mean nothing, so it becomes no row. The row of the
+    step before is terminated if the last step has ``is_terminal``, and truncated otherwise.
+
+    Raises:
+        UnusableLog: the columns ``is_first``, ``is_last`` and ``is_terminal`` contradict each other.
+
+    References:
+        S. Ramos et al., "RLDS: an Ecosystem to Generate, Share and Use Datasets in Reinforcement Learning", 2021.
+    """
+    marks = {heading(name).plain: name for name in table.columns if heading(name).plain in (FIRST, LAST, TERMINAL)}
+    if FIRST not in marks or LAST not in marks or table.faults:
+        return table
+    first, last = _marks(table, marks[FIRST]), _marks(table, marks[LAST])
+    terminal = _marks(table, marks[TERMINAL]) if TERMINAL in marks else np.zeros_like(last)
+    after_last = np.concatenate([[True], last[:-1]])
+    if (odd := np.flatnonzero(first != after_last)).size:
+        raise UnusableLog(
+            f"expected {FIRST} to be 1 in the first row and after each row with {LAST}, as RLDS defines them, got "
+            f"{int(first[odd[0]])} in line {table.lines[odd[0]]}"
+        )
+    if (odd := np.flatnonzero(terminal & ~last)).size:
+        raise UnusableLog(f"expected {TERMINAL} only where {LAST} is 1, got 1 and 0 in line {table.lines[odd[0]]}")
+    rows = np.flatnonzero(~last[:-1])
+    if not len(rows):
+        raise UnusableLog(f"expected steps of RLDS, got none: each row is marked by {LAST}, or is the last row")
+    columns = {name: cells for name, cells in table.columns.items() if name not in marks.values()}
+    states = roles_by_name(list(columns)).state
+    columns_of_steps = {name: cells[rows] for name, cells in columns.items()}
+    if not any(NEXT.match(heading(name).name) for name in columns):
+        columns_of_steps |= {f"next.{name}": columns[column][rows + 1] for name, column in states.items()}
+    columns_of_steps |= {"terminated": terminal[rows + 1], "truncated": last[rows + 1] & ~terminal[rows + 1]}
+    if "episode" not in columns_of_steps:
+        columns_of_steps["episode"] = np.cumsum(first)[rows]
+    without = len(table) - len(rows)
+    return replace(
+        table,
+        columns=columns_of_steps,
+        lines=table.lines[rows],
+        cells=[table.cells[row] for row in rows.tolist()] if len(table.cells) else (),
+        remarks=(*table.remarks, f"RLDS: {has(without, 'row')} only the last observation of an episode, and no step"),
+    )
+
+
+def _marks(table: Table, name: str) -> Bools:
+    marks, faults = flags(name, table.columns[name])
+    if faults:
+        row = next(iter(faults))
+        raise UnusableLog(f"line {table.lines[row]}: {faults[row]}")
+    return marks

@@ -1,4 +1,7 @@
-"""A log as it was read: named columns of cells, and functions that convert cells to numbers."""
+"""A log as it was read: named columns of cells, and functions that convert cells to numbers.
+
+An error concerns the whole log. A fault of a single row is no error: the row is only left out.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from surrogym_shared.logs.errors import UnusableLog
+
+class UnusableLog(ValueError):
+    """A log, its mapping or its columns can't be used. The message says what was expected and what came."""
+
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
