@@ -45,7 +45,7 @@ from support.changing import Array, Machine, Parameters
 from surrogym_lab.reproduce.rows import read_records, write_records
 from surrogym_sampler import original
 from surrogym_sampler.original.episodes import open_episode
-from surrogym_sampler.original.limits.guard import Guard
+from surrogym_sampler.original.limits import Guard
 from surrogym_sampler.original.loading import Respecified
 from surrogym_sampler.original.rollouts import answering, keeping_limits
 from surrogym_server.local import LocalSurrogate

@@ -16,7 +16,7 @@ from support.compilers import NEEDS_C, SANITIZED, Compiled, called_by_name, call
 from support.controllers import LEARNERS, learner, limited, network, plant
 from surrogym_sampler.original.actions import decode_actions
 from surrogym_sampler.original.lags import begun, followed
-from surrogym_sampler.original.limits.guard import Guard
+from surrogym_sampler.original.limits import Guard
 from surrogym_shared.spec import DiscreteAction, MultiDiscreteAction
 from surrogym_shared.terms import observe as declared
 from surrogym_trainer.deployment.c import write, write_arduino

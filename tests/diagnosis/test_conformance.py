@@ -13,7 +13,7 @@ from support.forging_proxy import Forge, forging_proxy, leave
 from support.server import ServerProcess, running_server
 from surrogym.cli import build
 from surrogym_client.transport import Api
-from surrogym_sampler.diagnosis.conformance import conformance, sessions
+from surrogym_sampler.diagnosis.conformance import checks, conformance
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +76,7 @@ def reset_every_lane(path: str, body: dict[str, Any]) -> None:
 def test_a_server_that_breaks_a_protocol_rule_fails_the_check_of_that_rule(
     server: ServerProcess, monkeypatch: pytest.MonkeyPatch, request_: Forge, reply: Forge, broken: str
 ):
-    monkeypatch.setattr(sessions, "CHECKS", sessions.CHECKS[:-1])  # the proxy carries no stream
+    monkeypatch.setattr(checks, "WITH_MODEL", checks.WITH_MODEL[:-1])  # the proxy carries no stream
     with forging_proxy(server.url, request_, reply) as url:
         outcomes = {outcome.name: outcome.failure for outcome in conformance(url, None, "broken")}
     failure = outcomes[broken]

@@ -143,7 +143,7 @@ def test_the_error_of_a_failed_program_contains_its_last_stderr_line(capfd: pyte
 def test_much_output_on_stderr_does_not_block_an_environment_program(monkeypatch: pytest.MonkeyPatch):
     """This process's own standard error is a pipe that nobody reads."""
     reading, writing = os.pipe()
-    monkeypatch.setattr("surrogym_sampler.original.executables.standard_error.OWN", writing)
+    monkeypatch.setattr("surrogym_sampler.original.executables.program.OWN", writing)
     plant = moody("[print('x' * 10**6, file=sys.stderr) for _ in range(30)]")
     try:
         assert plant.step_from(np.zeros(4), np.ones(1)).reward > 0

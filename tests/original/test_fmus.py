@@ -26,8 +26,7 @@ from surrogym_sampler import original
 from surrogym_sampler.original.describing import describe
 from surrogym_sampler.original.episodes import open_episode
 from surrogym_sampler.original.errors import EnvironmentDied, StepFailed, StepTimedOut, UnknownEnvironment
-from surrogym_sampler.original.fmus.adapter import Fmu, open_simulator
-from surrogym_sampler.original.fmus.environment import FmuEnvironment
+from surrogym_sampler.original.fmus.adapter import Fmu, FmuEnvironment, open_simulator
 from surrogym_sampler.original.loading import fits, is_known, isolated
 from surrogym_shared.spec import (
     BoxAction,

@@ -19,8 +19,7 @@ from support.noting import until
 from surrogym_sampler.original.episodes import open_episode
 from surrogym_sampler.original.errors import StepFailed, StepRefused, UnknownEnvironment
 from surrogym_sampler.original.isolated import IsolatedEnvironment
-from surrogym_sampler.original.limits.guard import Guard
-from surrogym_sampler.original.limits.queries import GuardedRollouts, GuardedSteps
+from surrogym_sampler.original.limits import Guard, GuardedRollouts, GuardedSteps
 from surrogym_sampler.original.protocol import RealStep
 from surrogym_sampler.original.rollouts import answering, keeping_limits
 from surrogym_shared.limits import past

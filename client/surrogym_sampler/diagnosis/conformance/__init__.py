@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 
 from surrogym_client.errors import SurrogymClientError
-from surrogym_sampler.diagnosis.conformance import leases, sessions
+from surrogym_sampler.diagnosis.conformance import checks
 from surrogym_sampler.diagnosis.conformance.target import Target
 from surrogym_sampler.diagnosis.outcomes import Mismatch, Outcome
 
@@ -24,10 +24,10 @@ def conformance(url: str | None, token: str | None, surrogate: str) -> Iterator[
         SurrogymClientError: the name is taken, or the surrogate gets no model, so that sessions can't be checked.
     """
     with Target(url, token, surrogate) as target:
-        for check in leases.CHECKS:
+        for check in checks.WITHOUT_MODEL:
             yield _outcome(check, target)
         target.teach()
-        for check in sessions.CHECKS:
+        for check in checks.WITH_MODEL:
             yield _outcome(check, target)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 
-from surrogym_sampler.diagnosis.executables import ends, requests, states
+from surrogym_sampler.diagnosis.executables.checks import CHECKS
 from surrogym_sampler.diagnosis.executables.subject import LeftOut, Subject
 from surrogym_sampler.diagnosis.outcomes import Mismatch, Outcome
 from surrogym_sampler.original.errors import RequestRefused, StepFailed, UnknownEnvironment
@@ -31,7 +31,7 @@ def conformance(command: str, seconds: float) -> Iterator[Outcome]:
             yield Outcome(FIRST, f"{_own(error)}; see docs/how-to/executables.md for a first program")
             return
         yield Outcome(FIRST, None)
-        for check, way_out in (*requests.CHECKS, *states.CHECKS, *ends.CHECKS):
+        for check, way_out in CHECKS:
             yield _outcome(check, way_out, subject)
 
 

@@ -21,7 +21,7 @@ from surrogym_sampler.original.executables.messages import (
 )
 from surrogym_sampler.original.executables.program import Program
 from surrogym_sampler.original.gymnasium import wrapped
-from surrogym_sampler.original.limits.guard import rest_seconds
+from surrogym_sampler.original.limits import rest_seconds
 from surrogym_sampler.original.protocol import Array, RealStep
 from surrogym_shared.spec import EnvironmentSpec
 

@@ -1,14 +1,19 @@
-"""A running program: its start, its requests within a time limit, and its end."""
+"""A running program: its start, its requests within a time limit, its standard error, and its end, even if the process
+that started it was killed."""
 
 from __future__ import annotations
 
+import math
 import os
+import select
 import selectors
 import shlex
 import signal
 import subprocess
+import threading
 import time
 from contextlib import suppress
+from typing import IO
 
 from surrogym_sampler.original.errors import (
     EnvironmentDied,
@@ -18,9 +23,94 @@ from surrogym_sampler.original.errors import (
     StepTimedOut,
     UnknownEnvironment,
 )
-from surrogym_sampler.original.executables.guard import Guard
 from surrogym_sampler.original.executables.messages import LONGEST_LINE, Reply, decode, encode, short
-from surrogym_sampler.original.executables.standard_error import StandardError
+
+SHELL = "/bin/sh"
+# `read` returns when this process ends, which closes the pipe to the shell's input. $1 is the time to wait in seconds,
+# $0 the id of the process group to kill.
+SCRIPT = 'read -r _; sleep "$1"; kill -s KILL -- "-$0"'
+
+
+class Guard:
+    """A shell that waits for the end of this process, and then kills a process group.
+
+    The shell is a process of its own, so it also works after SIGKILL of this process, on Linux and macOS.
+
+    Args:
+        group: id of the process group.
+        grace: seconds between the end of this process and the kill, in which a running step may finish.
+
+    Raises:
+        OSError: the shell can't be started.
+    """
+
+    def __init__(self, group: int, grace: float) -> None:
+        self._shell = subprocess.Popen(
+            [SHELL, "-c", SCRIPT, str(group), str(math.ceil(grace))],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )
+
+    def dismiss(self) -> None:
+        """End the guard. Call this before the process group's id can be given to other processes."""
+        assert self._shell.stdin is not None
+        self._shell.kill()
+        self._shell.wait()
+        self._shell.stdin.close()
+
+
+OWN = 2  # file descriptor of this process's standard error
+TAIL = 4096  # number of last bytes of the program's standard error that are kept
+SHOWN = 200  # largest number of characters of the last line in an error
+PATIENCE = 0.1  # a piece of output is dropped if this process's standard error does not accept it within these seconds
+LAST_SECONDS = 1.0  # seconds to read the output of an ended program; a process that it started may hold the pipe open
+
+
+class StandardError:
+    """The standard error of a running program. A thread reads it, so that the program never waits for a reader.
+
+    A piece that this process's own standard error does not accept in time is dropped.
+
+    Args:
+        pipe: the end of the pipe to read from. The thread closes it.
+    """
+
+    def __init__(self, pipe: IO[bytes]) -> None:
+        self._pipe = pipe
+        self._tail = b""
+        self._thread = threading.Thread(target=self._pass_on, name="standard error", daemon=True)
+        self._thread.start()
+
+    def finish(self) -> None:
+        """Wait until the output of an ended program is read, at most ``LAST_SECONDS``."""
+        self._thread.join(LAST_SECONDS)
+
+    def last_line(self) -> str:
+        """Return the printable characters of the last line that is not empty; "" if there is none."""
+        lines = self._tail.decode(errors="replace").splitlines()
+        printable = ("".join(filter(str.isprintable, line)).strip() for line in reversed(lines))
+        last = next(filter(None, printable), "")
+        return last if len(last) <= SHOWN else f"{last[:SHOWN]}…"
+
+    def _pass_on(self) -> None:
+        taken = True
+        with self._pipe:
+            while piece := os.read(self._pipe.fileno(), select.PIPE_BUF):
+                self._tail = (self._tail + piece)[-TAIL:]
+                taken = _write(piece, PATIENCE if taken else 0.0)
+
+
+def _write(piece: bytes, seconds: float) -> bool:
+    """Write to this process's standard error, and return whether it accepted the piece within ``seconds``. A pipe that
+    is ready accepts ``PIPE_BUF`` bytes without waiting."""
+    try:
+        ready = bool(select.select([], [OWN], [], seconds)[1])
+        return ready and os.write(OWN, piece) > 0
+    except OSError:  # this process's standard error is closed
+        return False
+
 
 GRACE_SECONDS = 30.0  # seconds that a running step may still take after this process was killed
 END_SECONDS = 2.0  # seconds to wait for the program's end after the request to close, and again after SIGTERM

@@ -23,7 +23,7 @@ from support.alternating import alternating
 from support.postgresql import Postgresql
 from support.server import ServerProcess, running_server
 from surrogym_client.transport import HttpSurrogate, Transport
-from surrogym_sampler.diagnosis.conformance import conformance, leases, sessions
+from surrogym_sampler.diagnosis.conformance import checks, conformance
 from surrogym_server.engine.port import SessionEngine
 from surrogym_server.engine.requests import Advance, Reply, Reset
 from surrogym_server.errors import InvalidInput, SeqConflict, Unavailable
@@ -254,7 +254,7 @@ def fronts(
 @pytest.mark.parametrize("number", [0, 1])
 def test_the_conformance_suite_passes_at_each_front_server(fronts: list[str], number: int):
     outcomes = {outcome.name: outcome.failure for outcome in conformance(fronts[number], None, f"front-{number}")}
-    assert len(outcomes) == len(leases.CHECKS) + len(sessions.CHECKS)
+    assert len(outcomes) == len(checks.WITHOUT_MODEL) + len(checks.WITH_MODEL)
     assert set(outcomes.values()) == {None}, outcomes
 
 
@@ -263,10 +263,10 @@ def test_the_conformance_suite_passes_while_sessions_alternate_between_two_front
 ):
     with alternating(fronts) as alternation:
         outcomes = {outcome.name: outcome.failure for outcome in conformance(fronts[0], None, "alternating")}
-    assert len(outcomes) == len(leases.CHECKS) + len(sessions.CHECKS)
+    assert len(outcomes) == len(checks.WITHOUT_MODEL) + len(checks.WITH_MODEL)
     assert set(outcomes.values()) == {None}, outcomes
     shared = alternation.by_session()
-    assert len(shared) > len(sessions.CHECKS)
+    assert len(shared) > len(checks.WITH_MODEL)
     for session, (first, second) in shared.items():
         assert first - second in (0, 1), (session, shared)
     counts = " and ".join(str(sum(of_server)) for of_server in zip(*shared.values(), strict=True))
