@@ -37,8 +37,9 @@ def settle(definition: EnvironmentDefinition, q: Tensor) -> Tensor:
 
 
 def placed(definition: EnvironmentDefinition, change: Tensor) -> Tensor:
-    """Convert changes (m, M) of the moving coordinates to changes (m, C) of all coordinates, as ``moved`` needs them.
-    Changes of the observation are returned unchanged."""
+    """Convert predicted changes (m, M) of the moving coordinates to changes (m, C) of all C coordinates, 0 for those
+    that don't move. If the environment's model predicts changes of the observation instead (preset ``paper``),
+    ``change`` (m, D) has these, and the result is ``change`` itself."""
     if definition.moves_observation:
         return change
     every = change.new_zeros(len(change), len(definition.coordinates))
@@ -48,14 +49,16 @@ def placed(definition: EnvironmentDefinition, change: Tensor) -> Tensor:
 def moved(
     definition: EnvironmentDefinition, inverse: ObservationInverse | None, q: Tensor, u: Tensor, change: Tensor
 ) -> Tensor:
-    """Return the next coordinates (m, C), given predicted changes, with the environment's rules applied and lags set.
+    """Return the next coordinates (m, C), given predicted changes. The environment's rules, such as limits, are applied
+    to them, and lags (coordinates that repeat a past value) are set.
 
     Args:
         definition: the environment.
         inverse: inverse of the observation if the model predicts changes of the observation, otherwise None.
         q: coordinates (m, C) before the step.
         u: actions (m, F).
-        change: change of the coordinates, (m, C), or of the observation, (m, D).
+        change: predicted change of the coordinates, (m, C), if ``inverse`` is None, otherwise of the observation, (m,
+            D).
     """
     arrived = q + change if inverse is None else inverse(definition.observe(q) + change, q)
     return with_lags(definition, q, u, settle(definition, arrived))

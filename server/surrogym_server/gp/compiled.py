@@ -221,8 +221,8 @@ def _add_residuals(
     Args:
         head: scalars of the process, such as its scale: its matrix HEAD (1, 11).
         rows: coefficients of the polynomial parts of the process: its matrix POLYNOMIALS (5 + 2 n, d).
-        kept, turned: matrices KEPT and TURNED of the process: frequencies of the inputs whose sign a reflection keeps,
-            and of those whose sign it changes.
+        kept, turned: random Fourier frequencies of the process: its matrices KEPT and TURNED (d, S). KEPT is 0 for
+            inputs whose sign the mirror symmetry changes, TURNED for all others.
         own: inputs of the process, (d, B).
         k: covariances of the inputs with the n points, (n, B).
         paths: weights of the posterior samples, one row for each input, (B, W); the first columns belong to this
@@ -281,8 +281,8 @@ def predict(
         at: index of the process's first matrix in the tables.
         x: all d inputs of the model, of which the process reads some.
         wanted: whether to write standard deviations (without noise) to ``std``.
-        paths: if it has no rows, ``mean`` gets the posterior means. If it has B rows of W weights, each is a posterior
-            sample, and ``mean`` gets its value at the input with this index.
+        paths: if it has no rows, ``mean`` gets the posterior means. If it is (B, W), row b has the weights of a
+            posterior sample, and ``mean[b]`` gets the value of this sample at input b.
         mean, std: arrays for the results, in the output's unit.
     """
     head, inputs = matrix(numbers, places, at + HEAD), matrix(numbers, places, at + INPUTS)

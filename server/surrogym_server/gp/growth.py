@@ -101,8 +101,9 @@ class _GrowingObjective:
         return rates
 
     def plain(self, theta: Array) -> tuple[Evidence, Array]:
-        """Return the negative log evidence of the process G as a function, for the rates in theta, and the derivatives
-        of each input w_j of G with respect to its rate, (n, d)."""
+        """Apply the rates in theta to inputs and targets. Return the negative log evidence of the process G, an object
+        that is called with the hyperparameters of G, and the derivatives of each input w_j of G with respect to its
+        rate, (n, d)."""
         rates, z = self.rates(theta), self._z
         small = np.abs(rates) < FLAT
         safe = np.where(small, 1.0, rates)

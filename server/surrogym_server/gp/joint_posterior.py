@@ -48,8 +48,8 @@ class Joint:
         return prior - explained
 
     def row(self, index: int) -> Tensor:
-        """Return the vector r (m,) of the module's docstring for an observation at point ``index``: the covariances of
-        this point with all points, divided by the standard deviation of the observation."""
+        """Return the posterior covariances (m,) of point ``index`` with all points, divided by the standard deviation
+        of an observation at this point, noise included."""
         shared = self.between(slice(index, index + 1), slice(None))[0]
         return shared / (self.variance[index] + self.noise).sqrt()
 

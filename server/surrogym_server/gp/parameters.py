@@ -82,8 +82,8 @@ class Parameters:
         """Return for each free parameter in theta how far it is from its prior's mean, in the prior's standard
         deviations.
 
-        The negative log density of the priors is half the sum of the squares of this result, plus ``prior_constant``,
-        plus log(2 pi) / 2 for each free parameter.
+        The negative log density of the priors is half the sum of the squares of this result, plus the attribute
+        ``prior_constant``, plus log(2 pi) / 2 for each free parameter.
         """
         distance: Array = (theta - self.prior[:, 0]) / self.prior[:, 1]
         return distance

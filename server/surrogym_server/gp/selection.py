@@ -94,8 +94,8 @@ class _Search:
         return best if best is not None and best.cost <= most else None
 
     def _each_without_one(self, subset: _Subset) -> Iterator[_Subset]:
-        """Yield each subset with one input less, with unchanged hyperparameters. Skip a subset on which only the zero
-        function has the symmetry of the process."""
+        """Yield each subset with one input less, with the hyperparameters of ``subset``. Skip a subset of inputs of
+        which only the zero function has the symmetry of the process."""
         mirror, places = self._posterior.hyper.reflection, subset.mask.nonzero()[:, 0].tolist()
         for position, place in enumerate(places):
             mask = subset.mask.clone()

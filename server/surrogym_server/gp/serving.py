@@ -228,7 +228,8 @@ def _weights(posterior: Posterior) -> Tensor:
 
 def _exponents(posterior: Posterior, inputs: Sequence[int], width: int) -> Tensor:
     """Return the columns of the matrix A for one process, (D, n), or (D, 2 n) with mirror images. The product of z =
-    [x, x^2, 1] and A gives the exponents of the squared exponentials. ``inputs`` and ``width`` are as in ``_in_z``."""
+    [x, x^2, 1] and A gives the exponents of the squared exponentials. ``inputs`` are the indices of the process's
+    inputs among the ``width`` inputs of the model."""
     points = _points(posterior)
     precision = posterior.hyper.lengthscale.square().reciprocal()
     scaled = points / posterior.hyper.lengthscale
@@ -238,22 +239,23 @@ def _exponents(posterior: Posterior, inputs: Sequence[int], width: int) -> Tenso
 
 def _polynomial(posterior: Posterior, inputs: Sequence[int], width: int) -> Tensor:
     """Return the coefficients R (D, n) of z = [x, x^2, 1] in the polynomial covariances of an input x with the n points
-    of one process. ``inputs`` and ``width`` are as in ``_in_z``."""
+    of one process. ``inputs`` are the indices of the process's inputs among the ``width`` inputs of the model."""
     polynomial, x = posterior.hyper.polynomial, posterior.x
     constant = x.new_full((len(x),), polynomial.constant)
     return _in_z((x * polynomial.linear).T, (x.square() * polynomial.quadratic).T, constant, inputs, width)
 
 
 def _prior(hyper: Hyperparameters, inputs: Sequence[int], width: int) -> Tensor:
-    """Return the coefficients p (D,) of the prior variance k(x, x) = z^2 p, with z^2 = [x^2, x^4, 1]. ``inputs`` and
-    ``width`` are as in ``_in_z``."""
+    """Return the coefficients p (D,) of the prior variance k(x, x) = z^2 p, with z^2 = [x^2, x^4, 1]. ``inputs`` are
+    the indices of the process's inputs among the ``width`` inputs of the model."""
     polynomial = hyper.polynomial
     constant = polynomial.linear.new_full((1,), hyper.signal_variance + polynomial.constant)
     return _in_z(polynomial.linear[:, None], polynomial.quadratic[:, None], constant, inputs, width)[:, 0]
 
 
 def _squares_alone(coefficients: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the first three arguments of ``_in_z`` for the function sum_j c_j x_j^2, with coefficients c (d,)."""
+    """Return the linear (d, 1), quadratic (d, 1) and constant (1,) coefficients of the function sum_j c_j x_j^2, with
+    coefficients c (d,)."""
     column = coefficients[:, None]
     return torch.zeros_like(column), column, coefficients.new_zeros(1)
 

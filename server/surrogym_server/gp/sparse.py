@@ -126,15 +126,16 @@ def hardest(posterior: Posterior, x: Tensor, y: Tensor, most: int) -> Tensor:
 
 
 def _with_noises(hyper: Hyperparameters, x: Tensor, y: Tensor) -> Iterator[Posterior]:
-    """Yield the process of x (n, d) and y (n,) through inducing points, once for each multiple of the noise variance in
-    ``NOISES``. All use the same inducing points."""
+    """Yield the process of x (n, d) and y (n,) through inducing points, once for each factor in the list ``NOISES``, by
+    which the noise variance is multiplied. All use the same inducing points."""
     pivots = _pivots(hyper, x)
     for noise in NOISES:
         yield _projected(replace(hyper, noise_variance=noise * hyper.noise_variance), x, y, pivots)
 
 
 def _projected(hyper: Hyperparameters, x: Tensor, y: Tensor, pivots: tuple[Tensor, Tensor, Tensor]) -> Posterior:
-    """Return the process of x (n, d) and y (n,) through inducing points; ``pivots`` is the result of ``_pivots``."""
+    """Return the process of x (n, d) and y (n,) through inducing points. ``pivots`` are the indices of the inducing
+    points among the rows of x, and other results of choosing them, as ``_pivots`` returns them."""
     # Pivoted Cholesky: indices of m inducing points (m,), factor V (m, n), variances that V does not explain (n,).
     points, v, left = pivots
     inducing = x[points]

@@ -54,7 +54,7 @@ class CandidateView:
     @cached_property
     def variance_reduction(self) -> Tensor:
         """How much a real step at each candidate would reduce the weighted variance over the reference points, (m,).
-        Only acquisitions with ``reads_reference`` = True may use it."""
+        Only an acquisition whose class attribute ``reads_reference`` is True may use it."""
         return self._reduction()
 
 

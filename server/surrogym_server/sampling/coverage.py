@@ -39,8 +39,9 @@ def covered(definition: EnvironmentDefinition, q: Array, u: Array, logged_q: Arr
 
 
 def _places(definition: EnvironmentDefinition, q: Array, u: Array) -> Array:
-    """Map n states q (n, C) and actions u (n, F) to points (n, D) whose Euclidean distances are those that the
-    docstring of ``covered`` describes."""
+    """Map n states q (n, C) and actions u (n, F) to points (n, D) whose Euclidean distances say how similar the steps
+    are. Coordinates and actions are divided by the width of their range, angles become points on a circle, and two
+    different discrete actions have the distance 1."""
     columns: list[Array] = []
     for index, coordinate in enumerate(definition.coordinates):
         if coordinate.kind == "angle":

@@ -85,8 +85,8 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
     (queries), each as if those chosen before had been answered (see ``batch.choose`` and ``rollouts.plan_round``). A
     query that is refused or set aside counts as closed, so the next round needs no sample of it.
 
-    The comments name preset "paper" beside the setting by which it decides. ``tolerance`` and ``acquisition`` can also
-    be set alone, the stopping rule only by the preset.
+    Comments in the code name preset "paper" beside the setting by which the preset changes a decision. ``tolerance``
+    and ``acquisition`` can also be set alone, the stopping rule only by the preset.
 
     Args:
         definition: the environment, with the settings of its design.
@@ -172,9 +172,9 @@ def _verdict_with(queries: tuple[Query, ...], round: Round) -> Verdict:
     """Return the verdict on a design that may continue: "continue" if a query was chosen or an earlier query may still
     be answered, otherwise "unsure", or "over_budget" if the budget is spent.
 
-    If no query was chosen, the rest of the budget is too small, less the steps of queries that were set aside; or each
-    candidate is close to an earlier query or would teach nothing, because its step is predicted to end at a bound or
-    to end the episode.
+    No query is chosen in two cases. Either the budget that remains, without the steps of queries that were set aside,
+    is too small. Or each candidate is close to an earlier query or would teach nothing, because its step is predicted
+    to end at a bound or to end the episode.
     """
     if queries or round.request.open:
         return "continue"

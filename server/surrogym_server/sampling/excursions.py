@@ -30,10 +30,10 @@ LONGEST = 16  # greatest number of actions of an excursion (an action sequence t
 def excursion(
     model: DynamicsModel, samples: Tensor, snapshots: Mapping[str, Vector], longest: int, rng: np.random.Generator
 ) -> Query:
-    """Plan an excursion: the shortest sequence of actions after which the predicted state is at least the distance
-    ``FAR`` away from the states of all samples.
+    """Plan an excursion: the shortest sequence of actions after which the predicted state is at least ``FAR`` (0.5)
+    standard deviations of the sampling range away from the states of all samples.
 
-    If no sequence leads so far, plan the one that leads farthest.
+    If no sequence leads so far, plan the one that leads farthest. States outside the sampling range don't count.
 
     Args:
         model: the model.
@@ -49,8 +49,8 @@ def excursion(
 def _reach(model: DynamicsModel, samples: Tensor, starts: Tensor, sequences: Sequences) -> tuple[Tensor, Tensor]:
     """Rate sequences of actions by how far they lead away from the samples.
 
-    A sequence that reaches the distance ``FAR`` has a higher value than any that does not, and a higher value than one
-    that takes more actions to reach it.
+    A sequence that reaches the distance ``FAR`` (0.5 standard deviations of the sampling range) has a higher value than
+    any that does not, and a higher value than one that takes more actions to reach it.
 
     Args:
         model: the model.

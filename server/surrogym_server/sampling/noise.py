@@ -89,9 +89,9 @@ def to_repeat(model: DynamicsModel, samples: Samples, tolerances: Sequence[float
 
     Repetitions are needed if noise above a tolerance could explain the samples, and repeated steps have neither
     confirmed nor refuted this noise. First one step is repeated, which suffices to refute noise if the environment is
-    deterministic. Further repetitions follow until their number is the next of ``STAGES``. An output is also tested
-    again if its confirmed noise does not explain its leave-one-out error, because few repetitions may show too little
-    noise. Steps that ended at a bound are not repeated, because the bound hides noise.
+    deterministic. Further repetitions follow until their number is the next one in the list ``STAGES``. An output is
+    also tested again if its confirmed noise does not explain its leave-one-out error, because few repetitions may show
+    too little noise. Steps that ended at a bound are not repeated, because the bound hides noise.
     """
     model_noise, limits = _model_noise(model, tolerances)
     differences = repeats(model, samples)

@@ -97,7 +97,8 @@ def _explained_share(at: AtSamples, now: Tensor, past: Tensor, complete: Tensor)
     Args:
         at: values of the output at the samples, and covariance of its process.
         now: (n, e) features of state and action.
-        past: (n, d) features of the past of each sample, see ``_past``.
+        past: (n, d) features of the past of each sample: the change of the state in the step before, and earlier
+            actions.
         complete: (n,) bool, whether the past of each sample is known. Other samples are not used.
     """
     some = complete[at.rows]

@@ -136,8 +136,8 @@ def _among(follows: Tensor, rows: Tensor) -> Tensor:
 
 
 def sensor_pattern(slope: Tensor, follows: Tensor) -> Tensor:
-    """Return the matrix S (n, n) of the module's docstring: the covariance between the results of n steps that sensor
-    noise causes, divided by its mean diagonal.
+    """Return the covariance (n, n) between the results of n steps that sensor noise causes, divided by its mean
+    diagonal.
 
     ``follows[i]`` is the index of the step before step i, or -1 if there is none. ``slope[i]`` is the derivative of the
     next value of the coordinate with respect to its present value in step i.
@@ -155,10 +155,11 @@ def best_share(y: Tensor, function: Tensor, noise: float, pattern: Tensor) -> tu
         y: (n,) targets with mean 0.
         function: (n, n) prior covariance of the targets without noise.
         noise: variance of the noise of one step.
-        pattern: matrix S (n, n) from ``sensor_pattern``.
+        pattern: (n, n) covariance between the results of the steps that sensor noise causes, from ``sensor_pattern``.
 
     Returns:
-        The share, the factor c that scales ``noise``, and twice the difference in log likelihood from a share of 0.
+        The share, the factor by which ``noise`` has to be multiplied, and twice the difference in log likelihood from a
+        share of 0.
     """
     likelihoods = torch.stack(
         [

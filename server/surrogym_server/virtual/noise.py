@@ -33,14 +33,14 @@ class Purpose(IntEnum):
 
 
 def uniform_noise(lanes: LaneState, purpose: Purpose, size: int) -> Tensor:
-    """Return ``size`` uniform random numbers between 0 and 1 for each of N lanes, as an array (N, size). They depend on
-    the lane's state and the purpose alone."""
+    """Return ``size`` uniform random numbers between 0 and 1 for each of N lanes, (N, size). They depend on the lane's
+    seed, number, episode and step, and on the purpose."""
     return uniforms(_words(lanes, purpose, 1, size)).flatten(-2)[:, 0, :size]
 
 
 def normal_noise(lanes: LaneState, purpose: Purpose, particles: int, size: int) -> Tensor:
     """Return ``size`` standard normal random numbers for each particle of each of N lanes, (N, particles, size). They
-    depend on the lane's state and the purpose alone."""
+    depend on the lane's seed, number, episode and step, and on the purpose."""
     return normals(_words(lanes, purpose, particles, size)).flatten(-2)[..., :size]
 
 

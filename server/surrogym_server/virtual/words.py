@@ -26,7 +26,8 @@ LOW, HALF = np.uint64(0xFFFFFFFF), np.uint64(32)
 def fill(seed: Ints, lane: Ints, episode: Ints, third: Ints, words: Ints) -> None:
     """Fill ``words`` (N, I, 4) with random 32-bit words, I times four for each of N lanes.
 
-    The i-th four words of lane n have the counter (lane[n], episode[n], third[n], i) and the key ``seed[n]``.
+    The i-th four words of lane n have the counter (lane[n], episode[n], third[n], i) and the key ``seed[n]``. ``third``
+    combines the number of the step and the purpose of the random numbers.
     """
     for n in range(len(words)):
         key0, key1 = np.uint64(seed[n]) & LOW, (np.uint64(seed[n]) >> HALF) & LOW

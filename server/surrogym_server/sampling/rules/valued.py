@@ -12,8 +12,8 @@ def ask_best_candidates(round: Round) -> tuple[Query, ...]:
     """Return one query (a real step to request) for each output whose confidence index is below the target, the lowest
     first, as far as the budget allows: the candidate with the largest value of the acquisition.
 
-    If the design has ended, return ``request.extra`` queries, for the outputs below the target in turn. If some
-    candidates are reserved (see ``Candidates``), the first query is one of them.
+    If the design has ended, return as many queries as a person has requested (``request.extra``), for the outputs below
+    the target in turn. If some candidates are reserved (see ``Candidates``), the first query is one of them.
     """
     judgement = round.judgement
     unanswered = Points.of(round.definition, round.request.unanswered)

@@ -102,15 +102,18 @@ def conclude(
             these.
         q_next, pay, std, over: predicted coordinates (K, C), rewards (K,), standard deviations (K, O) and terminations
             (K,) of the K lanes that move.
-        fallen: (K,) lanes that end because the fallback action of the limits would take over; (0,) without limits.
+        fallen: (K,) mask of the lanes whose episode ends because, at the machine, the fallback action of the declared
+            limits would take over; (0,) without limits.
         scales: (O,) standard deviation of each output over the samples.
         terminal_reward: reward that terminating steps pay in addition.
-        penalty, trust, time_limit: as in ``VirtualSettings``; trust is infinite and time_limit -1 for None.
+        penalty, trust, time_limit: fields of ``VirtualSettings``. A field that is None there is infinite (trust) or -1
+            (time_limit) here.
         inside: lower and upper ends of the sampling range, (2, C), if an episode ends when it leaves this range,
             otherwise (0, 0).
         outside_reward: reward of a lane whose episode ended early: outside the sampling range, where the model is too
             uncertain, or because it is in ``fallen``. It is paid once for each step up to the time limit.
-        q, elapsed, phase: coordinates, numbers of steps and phases of all N lanes; updated.
+        q, elapsed, phase: coordinates (N, C), numbers of steps in the episode (N,), and phases (N,) of all lanes;
+            updated. A phase says whether a lane was never reset, is in an episode, or has ended one.
         rewards: (2, N) array for the rewards less penalties, and the rewards without penalties.
         ends: (5, N) array for five flags of each lane: terminated; truncated; truncated because the model is too
             uncertain; terminated or truncated; ended early with the outside reward.

@@ -107,11 +107,12 @@ def _divided(
     settings: VirtualSettings, lanes: LaneState, phase: NDArray[np.int8], mask: Bools | None
 ) -> tuple[Bools, Chosen, Bools | None]:
     """Divide the lanes (parallel environments) that ``mask`` (N,) selects into those that this step moves and those
-    that it resets; None selects all. ``phase`` (N,) has the phase of each lane.
+    that it resets; None selects all. ``phase`` (N,) says of each lane whether it was never reset, is in an episode, or
+    has ended one.
 
     Returns:
-        A mask (N,) of the lanes to move; the same lanes as a mask or, if they are all, EVERY; and a mask (N,) of the
-        lanes to reset, None if there are none.
+        A mask (N,) of the lanes to move; the same lanes as a tensor mask, or as the slice of all lanes if all move; and
+        a mask (N,) of the lanes to reset, None if there are none.
     """
     running = phase == RUNNING
     if mask is None and running.all():

@@ -176,8 +176,9 @@ def _require_dropped(definition: EnvironmentDefinition, output: OutputModel) -> 
 
 
 def _require_size(output: OutputModel) -> None:
-    """Raise ``InvalidInput`` unless an output that adds to a prior model's prediction has a finite ``size_with_prior``
-    above 0 and is not learned by its logarithm (``warp``)."""
+    """Check an output that is added to a prior model's prediction. Raise ``InvalidInput`` unless the standard deviation
+    of their sum over the samples (``size_with_prior``) is finite and above 0, and the output is not learned by its
+    logarithm (``warp``)."""
     size = output.size_with_prior
     if size is not None and (not 0 < size < math.inf or output.warp is not None):
         raise InvalidInput(

@@ -29,7 +29,8 @@ FEWEST = 20
 def without_inputs(
     learner: OutputLearner, output: OutputModel, target: Tensor, inputs: Mapping[FeatureMap, Tensor], used: Tensor
 ) -> OutputModel:
-    """Return the output without the inputs that hardly influence it, or unchanged if all inputs matter.
+    """Return the output, learned without those inputs that hardly influence it. If all inputs matter, return ``output``
+    itself.
 
     Args:
         learner: fitter of the model's outputs.
@@ -90,8 +91,8 @@ def _may_be_dropped(learner: OutputLearner, output: OutputModel) -> Tensor:
 
 
 def _with_fewer(learner: OutputLearner, output: OutputModel, x: Tensor, y: Tensor, selection: Selection) -> OutputModel:
-    """Return the output with only the selected inputs, fitted to points x (n, d), y (n,), if this reduces the
-    leave-one-out error to at most ``LESS`` (0.5) times its value. Otherwise return it unchanged."""
+    """Return the output with only the selected inputs, fitted to points x (n, d), y (n,), if its leave-one-out error is
+    then at most ``LESS`` (0.5) times that of ``output``. Otherwise return ``output`` itself."""
     assert output.posterior is not None
     mask, x = selection.mask, x[:, selection.mask]
     feature_map = map_without(output.feature_map, mask)

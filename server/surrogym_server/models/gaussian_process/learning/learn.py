@@ -70,7 +70,7 @@ class _Among:
         inputs: features (n, d) of the samples for each candidate feature map (encoding of state and action).
         keep: samples that did not end at a bound, which would cut their increments off.
         keep_lead: samples to learn from if next values of other coordinates (leads) are inputs.
-        past: samples to learn from if reaching limits of other coordinates does not change this output.
+        past: samples to learn from if this output does not change when other coordinates reach their limits.
         side: (n,) 1 for a sample that ended at the output's own upper limit, -1 at the lower, otherwise 0.
     """
 

@@ -92,8 +92,8 @@ def _candidate(learner: OutputLearner, place: int, output: OutputModel) -> _Cand
 
 
 def _sharing(members: Sequence[_Candidate], pool: Pool, member: int) -> OutputModel:
-    """Return the output of the pool's member with index ``member``, learned from the samples of all members, or
-    unchanged if it then predicts its own samples worse."""
+    """Return the output of the pool's member with index ``member``, learned from the samples of all members. If it then
+    predicts its own samples worse, return the output as learned from its own samples alone."""
     candidate, output = members[member], members[member].output
     assert output.posterior is not None
     x, y, hyper = pool.samples_of(member, MOST)

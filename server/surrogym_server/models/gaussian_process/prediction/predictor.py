@@ -116,7 +116,7 @@ class Predictor:
 
     def _by_prior(self, prior: Predictor, q: Tensor, u: Tensor) -> Tensor:
         """Return the prior model's predictions (m, columns) at q (m, C) and u (m, F): a column for each coordinate or
-        observation entry, and one for the reward. Columns to which they are not added are 0."""
+        observation entry, and one for the reward. Columns of outputs that don't use the prior model are 0."""
         change, _, reward = prior.means(q, u)
         added = change.new_zeros(len(q), self._reward_column + 1)
         added[:, [*self._columns, self._reward_column]] = torch.cat([change, reward[:, None]], 1)

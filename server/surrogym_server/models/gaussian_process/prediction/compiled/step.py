@@ -432,7 +432,7 @@ class StepsOfModel(ArraySteps):
 
     def _by_prior(self, prior: StepsOfModel, q: Floats, u: Floats) -> Floats:
         """Return the prior model's predictions (N, columns) at q (N, C) and u (N, F): a column for each coordinate or
-        observation entry, and one for the reward. Columns to which they are not added are 0."""
+        observation entry, and one for the reward. Columns of outputs that don't use the prior model are 0."""
         added = np.empty((len(q), len(self.uses)))
         added[:, -1] = prior._steps(q, u, None, None, None, False, False, added).reward
         return added * self.uses
