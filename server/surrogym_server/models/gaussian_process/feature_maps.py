@@ -48,7 +48,7 @@ def candidates(
         return (FeatureMap(state="observation"),)
     states: list[State] = ["cos_sin"]
     if definition.angles:
-        states += ["wrapped", "both"]
+        states.append("wrapped")
     actions: list[Encoding] = ["value"]
     if any(n > 2 for n in definition.action.nvec):
         actions.append("one_hot")

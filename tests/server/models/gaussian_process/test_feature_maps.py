@@ -14,8 +14,8 @@ from surrogym_shared.spec import Design
 
 
 def test_each_environment_has_its_expected_candidate_feature_maps(pendulum_definition, cartpole_definition):
-    assert len(candidates(pendulum_definition, follows=True)) == 14
-    assert len(candidates(pendulum_definition, follows=False)) == 6
+    assert len(candidates(pendulum_definition, follows=True)) == 10
+    assert len(candidates(pendulum_definition, follows=False)) == 4
     assert candidates(cartpole_definition, follows=True) == (FeatureMap(), FeatureMap(parity="odd"))
     three_actions = candidates(definition_from_spec(acrobot()), follows=False)
     assert {(m.action, m.parity) for m in three_actions} == {("value", ""), ("value", "odd"), ("one_hot", "")}
