@@ -30,7 +30,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, ClassVar
 from unittest.mock import patch
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "examples" / "fmus"))
@@ -41,7 +41,7 @@ import numpy as np
 import torch
 from common import parser, started, write
 from machines import Ball, Block, Chain, Crane, Drone, Rooms, Tanks
-from structures import definition_of, hypercube, real_steps, scored
+from structures import hypercube, real_steps, scored
 from torch import Tensor
 
 import surrogym
@@ -55,9 +55,10 @@ from support.real_steps import samples_of
 from support.van_de_vusse import VanDeVusse
 from surrogym.demo.tasks import TASKS as DEMOS
 from surrogym_lab.unseen import tasks as unseen
-from surrogym_sampler.original import make
+from surrogym_sampler.original import RealStep, make
 from surrogym_sampler.original.describing import describe
 from surrogym_sampler.original.rollouts import answering
+from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.definition import REWARD, EnvironmentDefinition, wrap
 from surrogym_server.environment.distributions import scaling
 from surrogym_server.environment.features import FeatureMap
@@ -70,7 +71,7 @@ from surrogym_server.models.gaussian_process.prediction.several import Functions
 from surrogym_server.sampling import design, judging
 from surrogym_server.sampling.latin_hypercube import going_on, random_points
 from surrogym_server.sampling.rollouts import random_sequences
-from surrogym_shared.spec import Bounds, DeclaredReward, EnvironmentSpec
+from surrogym_shared.spec import Bounds, DeclaredReward, Design, DiscreteAction, EnvironmentSpec, Reward
 
 SIZES, MANY, BUDGET = (20, 40, 100), (400, 2_300), 100
 UNSEEN, UNSEEN_SEED, LONGEST = 500, 4_099, 50  # unseen steps, and the longest of their rollouts
@@ -78,11 +79,20 @@ SAME = 1e-9  # difference of two predictions, in standard deviations of the outp
 REACTOR = example()
 
 
-class With:
-    """A plant with noise, or with another specification. ``process`` and ``sensor`` are shares of each range."""
+def definition_of(original: Any, settings: Mapping[str, Any]) -> EnvironmentDefinition:
+    """The definition of a plant whose reward is learned, with settings of the processes."""
+    spec = original.spec()
+    design = Design.model_validate({"model": {"name": "gaussian_process", "settings": dict(settings)}})
+    reward = spec.reward if isinstance(spec.reward, Reward) else Reward(timing=spec.reward.timing)
+    return definition_from_spec(spec.model_copy(update={"design": design, "reward": reward}))
 
-    def __init__(self, original: Any, process: float = 0.0, **changed: Any) -> None:
-        self.original, self.process, self.changed = original, process, changed
+
+class With:
+    """A plant with process noise, a share of each range, with a bonus in the upper fifth of the first coordinate's
+    range, or with another specification."""
+
+    def __init__(self, original: Any, process: float = 0.0, bonus: float = 0.0, **changed: Any) -> None:
+        self.original, self.process, self.bonus, self.changed = original, process, bonus, changed
         self.rng = np.random.default_rng(5)
         coordinates = definition_of(original, {}).coordinates
         self.spans = 12**0.5 * np.array([scaling(c.sampling)[1] for c in coordinates])  # of uniform ranges
@@ -93,7 +103,29 @@ class With:
     def step_from(self, coordinates: Any, action: Any) -> Any:
         step = self.original.step_from(coordinates, action)
         moved = self.process * self.spans * self.rng.standard_normal(len(self.spans))
-        return replace(step, next_coordinates=np.asarray(step.next_coordinates) + moved)
+        low, high = next(iter(self.original.ranges.values())) if self.bonus else (0.0, 0.0)
+        paid = self.bonus * bool(coordinates[0] > low + 0.8 * (high - low)) if self.bonus else 0.0
+        return replace(step, next_coordinates=np.asarray(step.next_coordinates) + moved, reward=step.reward + paid)
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+
+class Moves(unseen.NarrowPlane):
+    """A boat with five discrete actions, whose numbers have no order: stay, or go one way."""
+
+    ways: ClassVar[np.ndarray] = np.array([[0, 0], [1, 0], [0, -1], [-1, 0], [0, 1]])
+
+    def spec(self) -> EnvironmentSpec:
+        return super().spec().model_copy(update={"action": DiscreteAction(n=len(self.ways))})
+
+    def formula(self, q: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        after, _ = super().formula(q, self.ways[u.astype(int)[..., 0]])
+        return after, -(q**2).sum(-1)
+
+    def step_from(self, coordinates: Any, action: Any) -> RealStep:
+        after, reward = self.formula(np.asarray(coordinates, dtype=float), np.atleast_1d(np.asarray(action)))
+        return RealStep(coordinates, action, after, float(reward))
 
 
 def _two_sided() -> Any:
@@ -136,6 +168,11 @@ PLANTS: dict[str, Callable[[], Any]] = {
     },
     **{f"{name}, noise": (lambda name=name: With(make(DEMOS[name].environment), 0.01)) for name in NAMES},
     **{f"{name}, reset": (lambda name=name: make(DEMOS[name].environment, access="reset")) for name in NAMES},
+    **{f"{name}, snapshots": (lambda name=name: make(DEMOS[name].environment, access="snapshot")) for name in NAMES},
+    **{
+        f"{kind.__name__.lower()}, bonus": (lambda kind=kind: With(kind(), bonus=1.0)) for kind in (Tanks, Rooms, Drone)
+    },
+    "discrete moves": Moves,
     **{kind.__name__: kind for kind in UNSEEN_TASKS},
     "ResetOnly": lambda: answering(unseen.ResetOnly()),
     **{f"hidden reward, {n} inputs": (lambda n=n: HiddenBump(n, seed=n)) for n in (1, 2, 3, 4)},
@@ -248,7 +285,6 @@ MECHANISMS: dict[str, Mechanism] = {
     "maps: next speed": _of_map(lambda m: m.lead),
     "maps: next speed alone": _of_map(lambda m: m.lead and m.state == "none"),
     "maps: wrapped angle": _of_map(lambda m: m.state == "wrapped"),
-    "maps: angle both ways": _of_map(lambda m: m.state == "both"),
     "maps: one-hot action": _of_map(lambda m: m.action == "one_hot"),
     "maps: observation": _of_map(lambda m: m.state == "observation"),
     "maps: reward after the step": _of_map(lambda m: m.after),
