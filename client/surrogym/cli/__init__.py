@@ -13,6 +13,7 @@ from importlib.metadata import entry_points
 import typer
 
 from surrogym.cli.errors import sentence
+from surrogym.cli.groups import add
 from surrogym.cli.help import Command, Commands
 from surrogym_shared.terminal import say
 
@@ -88,10 +89,11 @@ def build() -> typer.Typer:
     )
     app.callback()(_version)
     for name in COMMANDS:
-        register: Callable[[typer.Typer], None] = import_module(
-            f"{__name__}.commands.{name.replace('-', '_')}"
-        ).register
-        register(app)
+        module = import_module(f"{__name__}.commands.{name.replace('-', '_')}")
+        if hasattr(module, "group"):
+            app.add_typer(module.group(), name=name)
+        else:
+            add(app, name, module.command)
     for entry in entry_points(group=ENTRY_POINTS):
         entry.load()(app)
     for info in app.registered_commands:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from surrogym.cli.groups import Output, PolicyReading, Service, add
+from surrogym.cli.groups import Output, PolicyReading, Service
 from surrogym.cli.options import FallbackProgram, SpecFile, read_spec
 from surrogym.cli.pushing import push_or_say
 
@@ -21,11 +21,6 @@ if TYPE_CHECKING:
     from surrogym_trainer.policies.card import PolicyCard
     from surrogym_trainer.policies.predict import Predict
     from surrogym_trainer.training.handover import Handover, Subject
-
-
-def register(app: typer.Typer) -> None:
-    """Add ``surrogym audit`` to the app."""
-    add(app, "audit", command)
 
 
 def command(

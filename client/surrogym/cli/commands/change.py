@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from surrogym.cli.groups import Output, Service, add
+from surrogym.cli.groups import Output, Service
 from surrogym.cli.options import (
     Surrogate,
     Tolerances,
@@ -14,11 +14,6 @@ from surrogym.cli.options import (
 )
 
 USUAL = "=usual"  # --tolerance OUTPUT=usual gives an output its default tolerance again
-
-
-def register(app: typer.Typer) -> None:
-    """Add ``surrogym change`` to the app."""
-    add(app, "change", command)
 
 
 def command(

@@ -7,16 +7,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from surrogym.cli.groups import Output, Service, add
+from surrogym.cli.groups import Output, Service
 from surrogym.cli.options import StepLimit
 
 if TYPE_CHECKING:
     from surrogym_sampler.diagnosis.outcomes import Outcome
-
-
-def register(app: typer.Typer) -> None:
-    """Add ``surrogym conformance`` to the app."""
-    add(app, "conformance", command)
 
 
 def command(

@@ -6,13 +6,8 @@ from typing import Annotated
 
 import typer
 
-from surrogym.cli.groups import Output, Service, add
+from surrogym.cli.groups import Output, Service
 from surrogym.cli.options import Surrogate
-
-
-def register(app: typer.Typer) -> None:
-    """Add ``surrogym delete`` to the app."""
-    add(app, "delete", command)
 
 
 def command(

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from surrogym.cli.groups import add
 from surrogym.cli.options import ExitWithParent, Quiet, require_known
 from surrogym.demo.tasks import TASKS
 
@@ -35,11 +34,6 @@ Algorithm = Annotated[
 Access = Annotated[
     Literal["any", "snapshot", "reset"], typer.Option(help="Where a query may begin, as in surrogym register.")
 ]
-
-
-def register(app: typer.Typer) -> None:
-    """Add ``surrogym demo`` to the app."""
-    add(app, "demo", command)
 
 
 def command(

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from surrogym.cli.groups import Output, PolicyReading, Service, add
+from surrogym.cli.groups import Output, PolicyReading, Service
 from surrogym.cli.options import NAMES, SpecFile
 
 if TYPE_CHECKING:
@@ -24,11 +24,6 @@ if TYPE_CHECKING:
     from surrogym_trainer.policies.card import PolicyCard
     from surrogym_trainer.policies.controller_check import StoredCheck
     from surrogym_trainer.policies.predict import Predict
-
-
-def register(app: typer.Typer) -> None:
-    """Add ``surrogym deploy`` to the app."""
-    add(app, "deploy", command)
 
 
 @dataclass(frozen=True)

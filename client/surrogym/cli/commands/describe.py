@@ -6,13 +6,7 @@ from typing import Annotated
 
 import typer
 
-from surrogym.cli.groups import add
 from surrogym.cli.options import Quiet
-
-
-def register(app: typer.Typer) -> None:
-    """Add ``surrogym describe`` to the app."""
-    add(app, "describe", command)
 
 
 def command(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from surrogym.cli.groups import Output, Service, add
+from surrogym.cli.groups import Output, Service
 from surrogym.cli.options import (
     NAMES,
     SpecFile,
@@ -19,11 +19,6 @@ from surrogym.cli.options import (
 if TYPE_CHECKING:
     from surrogym_sampler.diagnosis.doctor import Finding
     from surrogym_shared.spec import EnvironmentSpec
-
-
-def register(app: typer.Typer) -> None:
-    """Add ``surrogym doctor`` to the app."""
-    add(app, "doctor", command)
 
 
 def command(

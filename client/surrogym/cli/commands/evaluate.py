@@ -12,7 +12,7 @@ import typer
 from surrogym.cli.beside import Beside
 from surrogym.cli.disagreement import Differences, Imagining
 from surrogym.cli.filming import film
-from surrogym.cli.groups import Output, PolicyReading, Service, add
+from surrogym.cli.groups import Output, PolicyReading, Service
 from surrogym.cli.learning import kept
 from surrogym.cli.opening import opener_for_policy
 from surrogym.cli.options import NAMES, FallbackProgram, SpecFile, read_spec
@@ -42,11 +42,6 @@ Ledger = Annotated[
     str | None,
     typer.Option(help="Surrogate whose ledger counts the real steps. [default: as noted beside the policy]"),
 ]
-
-
-def register(app: typer.Typer) -> None:
-    """Add ``surrogym evaluate`` to the app."""
-    add(app, "evaluate", command)
 
 
 @dataclass(frozen=True)

@@ -7,16 +7,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from surrogym.cli.groups import Output, Service, add
+from surrogym.cli.groups import Output, Service
 from surrogym.cli.options import Surrogate, connect
 
 if TYPE_CHECKING:
     from surrogym_client.transport.api import Api
-
-
-def register(app: typer.Typer) -> None:
-    """Add ``surrogym export`` to the app."""
-    add(app, "export", command)
 
 
 def command(

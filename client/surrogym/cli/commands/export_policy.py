@@ -7,12 +7,7 @@ from typing import Annotated
 
 import typer
 
-from surrogym.cli.groups import Output, PolicyReading, add
-
-
-def register(app: typer.Typer) -> None:
-    """Add ``surrogym export-policy`` to the app."""
-    add(app, "export-policy", command)
+from surrogym.cli.groups import Output, PolicyReading
 
 
 def command(

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from surrogym.cli.groups import Output, Service, add
+from surrogym.cli.groups import Output, Service
 from surrogym.cli.options import SpecFile, Wait, connect, given_here, read_spec, typed
 
 if TYPE_CHECKING:
@@ -68,11 +68,6 @@ class OfLogs:
             help="For a log: file for the rows that can't be used. [default: LOG.rejected.csv, beside the log]",
         ),
     ] = None
-
-
-def register(app: typer.Typer) -> None:
-    """Add ``surrogym import`` to the app."""
-    add(app, "import", command)
 
 
 def command(

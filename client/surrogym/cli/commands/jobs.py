@@ -6,18 +6,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from surrogym.cli.groups import Output, Service, add
+from surrogym.cli.groups import Output, Service
 from surrogym.cli.options import Surrogate
 
 if TYPE_CHECKING:
     from surrogym_shared.wire import JobDetail, JobList, JobView
 
 HEADING = ("job", "status", "task", "done", "imagined return", "worker", "policy", "why")
-
-
-def register(app: typer.Typer) -> None:
-    """Add ``surrogym jobs`` to the app."""
-    add(app, "jobs", command)
 
 
 def command(

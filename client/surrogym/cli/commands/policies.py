@@ -7,18 +7,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from surrogym.cli.groups import Output, Service, add
+from surrogym.cli.groups import Output, Service
 from surrogym.cli.options import names_of_surrogates
 
 if TYPE_CHECKING:
     from surrogym_shared.wire import EvaluationView, PolicyView
 
 HEADING = ("policy", "aliases", "algorithm", "promise", "trusted", "real return (95 %)", "success", "files")
-
-
-def register(app: typer.Typer) -> None:
-    """Add ``surrogym policies`` to the app."""
-    add(app, "policies", command)
 
 
 def command(

@@ -36,8 +36,8 @@ class PolicyGroup(TyperGroup):
         return super().resolve_command(ctx, [self.default, *args] if named else args)
 
 
-def register(app: typer.Typer) -> None:
-    """Add ``surrogym policy`` and its subcommands to the app."""
+def group() -> typer.Typer:
+    """Return ``surrogym policy`` with its subcommands."""
     parts = typer.Typer(
         cls=PolicyGroup,
         help="Show, store, download, name or delete a policy. surrogym policies lists all of them.\n\n"
@@ -47,7 +47,7 @@ def register(app: typer.Typer) -> None:
     )
     for name, command in ((SHOW, show), ("push", push), ("get", get), ("alias", alias), ("delete", delete)):
         add(parts, name, command)
-    app.add_typer(parts, name="policy")
+    return parts
 
 
 def show(context: typer.Context, policy: Named, *, service: Service, output: Output) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from surrogym.cli.groups import Output, Service, add
+from surrogym.cli.groups import Output, Service
 from surrogym.cli.options import NAMES, Surrogate
 
 if TYPE_CHECKING:
@@ -26,11 +26,6 @@ OTHER = "surrogate:"  # an argument that begins with this prefix names another s
 LEAST = 2  # a prior is calibrated on at least this number of real steps
 # if a calibrated simulator's error exceeds this share of the changes of state, its calibrated values may be wrong
 LACKING = 0.01
-
-
-def register(app: typer.Typer) -> None:
-    """Add ``surrogym prior`` to the app."""
-    add(app, "prior", command)
 
 
 def command(

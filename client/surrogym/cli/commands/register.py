@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from surrogym.cli.groups import Output, Service, add
+from surrogym.cli.groups import Output, Service
 from surrogym.cli.options import (
     NAMES,
     SpecFile,
@@ -27,11 +27,6 @@ if TYPE_CHECKING:
     from surrogym_client.transport.api import Api
     from surrogym_shared.spec import EnvironmentSpec
     from surrogym_shared.wire import SurrogateView
-
-
-def register(app: typer.Typer) -> None:
-    """Add ``surrogym register`` to the app."""
-    add(app, "register", command)
 
 
 @dataclass(frozen=True)

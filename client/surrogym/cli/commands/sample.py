@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from surrogym.cli.groups import Output, Service, add
+from surrogym.cli.groups import Output, Service
 from surrogym.cli.options import (
     NAMES,
     ExitWithParent,
@@ -103,11 +103,6 @@ class CautionOptions:
             raise CommandError(
                 "--approve asks a person before each query: expected a terminal, without --quiet and --on-ray"
             )
-
-
-def register(app: typer.Typer) -> None:
-    """Add ``surrogym sample`` to the app."""
-    add(app, "sample", command)
 
 
 def command(

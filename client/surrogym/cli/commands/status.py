@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from surrogym.cli.groups import Service, add
+from surrogym.cli.groups import Service
 from surrogym.cli.options import AsJson, names_of_surrogates
 
 if TYPE_CHECKING:
@@ -24,11 +24,6 @@ FIDELITY = (
     *("leave-one-out error", "within 1 std", "within 2", "noise"),
 )
 PREQUENTIAL = ("output", "new samples", "in 50 %", "in 80 %", "in 90 %", "interval score")
-
-
-def register(app: typer.Typer) -> None:
-    """Add ``surrogym status`` to the app."""
-    add(app, "status", command)
 
 
 def command(

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from surrogym.cli.groups import Output, Service, add
+from surrogym.cli.groups import Output, Service
 from surrogym.cli.options import (
     ExitWithParent,
     Surrogate,
@@ -37,11 +37,6 @@ if TYPE_CHECKING:
     Record = Callable[[TrainProgress], None]
 
 NOTHING_YET = "interrupted before there was a policy; nothing was saved; the same command starts from the beginning"
-
-
-def register(app: typer.Typer) -> None:
-    """Add ``surrogym train`` to the app."""
-    add(app, "train", command)
 
 
 def command(

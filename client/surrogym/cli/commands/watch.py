@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from surrogym.cli.groups import Output, Service, add
+from surrogym.cli.groups import Output, Service
 from surrogym.cli.options import names_of_surrogates
 
 if TYPE_CHECKING:
@@ -23,11 +23,6 @@ if TYPE_CHECKING:
     from surrogym_trainer.watching.watcher import Alarm, Watcher
 
 SHOWN = 8  # at most this number of unusable rows is printed
-
-
-def register(app: typer.Typer) -> None:
-    """Add ``surrogym watch`` to the app."""
-    add(app, "watch", command)
 
 
 def command(

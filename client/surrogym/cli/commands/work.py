@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from surrogym.cli.groups import Output, Service, add
+from surrogym.cli.groups import Output, Service
 from surrogym.cli.options import (
     NAMES,
     ExitWithParent,
@@ -36,11 +36,6 @@ Reference = Annotated[
         "for surrogym evaluate. The module's code is run."
     ),
 ]
-
-
-def register(app: typer.Typer) -> None:
-    """Add ``surrogym work`` to the app."""
-    add(app, "work", command)
 
 
 def command(
