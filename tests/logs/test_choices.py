@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from surrogym_shared.logs.checking import ReadLog, check_log, draft_log
-from surrogym_shared.logs.columns import roles_by_map, roles_by_name
+from surrogym_shared.logs.columns import mapping_of, roles_by_mapping, roles_by_name
 from surrogym_shared.logs.table import Floats, Table, UnusableLog
 from surrogym_shared.spec import BoxAction, DiscreteAction, EnvironmentSpec, MultiDiscreteAction
 
@@ -20,7 +20,7 @@ def read(actions: dict[str, Floats], spec: EnvironmentSpec | None = None, **mapp
     table = Table(columns, np.arange(2, 2 + rows))
     roles = roles_by_name(table.names)
     if mapping:
-        roles = roles_by_map(roles.mapping.model_dump() | mapping, table.names)
+        roles = roles_by_mapping(mapping_of(roles.mapping.model_dump() | mapping, "the mapping"), table.names)
     return draft_log(table, roles, "drawn") if spec is None else check_log(table, roles, spec)
 
 

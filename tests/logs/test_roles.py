@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from surrogym_sampler.logs import UnusableLog
-from surrogym_shared.logs.columns import roles_by_file, roles_by_map, roles_by_name
+from surrogym_shared.logs.columns import mapping_of, roles_by_mapping, roles_by_name
 
 NAMES = ["x", "y", "v", "r"]
 PLAIN = {"state": ["x", "y"], "action": ["v"]}
@@ -73,13 +73,14 @@ def test_log_column_names_are_case_sensitive():
 )
 def test_a_mapping_that_contradicts_itself_is_refused(changes: dict[str, object], says: str):
     with pytest.raises(UnusableLog, match="the mapping.*" + says):
-        roles_by_map(PLAIN | changes, NAMES)
+        roles_by_mapping(mapping_of(PLAIN | changes, "the mapping"), NAMES)
 
 
 def test_the_mapping_of_recognised_columns_gives_the_same_roles_again():
     """The server tells a page the roles of the columns. The page sends them back, and the roles stay the same."""
-    roles = roles_by_name(["x", "next_x", "action_x", "reward", "time"])
-    assert roles_by_map(roles.mapping.model_dump(), ["x", "next_x", "action_x", "reward", "time"]) == roles
+    names = ["x", "next_x", "action_x", "reward", "time"]
+    roles = roles_by_name(names)
+    assert roles_by_mapping(mapping_of(roles.mapping.model_dump(), "the page"), names) == roles
 
 
 @pytest.mark.parametrize(
@@ -96,7 +97,7 @@ def test_a_mapping_file_that_cant_be_read_is_refused_in_a_sentence(
 ):
     (tmp_path / name).write_bytes(content)
     with pytest.raises(UnusableLog, match=says):
-        roles_by_file(tmp_path / name, NAMES)
+        mapping_of(tmp_path / name, "the file")
 
 
 def test_a_next_state_column_is_matched_by_the_whole_state_name():

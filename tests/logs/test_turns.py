@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from surrogym_shared.logs.checking import ReadLog, draft_log
-from surrogym_shared.logs.columns import roles_by_map, roles_by_name
+from surrogym_shared.logs.columns import mapping_of, roles_by_mapping, roles_by_name
 from surrogym_shared.logs.table import Floats, Table
 
 DRAWS = range(20)
@@ -21,7 +21,7 @@ def drafted(columns: dict[str, Floats], **mapping) -> ReadLog:
     table = Table(columns, np.arange(2, 2 + len(columns["x"])))
     roles = roles_by_name(table.names)
     if mapping:
-        roles = roles_by_map(roles.mapping.model_dump() | mapping, table.names)
+        roles = roles_by_mapping(mapping_of(roles.mapping.model_dump() | mapping, "the mapping"), table.names)
     return draft_log(table, roles, "drawn")
 
 

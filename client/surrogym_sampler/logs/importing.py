@@ -18,7 +18,7 @@ from surrogym_shared import patterns
 from surrogym_shared.logs.checking import ReadLog, check_log, draft_log, is_of_rejected, write_rejected
 from surrogym_shared.logs.roles import read_roles
 from surrogym_shared.logs.rows import require_reward_unit
-from surrogym_shared.logs.table import Floats, Table, UnusableLog
+from surrogym_shared.logs.table import Floats, UnusableLog
 from surrogym_shared.logs.transitions import TooFewSteps, Transitions
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import NewSample
@@ -193,18 +193,13 @@ def _require_one_name(register: str | None, to: str | None, spec: EnvironmentSpe
             "expected the argument 'to' alone, got it with 'register' or 'spec': give 'register' for a new surrogate, "
             "or 'to' for an existing one, whose specification is used"
         )
-    if register is not None:
-        _require_name(register)
+    if register is not None and not re.fullmatch(patterns.NAME, register):
+        raise UnusableLog(f"name of the surrogate: expected {patterns.IN_WORDS[patterns.NAME]}, got {register!r}")
 
 
 def _write_draft(draft: str | Path | None, log: ReadLog) -> None:
     if draft is not None:
         write_draft(Path(draft), log.spec)
-
-
-def _require_name(name: str) -> None:
-    if not re.fullmatch(patterns.NAME, name):
-        raise UnusableLog(f"name of the surrogate: expected {patterns.IN_WORDS[patterns.NAME]}, got {name!r}")
 
 
 def _require_reward_unit(log: ReadLog, api: Api, name: str) -> None:
@@ -215,12 +210,12 @@ def _require_reward_unit(log: ReadLog, api: Api, name: str) -> None:
         require_reward_unit(log.reward, np.array(known), name)
 
 
-def keep_rejected(path: Path, log: ReadLog, where: str | Path | None = None) -> Path | None:
+def keep_rejected(path: Path, log: ReadLog | TooFewSteps, where: str | Path | None = None) -> Path | None:
     """Write the rejected rows of a log to a file, and return its path.
 
     Args:
         path: the log.
-        log: the log that was read.
+        log: the log that was read, or the error that it has too few usable steps.
         where: the file; the default is beside the log.
 
     Returns:
@@ -229,11 +224,7 @@ def keep_rejected(path: Path, log: ReadLog, where: str | Path | None = None) -> 
     Raises:
         UnusableLog: the default file exists and does not contain rejected rows.
     """
-    return _keep(path, log.table, log.steps, where)
-
-
-def _keep(path: Path, table: Table, steps: Transitions, where: str | Path | None) -> Path | None:
-    file = rejected_file(path, where)
+    file, steps = rejected_file(path, where), log.steps
     foreign = where is None and file.exists() and not is_of_rejected(file)
     if not steps.rejected and (foreign or not file.exists()):
         return None
@@ -242,7 +233,7 @@ def _keep(path: Path, table: Table, steps: Transitions, where: str | Path | None
             f"{counted(len(steps.rejected), 'row')} of the log can't be used and would be written to {file}, but that "
             "file exists and does not contain rejected rows: give another file with --rejected"
         )
-    write_rejected(file, table, steps)
+    write_rejected(file, log.table, steps)
     return file
 
 
@@ -253,7 +244,7 @@ def _read_or_keep(path: Path, options: Options, where: str | Path | None) -> tup
         log = read_log(path, options)
     except TooFewSteps as error:
         try:
-            file = _keep(path, error.table, error.steps, where)
+            file = keep_rejected(path, error, where)
             words = f"{error}; all of these rows are in {file}" if error.steps.rejected else str(error)
         except UnusableLog as other:
             words = f"{error}; {other}"

@@ -56,10 +56,6 @@ class ReadLog:
         """Reason for each column or array of the file that is not used."""
         return {**dict.fromkeys(self.roles.ignored, "it has no role"), **self.table.ignored}
 
-    def write_rejected(self, path: Path) -> None:
-        """Write the rows that were set aside as CSV: line, reason, and the cells as in the log."""
-        write_rejected(path, self.table, self.steps)
-
     @cached_property
     def reward(self) -> Floats:
         """Rewards of the usable steps (m,), from the log, or from the declared reward if the log has none."""

@@ -301,21 +301,6 @@ def _content(path: Path) -> Mapping[str, Any]:
     return content
 
 
-def roles_by_file(path: Path, names: Sequence[str]) -> Roles:
-    """Find the roles of columns by a mapping file, in JSON or TOML.
-
-    Raises:
-        OSError: the file can't be read.
-        UnusableLog: the file is not a mapping, or names a column that the log does not have.
-    """
-    return roles_by_mapping(mapping_of(path, str(path)), names, str(path))
-
-
-def roles_by_map(content: Mapping[str, Any], names: Sequence[str], where: str = "the mapping") -> Roles:
-    """Find the roles of columns by a mapping. Raises ``UnusableLog`` like ``roles_by_file``."""
-    return roles_by_mapping(mapping_of(content, where), names, where)
-
-
 def roles_by_mapping(mapped: LogMapping, names: Sequence[str], where: str = "the mapping") -> Roles:
     """Find the roles of columns by a parsed mapping.
 

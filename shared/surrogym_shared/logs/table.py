@@ -94,7 +94,7 @@ def numbers(name: str, cells: Cells) -> tuple[Floats, dict[int, str]]:
     """
     if kind := NO_NUMBERS.get(cells.dtype.kind):
         raise UnusableLog(f"{name}: expected a column of numbers, got {kind} ({cells.dtype})")
-    values = _plain(cells) if cells.dtype.kind in "biuf" else _parse(cells)
+    values = cells.astype(np.float64) if cells.dtype.kind in "biuf" else _parse(cells)
     unusable = np.flatnonzero(~(np.abs(values) <= MAX_MEASURED))
     return values, {int(row): f"{name}: {_reason(cells[row], values[row])}" for row in unusable}
 
@@ -171,10 +171,6 @@ def groups(cells: Cells) -> Ints:
         alone = text in ("", "nan", "None")
         numbers[row] = codes.setdefault(f"\0{row}" if alone else text, len(codes))
     return numbers
-
-
-def _plain(cells: Cells) -> Floats:
-    return cells.astype(np.float64)
 
 
 def is_number(cell: str) -> bool:
