@@ -11,13 +11,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from surrogym_sampler.original.actions import random_action
 from surrogym_sampler.original.episodes import draw
 from surrogym_sampler.original.errors import StepFailed
 from surrogym_sampler.original.executables import Executable
 from surrogym_sampler.original.isolated import IsolatedEnvironment
 from surrogym_sampler.original.protocol import Array, OriginalEnvironment, RealStep
 from surrogym_sampler.original.simulator import Simulated
-from surrogym_shared.spec import BoxAction, EnvironmentSpec, limits
+from surrogym_shared.spec import EnvironmentSpec, limits
 
 PLACES = 3  # number of states to which the environment is set in a test, and of steps in a test episode
 EXACT = 1e-6  # a difference below this share of a coordinate's sampling range counts as rounding
@@ -238,15 +239,6 @@ class _Looking:
 
     def _action(self) -> Array:
         return random_action(self._spec, self._rng)
-
-
-def random_action(spec: EnvironmentSpec, rng: np.random.Generator) -> Array:
-    """Draw an action (F,) uniformly from the action space."""
-    action = spec.action
-    if isinstance(action, BoxAction):
-        return rng.uniform(action.low, action.high)
-    counts = [action.n] if action.kind == "discrete" else action.nvec
-    return rng.integers(0, counts).astype(np.float64)
 
 
 def apart(spec: EnvironmentSpec, one: object, other: object) -> float:

@@ -29,6 +29,7 @@ from surrogym_client.runtime.versions import versions
 from surrogym_client.transport.api import Api
 from surrogym_sampler.diagnosis.access import EXACT, Access, CheckFailed, examine
 from surrogym_sampler.diagnosis.history import History, declared, look_back
+from surrogym_sampler.original.actions import middle_action
 from surrogym_sampler.original.episodes import draw
 from surrogym_sampler.original.errors import OriginalError, StepFailed
 from surrogym_sampler.original.executables import Executable
@@ -37,7 +38,7 @@ from surrogym_sampler.original.protocol import Array, OriginalEnvironment, RealS
 from surrogym_sampler.original.simulator import Simulated
 from surrogym_sampler.queries.sample_conversion import sample_of
 from surrogym_shared.plugins import Registry
-from surrogym_shared.spec import BoxAction, EnvironmentSpec
+from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import PROTOCOL, StepQuery
 
 ROUND_TRIPS = 20
@@ -258,7 +259,7 @@ def _timed(api: Api) -> float:
 
 def _one_step(original: IsolatedEnvironment | Executable | Simulated, spec: EnvironmentSpec) -> Finding:
     """Report one real step: from a random state of the sampling range, or from a reset if the state can't be set."""
-    start, action = draw(spec, np.random.default_rng(0), wide=True), _middle(spec)
+    start, action = draw(spec, np.random.default_rng(0), wide=True), middle_action(spec)
     begun = time.perf_counter()
     try:
         if spec.query == "rollout":
@@ -287,11 +288,3 @@ def _check(step: RealStep, start: Array, action: Array) -> None:
         action=action.tolist(),
     )
     sample_of(query, step, len(start))
-
-
-def _middle(spec: EnvironmentSpec) -> Array:
-    """Return the action (F,) in the middle of the bounds; zeros if the actions are discrete."""
-    if isinstance(spec.action, BoxAction):
-        middle: Array = (np.array(spec.action.low) + np.array(spec.action.high)) / 2
-        return middle
-    return np.zeros(spec.action.size)

@@ -17,7 +17,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from surrogym_sampler.diagnosis.access import random_action
+from surrogym_sampler.original.actions import random_action
 from surrogym_sampler.original.lags import read_names
 from surrogym_sampler.original.protocol import Array, RealStep, RolloutEnvironment
 from surrogym_shared.spec import EnvironmentSpec

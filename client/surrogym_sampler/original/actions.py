@@ -59,6 +59,20 @@ def explored(spec: EnvironmentSpec, action: Array, share: float, rng: np.random.
     return np.where(rng.random(size) < share, drawn, action)
 
 
+def random_action(spec: EnvironmentSpec, rng: np.random.Generator) -> Array:
+    """Draw an action (F,) uniformly from the action space."""
+    if isinstance(spec.action, BoxAction):
+        return rng.uniform(spec.action.low, spec.action.high)
+    return rng.integers(0, _counts(spec.action)).astype(np.float64)
+
+
+def middle_action(spec: EnvironmentSpec) -> Array:
+    """Return the action (F,) in the middle of its bounds; zeros if the actions are discrete."""
+    if isinstance(spec.action, BoxAction):
+        return np.asarray(np.mean([spec.action.low, spec.action.high], axis=0))
+    return np.zeros(spec.action.size)
+
+
 def require_same_action(name: str, declared: Action, own: Action) -> None:
     """Refuse a declared action that the environment can't take. It may have fewer values than the environment's own,
     and other bounds.

@@ -12,13 +12,14 @@ from typing import Any, Self
 
 import numpy as np
 
+from surrogym_sampler.original.actions import middle_action
 from surrogym_sampler.original.episodes import draw
 from surrogym_sampler.original.errors import StepRefused, UnknownEnvironment
 from surrogym_sampler.original.loading import Respecified, is_own, make, with_choices
 from surrogym_sampler.original.protocol import Array, OriginalEnvironment, RealStep
 from surrogym_sampler.priors.calibration import Calibration, RealTransitions, calibrate
 from surrogym_sampler.priors.parameters import adjustable, read_parameters
-from surrogym_shared.spec import BoxAction, EnvironmentSpec
+from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.surrogate_file import SurrogateFile
 from surrogym_shared.wire.priors import CalibratedParameter, PriorAbout
 
@@ -233,7 +234,7 @@ def _require_steps(environment: OriginalEnvironment, spec: EnvironmentSpec) -> N
     for _ in range(TRIALS):
         start = draw(spec, rng, wide=True)
         try:
-            reached = np.asarray(environment.step_from(start, _middle(spec)).next_coordinates)
+            reached = np.asarray(environment.step_from(start, middle_action(spec)).next_coordinates)
             if reached.shape == start.shape and np.isfinite(reached).all():
                 return
             why = f"it gave {reached.tolist()}"
@@ -244,13 +245,6 @@ def _require_steps(environment: OriginalEnvironment, spec: EnvironmentSpec) -> N
         f"coordinates, got a simulator that failed in all {TRIALS} trials: {why}; "
         "correct the simulator, or narrow the sampling ranges"
     )
-
-
-def _middle(spec: EnvironmentSpec) -> Array:
-    """Return the action (F,) in the middle of its bounds; zeros if the actions are discrete."""
-    if isinstance(spec.action, BoxAction):
-        return np.asarray(np.mean([spec.action.low, spec.action.high], axis=0))
-    return np.zeros(spec.action.size)
 
 
 def _transitions(real: Sequence[RealStep]) -> RealTransitions:

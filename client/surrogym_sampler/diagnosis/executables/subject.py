@@ -6,13 +6,12 @@ Shapes: C coordinates, F action entries.
 from __future__ import annotations
 
 import time
-from types import TracebackType
 from typing import Self
 
 import numpy as np
 
-from surrogym_sampler.diagnosis.access import random_action
 from surrogym_sampler.diagnosis.outcomes import Mismatch
+from surrogym_sampler.original.actions import random_action
 from surrogym_sampler.original.episodes import draw
 from surrogym_sampler.original.errors import RequestRefused
 from surrogym_sampler.original.executables.messages import (
@@ -53,9 +52,7 @@ class Subject:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.program.close()
 
     @property
