@@ -5,8 +5,8 @@ This module runs in the host process, because a fault of the native code ends th
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -194,18 +194,13 @@ class Instance:
         return SET_AS.get(kind, {}).get(self._version, kind)
 
 
-class _words:
-    """Context manager that converts an error of an FMI call to ``Broken`` or ``Refused``, with a message."""
-
-    def __init__(self, during: str) -> None:
-        self._during = during
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
-        if isinstance(error, FMICallException):
-            status = STATUS.get(error.status, error.status)
-            raise (Broken if error.status == fmi2Fatal else Refused)(
-                f"the FMU answered {error.function} with status {status}, during {self._during}"
-            ) from error
+@contextmanager
+def _words(during: str) -> Iterator[None]:
+    """Context that converts an error of an FMI call to ``Broken`` or ``Refused``, with a message."""
+    try:
+        yield
+    except FMICallException as error:
+        status = STATUS.get(error.status, error.status)
+        raise (Broken if error.status == fmi2Fatal else Refused)(
+            f"the FMU answered {error.function} with status {status}, during {during}"
+        ) from error
