@@ -107,9 +107,9 @@ def test_fmu_episodes_and_restored_snapshots_replay_bit_equal(which: str, reques
         actions = drawn(fmu, 40)
         fmu.reset(None)
         first = states(fmu, actions[:20])
-        snapshot = fmu.snapshot()
+        snapshot = fmu.save()
         later = states(fmu, actions[20:])
-        fmu.go_back(snapshot)
+        fmu.restore(snapshot)
         assert bits(*states(fmu, actions[20:])) == bits(*later)
         fmu.reset(None)
         assert bits(*states(fmu, actions)) == bits(*first, *later)
@@ -141,8 +141,8 @@ def test_an_fmu_snapshot_can_be_restored_in_another_process(tanks: Path) -> None
     one, other = opened(f"fmu:{tanks}"), opened(f"fmu:{tanks}")
     try:
         one.step(np.ones(1))
-        snapshot, at = one.snapshot(), one.read()
-        other.go_back(snapshot)
+        snapshot, at = one.save(), one.read()
+        other.restore(snapshot)
         assert bits(other.read()) == bits(at)
     finally:
         one.close()
@@ -154,9 +154,9 @@ def test_restoring_an_fmu_snapshot_of_another_file_is_refused(tanks: Path, tmp_p
     other = opened(mapping(tmp_path, fmu=str(tanks), start={"flow": 1e-4}))
     try:
         with pytest.raises(StepFailed, match=r"as it is now, .* another file, step or start: delete"):
-            other.go_back(one.snapshot())
+            other.restore(one.save())
         with pytest.raises(StepFailed, match=r"expected a snapshot of TwoTanks.fmu, got 5 other bytes"):
-            other.go_back(b"hello")
+            other.restore(b"hello")
     finally:
         one.close()
         other.close()
@@ -167,12 +167,12 @@ def test_fmu_states_that_cannot_be_serialised_are_lost_with_their_process(tanks:
     one, other = opened(f"fmu:{quiet}"), opened(f"fmu:{quiet}")
     try:
         one.step(np.ones(1))
-        snapshot, at = one.snapshot(), one.read()
+        snapshot, at = one.save(), one.read()
         one.step(np.ones(1))
-        one.go_back(snapshot)
+        one.restore(snapshot)
         assert bits(one.read()) == bits(at)
         with pytest.raises(StepFailed, match="dropped from memory"):
-            other.go_back(snapshot)
+            other.restore(snapshot)
     finally:
         one.close()
         other.close()

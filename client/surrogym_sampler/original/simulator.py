@@ -116,14 +116,19 @@ class Simulator(ABC):
     def write(self, state: Array) -> None:
         """Set the V variables of the state (V,), and clear all other memory of earlier steps."""
 
-    def save(self) -> Array:
-        """Return everything that the next step depends on, as K numbers (K,): more than ``read`` returns, if a solver
-        has a memory."""
-        return self.read()
+    def save(self) -> bytes:
+        """Return everything that the next step depends on as a snapshot: more than ``read`` returns, if a solver has a
+        memory. Raises ``StepFailed`` if the simulator can't return to a state."""
+        if not self.saves:
+            raise StepFailed(
+                "expected a simulator that can return to a saved state, got one that can only be reset: register it "
+                "with --access reset"
+            )
+        return packed(self.read())
 
-    def restore(self, saved: Array) -> None:
-        """Return to the state whose K numbers (K,) ``save`` returned."""
-        self.write(saved)
+    def restore(self, snapshot: bytes) -> None:
+        """Return to the state in a snapshot that ``save`` made."""
+        self.write(unpacked(snapshot, self.read().shape))
 
     @abstractmethod
     def observe(self) -> Array:
@@ -244,16 +249,11 @@ class Simulated:
     def save(self) -> bytes:
         """Return the simulator's whole state as a snapshot. Raises ``StepFailed`` if the simulator can't return to a
         state."""
-        if not self.simulator.saves:
-            raise StepFailed(
-                "expected a simulator that can return to a saved state, got one that can only be reset: register it "
-                "with --access reset"
-            )
-        return packed(self.simulator.save())
+        return self.simulator.save()
 
     def restore(self, snapshot: bytes) -> Array:
         """Return to a saved state, and return its coordinates (C,)."""
-        self.simulator.restore(unpacked(snapshot, self.simulator.save().shape))
+        self.simulator.restore(snapshot)
         return self.coordinates()
 
     def coordinates(self) -> Array:

@@ -147,10 +147,10 @@ class GymnasiumSimulator(_Gymnasium, OfParts):
             self.reset(None)
         super().write(state)
 
-    def restore(self, saved: Array) -> None:
+    def restore(self, snapshot: bytes) -> None:
         if self._over:
             self.reset(None)
-        super().restore(saved)
+        super().restore(snapshot)
 
     def observe(self) -> Array:
         return flat(self._name, self._env._get_obs()) if self.shows else self._last

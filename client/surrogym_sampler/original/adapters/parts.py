@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from surrogym_sampler.original.errors import UnknownEnvironment
+from surrogym_sampler.original.gymnasium import packed, unpacked
 from surrogym_sampler.original.protocol import Array
 from surrogym_sampler.original.simulator import Simulator, random_factor
 from surrogym_sampler.original.state_parts import StatePart
@@ -34,12 +35,13 @@ class OfParts(Simulator):
         for part, values in reversed(list(zip(self._parts, np.split(state, ends), strict=True))):
             part.write(values)
 
-    def save(self) -> Array:
-        return np.concatenate([part.save() for part in self._parts])
+    def save(self) -> bytes:
+        return packed(np.concatenate([part.save() for part in self._parts]))
 
-    def restore(self, saved: Array) -> None:
-        ends = np.cumsum([len(part.save()) for part in self._parts])[:-1]
-        for part, values in reversed(list(zip(self._parts, np.split(saved, ends), strict=True))):
+    def restore(self, snapshot: bytes) -> None:
+        ends = np.cumsum([len(part.save()) for part in self._parts])
+        saved = unpacked(snapshot, (int(ends[-1]),))
+        for part, values in reversed(list(zip(self._parts, np.split(saved, ends[:-1]), strict=True))):
             part.restore(values)
 
     def touches(self) -> bool:

@@ -10,7 +10,6 @@ Shapes: C coordinates, F action entries.
 from __future__ import annotations
 
 import re
-from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -35,83 +34,6 @@ from surrogym_shared.spec import MAX_DIMENSIONS, BoxAction, EnvironmentSpec
 from surrogym_shared.spec.base import REWARD
 from surrogym_shared.terms import terminates
 
-
-class SavingSimulator(Simulator):
-    """A simulator that may be able to make snapshots itself; ``has_snapshots`` says whether it can."""
-
-    has_snapshots: bool
-
-    @property
-    def saves(self) -> bool:
-        return self.settable or self.has_snapshots
-
-    @abstractmethod
-    def snapshot(self) -> bytes:
-        """Return the whole state, saved by the simulator itself."""
-
-    @abstractmethod
-    def go_back(self, snapshot: bytes) -> None:
-        """Return to the state in a snapshot that ``snapshot`` made."""
-
-
-class FmuEnvironment(Simulated):
-    """An FMU as an original environment, with one instance at a time, because each is a process."""
-
-    parallel = False
-
-    def __init__(self, simulator: SavingSimulator, spec: EnvironmentSpec) -> None:
-        if spec.reward.kind != "declared":
-            raise UnknownEnvironment(
-                f"expected a declared reward for {spec.environment or 'an FMU'}, which has no reward of its own, got a "
-                f"{spec.reward.kind} reward: declare it in the specification that surrogym describe writes "
-                "(docs/how-to/fmus.md)"
-            )
-        if spec.action.kind != "box" or spec.action.size != simulator.action.size:
-            raise UnknownEnvironment(
-                f"expected a continuous action of {simulator.action.size} entries, one for each input of the FMU that "
-                f"an action sets, got a {spec.action.kind} action of {spec.action.size}: correct the specification's "
-                "action"
-            )
-        super().__init__(simulator, spec)
-        self._saving = simulator
-
-    def begin(self, seed: int | None = None) -> Array:
-        """Begin an episode: at a declared start if the state can be set, else at the FMU's own start values. Returns
-        the coordinates (C,)."""
-        if self._spec.query == "rollout":
-            return super().begin(seed)
-        self.place(draw(self._spec, np.random.default_rng(seed), wide=False))
-        return self.coordinates()
-
-    def act(self, action: Array) -> RealStep:
-        """Apply an action (F,) in the current state. Reward and termination are computed as declared."""
-        step = super().act(action)
-        before, taken, after = (
-            np.atleast_2d(np.asarray(x)) for x in (step.coordinates, step.action, step.next_coordinates)
-        )
-        ended = terminates(self._spec, after)
-        paid = declared_reward(self._spec, before, taken, after, ended)
-        return replace(step, reward=float(paid[0]), terminated=bool(ended[0]))
-
-    def save(self) -> bytes:
-        """Return a snapshot: the FMU's own saved state if it can save one, else the coordinates that can be set."""
-        if self._saving.has_snapshots:
-            return self._saving.snapshot()
-        if not self._saving.settable:
-            raise StepFailed(
-                "expected an FMU that can save its state or be set to a state, got an FMU that can only be reset: "
-                "register it with --access reset"
-            )
-        return super().save()
-
-    def restore(self, snapshot: bytes) -> Array:
-        """Return to the state in a snapshot, and return its coordinates (C,)."""
-        if not self._saving.has_snapshots:
-            return super().restore(snapshot)
-        self._saving.go_back(snapshot)
-        return self.coordinates()
-
-
 UNKNOWN_LIMITS = (-1.0, 1.0)  # assumed limits of an input that declares none
 SAME = 1e-9  # a variable counts as set if it is read back with at most this relative error
 # To test whether a variable can be set, its start value is shifted by this share of the width of its limits, or of 2 if
@@ -131,7 +53,7 @@ def open_simulator(name: str) -> Simulator:
     return Fmu(name, read_archive(path), choices)
 
 
-class Fmu(SavingSimulator):
+class Fmu(Simulator):
     """One FMU for co-simulation. A reset always begins at its start values. The observation consists of its outputs."""
 
     pays = False
@@ -146,7 +68,7 @@ class Fmu(SavingSimulator):
             )
         outputs = archive.of_causality("output") or state
         self._state, self._size = state, len(state)
-        self.has_snapshots = archive.snapshots
+        self._has_snapshots = archive.snapshots
         step = self.period = step_of(archive, choices)
         self._process = Process(archive, inputs, [*state, *outputs], step, start_values(archive, choices))
         try:
@@ -187,11 +109,26 @@ class Fmu(SavingSimulator):
     def observe(self) -> Array:
         return self._process.values[self._size :].copy()
 
-    def snapshot(self) -> bytes:
-        return self._process.save()
+    @property
+    def saves(self) -> bool:
+        return self.settable or self._has_snapshots
 
-    def go_back(self, snapshot: bytes) -> None:
-        self._process.restore(snapshot)
+    def save(self) -> bytes:
+        """Return a snapshot: the FMU's own saved state if it can save one, else the variables that can be set."""
+        if self._has_snapshots:
+            return self._process.save()
+        if not self.settable:
+            raise StepFailed(
+                "expected an FMU that can save its state or be set to a state, got an FMU that can only be reset: "
+                "register it with --access reset"
+            )
+        return super().save()
+
+    def restore(self, snapshot: bytes) -> None:
+        if self._has_snapshots:
+            self._process.restore(snapshot)
+        else:
+            super().restore(snapshot)
 
     def close(self) -> None:
         self._process.close()
@@ -234,6 +171,45 @@ class Fmu(SavingSimulator):
             for v, ours in zip(self._state, self.variables, strict=True)
             if v.name != ours.name
         ]
+
+
+class FmuEnvironment(Simulated):
+    """An FMU as an original environment, with one instance at a time, because each is a process."""
+
+    parallel = False
+
+    def __init__(self, simulator: Simulator, spec: EnvironmentSpec) -> None:
+        if spec.reward.kind != "declared":
+            raise UnknownEnvironment(
+                f"expected a declared reward for {spec.environment or 'an FMU'}, which has no reward of its own, got a "
+                f"{spec.reward.kind} reward: declare it in the specification that surrogym describe writes "
+                "(docs/how-to/fmus.md)"
+            )
+        if spec.action.kind != "box" or spec.action.size != simulator.action.size:
+            raise UnknownEnvironment(
+                f"expected a continuous action of {simulator.action.size} entries, one for each input of the FMU that "
+                f"an action sets, got a {spec.action.kind} action of {spec.action.size}: correct the specification's "
+                "action"
+            )
+        super().__init__(simulator, spec)
+
+    def begin(self, seed: int | None = None) -> Array:
+        """Begin an episode: at a declared start if the state can be set, else at the FMU's own start values. Returns
+        the coordinates (C,)."""
+        if self._spec.query == "rollout":
+            return super().begin(seed)
+        self.place(draw(self._spec, np.random.default_rng(seed), wide=False))
+        return self.coordinates()
+
+    def act(self, action: Array) -> RealStep:
+        """Apply an action (F,) in the current state. Reward and termination are computed as declared."""
+        step = super().act(action)
+        before, taken, after = (
+            np.atleast_2d(np.asarray(x)) for x in (step.coordinates, step.action, step.next_coordinates)
+        )
+        ended = terminates(self._spec, after)
+        paid = declared_reward(self._spec, before, taken, after, ended)
+        return replace(step, reward=float(paid[0]), terminated=bool(ended[0]))
 
 
 def _variables(state: Sequence[Declared]) -> tuple[Variable, ...]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -22,8 +21,16 @@ PREFIX = "fmu:"
 Value = bool | int | float | str
 
 
-class _File(BaseModel):
-    """The content of a JSON file that names an FMU, with settings for it."""
+class Choices(BaseModel):
+    """The settings of a person for an FMU, as in a JSON file. None leaves a setting to the model description.
+
+    Attributes:
+        fmu: path of the FMU, from the folder of the JSON file.
+        step: seconds of one action.
+        actions: names of the inputs that a policy sets, or low and high of each by its name.
+        coordinates: names of the variables that describe the state.
+        start: values of parameters and other variables before the FMU is initialised, by name.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -33,24 +40,10 @@ class _File(BaseModel):
     coordinates: tuple[str, ...] | None = None
     start: dict[str, Value] = Field(default_factory=dict)
 
-
-@dataclass(frozen=True)
-class Choices:
-    """The settings of a person for an FMU. None leaves a setting to the model description.
-
-    Attributes:
-        step: seconds of one action.
-        actions: names of the inputs that a policy sets.
-        limits: low and high of inputs, by name.
-        coordinates: names of the variables that describe the state.
-        start: values of parameters and other variables before the FMU is initialised, by name.
-    """
-
-    step: float | None = None
-    actions: tuple[str, ...] | None = None
-    limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    coordinates: tuple[str, ...] | None = None
-    start: Mapping[str, Value] = field(default_factory=dict)
+    @property
+    def limits(self) -> Mapping[str, tuple[float, float]]:
+        """Low and high of inputs, by name."""
+        return self.actions if isinstance(self.actions, dict) else {}
 
 
 def read_choices(name: str) -> tuple[Path, Choices]:
@@ -61,11 +54,11 @@ def read_choices(name: str) -> tuple[Path, Choices]:
     """
     path = Path(name.removeprefix(PREFIX))
     if path.suffix == ".fmu":
-        return path, Choices()
+        return path, Choices(fmu=path.name)
     if path.suffix != ".json" or not path.is_file():
         raise UnknownEnvironment(f"expected fmu:PLANT.fmu, or fmu:PLANT.json that names an FMU, got {name!r}")
     try:
-        given = _File.model_validate(json.loads(path.read_text(encoding="utf-8")))
+        given = Choices.model_validate(json.loads(path.read_text(encoding="utf-8")))
     except ValidationError as error:
         wrong = first_fault(error) if error.errors()[0]["loc"] else "not a JSON object"
         raise UnknownEnvironment(
@@ -73,23 +66,21 @@ def read_choices(name: str) -> tuple[Path, Choices]:
         ) from error
     except ValueError as error:
         raise UnknownEnvironment(f"{path} is not JSON: {error}; correct the file at this position") from error
-    return path.parent / given.fmu, _choices(path, given)
+    _check(path, given)
+    return path.parent / given.fmu, given
 
 
-def _choices(path: Path, given: _File) -> Choices:
-    limits = given.actions if isinstance(given.actions, dict) else {}
-    for action, (low, high) in limits.items():
+def _check(path: Path, given: Choices) -> None:
+    for action, (low, high) in given.limits.items():
         if not low < high:
             raise UnknownEnvironment(
                 f"{path}: action {action!r}: expected low < high, got [{low:g}, {high:g}]: swap or correct them"
             )
-    actions = None if given.actions is None else tuple(given.actions)
-    for key, names in (("actions", actions), ("coordinates", given.coordinates)):
+    for key, names in (("actions", tuple(given.actions or ())), ("coordinates", given.coordinates)):
         if names and (twice := next((name for name in names if names.count(name) > 1), None)) is not None:
             raise UnknownEnvironment(
                 f"{path}: {key}: expected each variable once, got {twice!r} twice: remove one of them"
             )
-    return Choices(given.step, actions, limits, given.coordinates, given.start)
 
 
 def driven(archive: Archive, choices: Choices) -> tuple[Declared, ...]:
