@@ -19,7 +19,6 @@ import surrogym
 from surrogym_sampler import original
 from surrogym_sampler.original.describing import describe
 from surrogym_sampler.original.episodes import open_episode
-from surrogym_sampler.original.port import OriginalPort
 from surrogym_shared.logs.rewards import declared_reward
 from surrogym_shared.spec import DeclaredReward, EnvironmentSpec, Quantity, RewardTerm, Term, Uniform
 from surrogym_trainer.evaluation.evaluator import EvaluationSettings, evaluate
@@ -127,6 +126,8 @@ def main() -> None:
         ours = judged(policy, environment, spec, options.episodes)
 
         if options.baseline:
+            from surrogym_lab.original_port import OriginalPort  # this comparison runs in a checkout only
+
             port = OriginalPort(spec, lambda: open_episode("own", spec, lambda: Plant(options.plant, spec)))
             settings = TrainSettings(options.algorithm, options.baseline, seed=options.seed)
             trained = train(port, Path(folder, "baseline.zip"), settings)

@@ -28,11 +28,11 @@ from common import parser, started, write
 
 from surrogym_client.surrogates.waiting import wait_for_model
 from surrogym_client.transport import Api, HttpSurrogate
+from surrogym_lab.original_port import OriginalPort
 from surrogym_sampler.logs import import_log
 from surrogym_sampler.original import make
 from surrogym_sampler.original.episode import Episode
 from surrogym_sampler.original.episodes import open_episode
-from surrogym_sampler.original.port import OriginalPort
 from surrogym_shared.port import SurrogatePort
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_trainer.evaluation.evaluator import EvaluationSettings, evaluate

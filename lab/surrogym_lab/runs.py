@@ -9,8 +9,8 @@ from surrogym.demo.judging import Judgement, episodes_of
 from surrogym.demo.learning import Learned, SurrogateRun
 from surrogym.demo.processes import Children
 from surrogym.demo.run import Run
+from surrogym_lab.original_port import OriginalPort
 from surrogym_lab.settings import StudySettings
-from surrogym_sampler.original.port import OriginalPort
 from surrogym_shared.terminal import progress
 from surrogym_trainer.policies.card import PolicyCard, write_card
 from surrogym_trainer.training import TrainProgress, TrainSettings, train

@@ -8,10 +8,10 @@ import pytest
 
 from support.machine import Machine, SettableMachine, Simulator, diary_in, most_at_once, note
 from surrogym_client.runtime.lifetime import terminations_as_interrupts
+from surrogym_lab.original_port import NotParallel, OriginalPort
 from surrogym_sampler import original
 from surrogym_sampler.original.episodes import open_episode
-from surrogym_sampler.original.errors import EvaluationFailed, NotParallel, PolicyMisfit
-from surrogym_sampler.original.port import OriginalPort
+from surrogym_sampler.original.errors import EvaluationFailed, PolicyMisfit
 from surrogym_shared.wire import OpenSession
 from surrogym_trainer.evaluation import EvaluationInterrupted, EvaluationSettings, evaluate
 

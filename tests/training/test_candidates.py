@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from support.moody import SPEC, Line
+from surrogym_lab.original_port import OriginalPort
 from surrogym_sampler.original.episodes import SteppedEpisode
-from surrogym_sampler.original.port import OriginalPort
 from surrogym_trainer.policies.predict import Predict
 from surrogym_trainer.training import audited
 from surrogym_trainer.training.audited import AuditedTraining

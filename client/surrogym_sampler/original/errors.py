@@ -4,7 +4,6 @@ OriginalError
 ├── UnknownEnvironment      no environment can be made from this name, or no specification can express it
 ├── NotPerturbable          the environment's physical attributes can't be changed, because they are unknown
 ├── NotSettable             the environment can't be set to a state, only reset
-├── NotParallel             one instance is open, and the environment does not declare that several may be
 ├── PolicyMisfit            the policy was trained for another environment, or gives unknown actions
 ├── QueryRefused            the environment's specification does not allow a query; nothing was sent to it
 ├── SnapshotGone            a query begins at a snapshot that can't be used; the design chooses another query
@@ -44,10 +43,6 @@ class NotPerturbable(OriginalError):
 
 class NotSettable(OriginalError):
     """The environment can't be set to a state: an episode can only begin with a reset."""
-
-
-class NotParallel(OriginalError):
-    """A second instance was requested of an environment that runs one at a time."""
 
 
 class PolicyMisfit(OriginalError, ValueError):

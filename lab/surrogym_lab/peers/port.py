@@ -14,8 +14,8 @@ from typing import Protocol
 import numpy as np
 
 from surrogym_client.errors import SurrogymClientError
+from surrogym_lab.original_port import SEEDS
 from surrogym_sampler.original.episode import Episode, Moment
-from surrogym_sampler.original.port import SEEDS
 from surrogym_sampler.original.protocol import LONGEST_EPISODE, Array
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_trainer.policies.predict import Acting

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from surrogym_client.sb3 import SurrogateVecEnv
+from surrogym_lab.original_port import OriginalPort
 from surrogym_sampler import original
 from surrogym_sampler.original.episodes import GymnasiumEpisode, open_episode
-from surrogym_sampler.original.port import OriginalPort
 from surrogym_shared.port import SurrogatePort
 from surrogym_shared.wire import OpenSession
 from surrogym_trainer.training import TrainSettings, train

@@ -10,7 +10,7 @@ import numpy as np
 from surrogym_sampler.original.actions import decode_actions
 from surrogym_sampler.original.episode import Episode, Moment
 from surrogym_sampler.original.episodes import draw
-from surrogym_sampler.original.errors import NotParallel
+from surrogym_sampler.original.errors import OriginalError
 from surrogym_sampler.original.protocol import LONGEST_EPISODE, Array
 from surrogym_shared.port import Bools, Floats, Ints, ResetResult, StepResult
 from surrogym_shared.spec import BoxAction, DiscreteAction, EnvironmentSpec, MultiDiscreteAction
@@ -26,6 +26,10 @@ from surrogym_shared.wire import (
 )
 
 SEEDS = (2**20, 2**31)  # range of the seeds of resets, far from the seeds of evaluations
+
+
+class NotParallel(OriginalError):
+    """A second instance was requested of an environment that runs one at a time."""
 
 
 class OriginalPort:
