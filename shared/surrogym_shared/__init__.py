@@ -1,1 +1,2 @@
-"""Code that client and server share: specification, wire models, error codes, and the port of surrogates."""
+"""Code that client and server share: specification, wire models, error codes, and ``SurrogatePort``, the interface of a
+surrogate for trainers."""

@@ -103,7 +103,8 @@ class Choices:
 
 
 def middle_and_reach(low: NDArray[np.float64], high: NDArray[np.float64], dtype: np.dtype[Any]) -> tuple[Array, Array]:
-    """Return the middle and half the width (F,) of the ranges with the ends ``low`` and ``high`` (F,)."""
+    """Return the middle and half the width (F,) of the ranges with the ends ``low`` and ``high`` (F,), as arrays of
+    this dtype."""
     return ((low + high) / 2).astype(dtype), ((high - low) / 2).astype(dtype)
 
 

@@ -21,7 +21,7 @@ deviation                                 (N, O)       float64
 
 A rollout of a policy has ``op`` policy. Its arrays have the policy's precision, float32 or float64: mean and deviation
 (D,), log_deviations (F,), and ``parameters``: for each layer in order, the weights (inputs, units) and the bias
-(units,). ``until`` (N,) is bool.
+(units,). ``until`` (N,) is bool: the rollout stops once an episode has ended in each lane that it marks.
 
 The reply has the arrays above with a first axis of T steps, action (T, N, F), log_probability (T, N), and final_steps
 (K,) as int64 beside final_lanes. To save bytes without a loss, action and log_probability are float32 if that

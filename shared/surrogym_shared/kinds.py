@@ -1,4 +1,4 @@
-"""Types of words that select a kind of something in a specification or a session, such as a variant."""
+"""Types of the words that name a choice in a specification or a session, such as the variant of a session."""
 
 from typing import Literal
 

@@ -119,7 +119,8 @@ def left_too_often(left: int, episodes: int, share: float, level: float) -> bool
 
 def must_stop(left: int, episodes: int, probability: float) -> bool:
     """Return whether a machine must take no further episodes: ``left`` of its ``episodes`` left a limit, at least two,
-    and more than twice the allowed ``probability`` explains. With a probability of 1 % at most, it stops by mistake."""
+    and more than twice the allowed ``probability`` explains. The probability that a machine stops by mistake is 1 % at
+    most."""
     return left >= FEWEST_LEFT and left_too_often(left, episodes, 2 * probability, LEFT_LEVEL)
 
 

@@ -79,8 +79,9 @@ class Network:
     def of(
         cls, spec: EnvironmentSpec, mean: Array, deviation: Array, units: int | Sequence[int], vector: Array
     ) -> Self:
-        """Make policies from vectors of parameters (..., p), with p as ``size`` returns it, and the statistics (D,)
-        that standardise observations. Weights are entries of a vector, divided by sqrt(number of layer inputs)."""
+        """Make policies from vectors of parameters (..., p), with p as ``size`` returns it. ``mean`` and ``deviation``
+        (D,) standardise observations; ``units`` are the sizes of the hidden layers. Weights are entries of a vector,
+        divided by sqrt(number of layer inputs)."""
         layers, begin = [], 0
         for inputs, outputs in pairwise(_sizes(spec, units)):
             middle, end = begin + inputs * outputs, begin + (inputs + 1) * outputs

@@ -52,7 +52,8 @@ class Preset:
             coordinates: number of the state's coordinates.
             observations: number of the observation's entries.
             actions: number of the action's entries.
-            by_steps: whether a query is one step from a state to which the environment is set, or from a saved state.
+            by_steps: True if each query is a single step, from a state to which the environment is set or from a saved
+                state; False if queries are rollouts from a reset.
         """
         if self.name == "paper":
             return 10 * (observations + actions)  # the paper's number of initial real steps, in section 3.1
@@ -62,7 +63,7 @@ class Preset:
         """Return the default number of real steps of a design, including the ``initial`` steps.
 
         The preset ``paper`` takes three times the initial steps: the paper needed 125 steps in all with 40 initial
-        steps, and 120 with 50. The other arguments are those of ``initial_steps``.
+        steps, and 120 with 50. Arguments other than ``initial`` are those of ``initial_steps``.
         """
         if self.name == "paper":
             return 3 * initial

@@ -1,7 +1,7 @@
 """Rates of the action: how far each entry may change from one step to the next.
 
-The action of the last step is a coordinate, so whether an action keeps the rates follows from the state alone. The
-original environment, virtual environments and deployed controllers all compute it from there.
+The action of the last step is a coordinate, so the state alone determines which actions keep the rates. The original
+environment, virtual environments and deployed controllers all limit actions by the state in this way.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ def rates(spec: EnvironmentSpec) -> tuple[Rate, ...]:
 
 
 def within_rates(rates: Sequence[Rate], coordinates: Array, action: Array) -> Array:
-    """Return the actions (..., F) that keep the rates and are nearest to ``action`` (..., F), after steps that led to
-    coordinates (..., C), which contain the last action."""
+    """Return the actions (..., F) that keep the ``rates`` and are nearest to the requested ``action`` (..., F) in
+    states with ``coordinates`` (..., C), some of which have the values of the last action."""
     kept = np.array(action, dtype=np.float64)
     for rate in rates:
         last = coordinates[..., rate.last]

@@ -2,9 +2,11 @@
 pickles.
 
 The file is safetensors: eight bytes with the length of a JSON header, the header, then arrays as raw bytes. The model's
-arrays and metadata are stored as the server exports them. In addition there are ``samples.*`` arrays and, as metadata
-``surrogate``, format, name, specification, tolerances, counts of real steps (ledger) and predictions of new samples. So
-any reader of safetensors can open the file, and the server reads ``model`` as an exported model.
+arrays and metadata are stored as the server exports them. The samples are in further arrays, whose names begin with
+``samples.``. A further entry of the metadata, ``surrogate``, is JSON with format, name, specification, tolerances,
+counts of real steps (ledger), and the errors with which each new sample was predicted before a model learned from it.
+Any reader of safetensors can open the file. Without samples and this entry, it is the file of an exported model, which
+the server can import.
 
 Shapes: n samples, C coordinates, F action entries.
 """
@@ -65,8 +67,8 @@ class RealSamples:
 
 @dataclass(frozen=True)
 class SurrogateFile:
-    """Contents of a surrogate's file. ``model`` is a safetensors file of the model, as the server exports and imports
-    it.
+    """Contents of a surrogate's file. The attribute ``model`` has the bytes of a safetensors file of the model, as the
+    server exports and imports it.
 
     Examples:
         >>> SurrogateFile.load("pendulum.surrogate").spec.environment
@@ -88,7 +90,7 @@ class SurrogateFile:
         """Return the contents of the file.
 
         Raises:
-            NotASurrogateFile: ``model`` is not a safetensors file.
+            NotASurrogateFile: the attribute ``model`` is not the content of a safetensors file.
         """
         header, body = _split(self.model)
         samples = {name: getattr(self.samples, name) for name in RealSamples.__dataclass_fields__}
@@ -155,7 +157,8 @@ class SurrogateFile:
         return cls(name, spec, model, samples, tolerances, ledger, predictions, about)
 
     def about_as_json(self) -> str:
-        """Return as JSON what the prior in this file was made from. If ``about`` is empty, it is this surrogate."""
+        """Return as JSON what a prior made from this file is learned from: the simulator that the attribute ``about``
+        describes. If ``about`` is empty, it is this surrogate itself."""
         return json.dumps(self.about or {"source": self.name})
 
     @classmethod
@@ -207,7 +210,8 @@ def _join(header: Header, body: bytes) -> bytes:
 
 
 def _array(entry: Any, body: bytes) -> NDArray[Any]:
-    """Return the array that an entry of the header describes. Raises an error in ``UNREADABLE`` if it is invalid."""
+    """Return the array that an entry of the header describes. If the entry is invalid, raises one of the exceptions
+    that ``UNREADABLE`` lists."""
     dtype, shape, (start, stop) = DTYPES[entry["dtype"]], [int(n) for n in entry["shape"]], entry["data_offsets"]
     if min(shape, default=0) < 0 or not 0 <= start <= stop <= len(body):
         raise ValueError(f"expected an array within {len(body)} bytes, got one from byte {start} to {stop}")
@@ -218,7 +222,8 @@ def _array(entry: Any, body: bytes) -> NDArray[Any]:
 
 
 def _pair(pair: Any) -> list[float]:
-    """Return [error, standard deviation] of a prediction. Raises an error of ``UNREADABLE`` if they are invalid."""
+    """Return [error, standard deviation] of a prediction. If they are invalid, raises one of the exceptions that
+    ``UNREADABLE`` lists."""
     error, std = (float(one) for one in pair)
     if not math.isfinite(error) or not 0 <= std < math.inf:
         raise ValueError(f"expected a finite error and a standard deviation of 0 or more, got {error} and {std}")

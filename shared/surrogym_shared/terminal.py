@@ -98,8 +98,8 @@ def on_interrupt(words: Callable[[], str]) -> Iterator[None]:
 
 @contextmanager
 def progress(title: str, *, quiet: bool = False) -> Iterator[Update]:
-    """Context that shows the progress of work: a bar on a terminal, lines elsewhere after ``FIRST_SECONDS``, nothing if
-    ``quiet``. Yields the function that updates it."""
+    """Context that shows the progress of work: a bar on a terminal; elsewhere lines, the first after ``FIRST_SECONDS``
+    seconds; nothing if ``quiet``. Yields the function that updates it."""
     if quiet:
         yield _silent
     elif sys.stderr.isatty():
@@ -133,8 +133,8 @@ def _bar(title: str) -> Iterator[Update]:
 
 
 class _Lines:
-    """Progress as lines of text, at most one every ``PLAIN_SECONDS``, and none before ``begin`` is called. The end of
-    the work (share 1) is always shown."""
+    """Progress as lines of text, at most one in ``PLAIN_SECONDS`` seconds, and none before ``begin`` is called. The end
+    of the work (share 1) is always shown."""
 
     def __init__(self, title: str) -> None:
         self._title = title

@@ -24,8 +24,8 @@ INNER: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True, *
 
 
 def compiled(function: F) -> F:
-    """Compile a function that only compiled code calls. A product and the sum that it is added to may become one
-    operation, which rounds once."""
+    """Compile a function that only compiled code calls. A multiplication and the addition that follows may become one
+    operation (fused multiply-add), which rounds once."""
     return cast(F, njit(fastmath={"contract"}, **INNER)(function))
 
 

@@ -495,13 +495,15 @@ def _only(role: str, headings: Iterable[Heading], names: Sequence[str]) -> str |
 
 
 def _of_next(part: str, states: Mapping[str, str]) -> str:
-    """Return the name of the state whose next value a column has. For the column ``next.q_0`` it is ``q_0`` if there
-    is a state of this name, otherwise ``0``."""
+    """Return the name of the state whose next value a column has. ``part`` is the column's name without the mark of a
+    next state, such as ``q_0`` for the column ``next.q_0``. The name is ``q_0`` if there is a state of this name,
+    otherwise ``0``."""
     return part if part in states else _part(STATE.match(part)) or part
 
 
 def _part(match: re.Match[str] | None) -> str:
-    """Return the part of a column's name without the prefix or ending that marks its role."""
+    """Return the first group of a match that is not empty: the part of a column's name without the prefix or ending
+    that marks its role. Empty without a match."""
     return "" if match is None else next((part for part in match.groups() if part), "")
 
 

@@ -160,7 +160,8 @@ def _why(is_declared: bool, evidence: str) -> str:
 
 
 def _is_angle(roles: Roles, steps: Transitions, name: str, index: int, notes: list[str]) -> bool:
-    """Whether a state is an angle in radians. If the mapping has a list of angles, this list decides."""
+    """Whether a state is an angle in radians. If the mapping has a list of angles, this list decides. Without it, the
+    state is an angle if its motion continues across jumps of 2 pi."""
     if roles.angles is not None:
         if name in roles.angles:
             notes.append(f"{name}: an angle in radians, as it is declared")
@@ -182,7 +183,8 @@ def _is_angle(roles: Roles, steps: Transitions, name: str, index: int, notes: li
 
 
 def _bounds(roles: Roles, name: str, after: Floats, ends: tuple[float, float], notes: list[str]) -> Bounds | None:
-    """Return the limits of a coordinate: declared ones, or extreme values ``ends`` at which many steps end exactly."""
+    """Return the limits of a coordinate: declared ones, or else its smallest and largest value in the log, ``ends``, if
+    many steps end exactly there. None if it has no limit."""
     low, high = roles.limits.get(name, (None, None))
     limits = [end if _stays_at(after, end, ends) else None for end in ends]
     for side, end, declared in (("low", limits[0], low), ("high", limits[1], high)):
@@ -194,7 +196,8 @@ def _bounds(roles: Roles, name: str, after: Floats, ends: tuple[float, float], n
 
 
 def _stays_at(after: Floats, end: float, ends: tuple[float, float]) -> bool:
-    """Whether so many steps end exactly at the extreme value ``end`` that it must be a limit."""
+    """Whether so many of the values ``after`` (m,) of a coordinate after each of m steps equal ``end``, their smallest
+    or largest value, that it must be a limit. ``ends`` has both extreme values."""
     rows = int((after == end).sum())
     others = np.unique(after[(after != ends[0]) & (after != ends[1])], return_counts=True)[1]
     often = rows >= max(SATURATED_ROWS, SATURATED_SHARE * len(after))
@@ -324,7 +327,8 @@ def _are_codes(values: Floats) -> bool:
 
 
 def _count(values: Floats, most: float | None) -> int:
-    """Return the number of choices that are numbered from 0 up to the largest value, or to a declared limit."""
+    """Return the number of choices that are numbered from 0 up to the largest of ``values``, or up to a declared limit,
+    ``most``, if that is larger."""
     return int(max(values.max(), values.max() if most is None else most)) + 1
 
 
@@ -515,8 +519,9 @@ def _lies_in(low: float, high: float, turn: float) -> bool:
 
 
 def _motion(steps: Transitions, index: int, change: Floats, jumps: Bools, width: float) -> tuple[Floats, float]:
-    """Fit a linear model of a column's change to the steps without a jump. Return the changes (m,) that it predicts for
-    all steps, and the standard deviation of its error at the steps without a jump."""
+    """Fit a linear model of the ``change`` (m,) of state column ``index`` to those of m steps that have no jump;
+    ``jumps`` (m,) marks the others. Return the changes (m,) that it predicts for all steps, and the standard deviation
+    of its error at the steps without a jump."""
     slow = ~jumps
     follows = np.zeros(len(change), dtype=np.bool_)
     follows[1:] = (steps.row[1:] == steps.row[:-1] + 1) & (steps.q[1:] == steps.q_next[:-1]).all(1) & slow[:-1]

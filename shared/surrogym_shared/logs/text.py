@@ -251,7 +251,8 @@ def _cells(line: str, delimiter: str) -> list[str]:
 
 
 def _heading(head: _Head, delimiter: str, where: str, remarks: list[str]) -> tuple[list[str], int, list[str]]:
-    """Return the names of the columns, the number of lines before the first row, and the remarks."""
+    """Return the names of the columns, the number of lines before the first row, and ``remarks``, to which sentences
+    about the heading were added."""
     skipped = f"{counted(len(head.comments), 'comment line')} before the heading left out"
     cells = [name.strip() for name in _cells(head.line, delimiter)]
     if not _is_row(cells):
@@ -285,7 +286,8 @@ def _is_row(cells: Sequence[str]) -> bool:
 
 
 def _rows(text: str, delimiter: str, first: int, where: str) -> Iterator[tuple[int, list[str]]]:
-    """Yield the cells of each row that is not empty, with the number of its last line."""
+    """Yield the cells of each row that is not empty, with the number of its last line. The rows begin after the
+    ``first`` lines of the text; ``where`` is the source of the text, for messages."""
     lines = islice(io.StringIO(text, newline=None), first, None)
     if delimiter == BLANKS:
         yield from ((first + number, cells) for number, line in enumerate(lines, 1) if (cells := line.split()))

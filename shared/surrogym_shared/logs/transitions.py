@@ -196,7 +196,8 @@ class Ticks:
 
 
 def ticks_of(rows: Rows, episode: Ints, left_out: Mapping[int, str]) -> Ticks | None:
-    """Return the ticks of a log's clock if the clock is coarser than the rows; otherwise None.
+    """Return the ticks of a log's clock if the clock is coarser than the rows; otherwise None. ``episode`` (n,) has the
+    number of each row's episode. Rows whose indices are in ``left_out`` are ignored.
 
     Raises:
         UnusableLog: it is unclear whether rows of the same time are repeats or steps; or the clock is coarser than the
@@ -389,7 +390,8 @@ def _going_on(rows: Rows, follower: dict[int, int], rejected: dict[int, str]) ->
 
 
 def _interval(rows: Rows, follower: dict[int, int], rejected: dict[int, str]) -> float | None:
-    """Return the median time between a row and the row that follows it; None without a column of times."""
+    """Return the median time between a row and the row that follows it, in the unit of the column of times; None
+    without such a column."""
     if rows.time is None or not follower:
         return None
     pairs = [(a, b) for a, b in follower.items() if a not in rejected and b not in rejected]
@@ -402,7 +404,8 @@ def _paired(
 ) -> dict[int, int]:
     """Return, for each row that has a next state, the index of the row that contains this next state.
 
-    If the log has columns of next states, it is the row itself, otherwise the row that follows at the usual interval.
+    If the log has columns of next states, it is the row itself. Otherwise it is the row that follows, unless the time
+    between the two rows shows that rows are missing.
     """
     if rows.following is not None:
         return {row: row for row in range(len(rows)) if row not in rejected}

@@ -104,7 +104,8 @@ class RenewLease(Request):
 
 
 class FailQuery(Request):
-    """Request of a sampler to hand a query back without an answer. Another sampler may claim it, unless ``refused``."""
+    """Request of a sampler to hand a query back without an answer. Another sampler may claim it then, unless the field
+    ``refused`` says that the original environment refused it."""
 
     lease_token: Key = Field(description="token of the lease")
     error: Annotated[str, Field(min_length=1, max_length=4_000)] = Field(
@@ -352,7 +353,7 @@ class ReportSteps(Request):
 class Improve(Request):
     """Request for further queries, which the design's acquisition chooses.
 
-    The budget must have enough real steps left. With a token of role ``admin``, it is raised as needed.
+    The budget must have enough real steps left. With a token of role ``admin``, the budget is raised as needed.
     """
 
     queries: Annotated[

@@ -62,9 +62,10 @@ class PrequentialScores(Reply):
     """Scores of how well the last samples of an output, 20 at most, were predicted before the model learned from them.
 
     Each sample that the design, an audit or a person chose after the first fit is predicted by the latest model that
-    has not learned from it. The standard deviation is that for the optimum of the hyperparameters, and includes the
-    learned noise. An error within the tolerance counts as inside every interval. The design chooses samples where the
-    model is uncertain, so their errors are not representative. No verdict on the design depends on these scores.
+    has not learned from it. The standard deviation of a prediction is computed with the most probable hyperparameters,
+    and includes the learned noise. An error within the tolerance counts as inside every interval. The design chooses
+    samples where the model is uncertain, so their errors are not representative. No verdict on the design depends on
+    these scores.
     """
 
     predictions: int = Field(description="number of samples that were predicted")
