@@ -41,13 +41,12 @@ from surrogym_shared.spec import DiscreteAction, EnvironmentSpec
 from surrogym_shared.terms import observe as declared
 from surrogym_trainer.deployment.c import write
 from surrogym_trainer.deployment.c.compiling import running
-from surrogym_trainer.deployment.c.files import prefix_of
+from surrogym_trainer.deployment.c.files import prefix_of, sensors_of
 from surrogym_trainer.deployment.controller import Array, Choices, Controller
 from surrogym_trainer.deployment.graph import write as write_onnx
 from surrogym_trainer.deployment.reading import controller_of
 from surrogym_trainer.deployment.reference import Decided, begin, decide, observe, scores
 from surrogym_trainer.deployment.running import Comparison
-from surrogym_trainer.deployment.vectors import sensors_of
 from surrogym_trainer.policies import load_policy
 from surrogym_trainer.policies.card import PolicyCard, write_card
 

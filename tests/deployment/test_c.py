@@ -20,11 +20,11 @@ from surrogym_sampler.original.limits import Guard
 from surrogym_shared.spec import DiscreteAction, MultiDiscreteAction
 from surrogym_shared.terms import observe as declared
 from surrogym_trainer.deployment.c import write, write_arduino
+from surrogym_trainer.deployment.c.files import sensors_of, vectors_of
 from surrogym_trainer.deployment.controller import LIMITED, Choices, Controller, NotDeployable
 from surrogym_trainer.deployment.reading import controller_of
 from surrogym_trainer.deployment.reference import begin, decide
 from surrogym_trainer.deployment.targets import deploy
-from surrogym_trainer.deployment.vectors import sensors_of, vectors_of
 from surrogym_trainer.policies import load_policy
 
 pytestmark = NEEDS_C

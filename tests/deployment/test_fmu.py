@@ -14,11 +14,11 @@ from support.controllers import network, plant
 from support.steps_in_c import needs_compiler
 from support.twins import opened
 from surrogym_shared.fmu import Block, Variable
+from surrogym_trainer.deployment.c.files import sensors_of
 from surrogym_trainer.deployment.controller import Choices, NotDeployable
 from surrogym_trainer.deployment.reading import controller_of
 from surrogym_trainer.deployment.reference import begin, decide
 from surrogym_trainer.deployment.targets import deploy
-from surrogym_trainer.deployment.vectors import sensors_of
 
 pytestmark = needs_compiler
 PERIOD, ACTIONS = 0.05, ("action_0", "action_1")

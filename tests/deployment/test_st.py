@@ -13,12 +13,12 @@ pytest.importorskip("blark")
 from support.controllers import limited, network, plant
 from support.structured_text import FunctionBlock
 from surrogym_shared.spec import MultiDiscreteAction
+from surrogym_trainer.deployment.c.files import sensors_of
 from surrogym_trainer.deployment.controller import Choices, Controller, NotDeployable
 from surrogym_trainer.deployment.reading import controller_of
 from surrogym_trainer.deployment.reference import begin, decide
 from surrogym_trainer.deployment.st import source_of
 from surrogym_trainer.deployment.targets import deploy
-from surrogym_trainer.deployment.vectors import sensors_of
 
 PAST = {"changes": 2, "actions": 1, "largest": {"angle": 0.5, "slide": 0.2}, "at_start": {"angle": 0.3}}
 STEPS, RESTARTS = 80, (0, 60)

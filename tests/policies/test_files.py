@@ -37,8 +37,7 @@ from surrogym_trainer.policies.defaults import decaying
 from surrogym_trainer.policies.export import export_policy
 from surrogym_trainer.policies.files import load_learner, load_policy, save_policy
 from surrogym_trainer.policies.networks import PaperPolicy, Standardise
-from surrogym_trainer.policies.saved_settings import MAX_EXPERIENCE_BYTES
-from surrogym_trainer.policies.structure import ENTRY, Structure, describe
+from surrogym_trainer.policies.structure import ENTRY, MAX_EXPERIENCE_BYTES, Structure, describe
 from surrogym_trainer.training import TrainSettings, train
 
 OBSERVED = spaces.Box(-np.inf, np.inf, (3,), np.float32)

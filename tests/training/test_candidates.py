@@ -14,7 +14,7 @@ from surrogym_sampler.original.episodes import SteppedEpisode
 from surrogym_trainer.policies.predict import Predict
 from surrogym_trainer.training import audited
 from surrogym_trainer.training.audited import AuditedTraining
-from surrogym_trainer.training.candidates import Candidates
+from surrogym_trainer.training.closed_loop import Candidates
 from surrogym_trainer.training.settings import TrainResult, TrainSettings
 
 POLICIES = {

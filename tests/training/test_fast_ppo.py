@@ -27,8 +27,15 @@ from surrogym_trainer.policies import UnusablePolicy, load_policy
 from surrogym_trainer.training import TrainingInterrupted, TrainProgress, TrainSettings, train
 from surrogym_trainer.training.checks import Checks
 from surrogym_trainer.training.fast_ppo import search as searches
-from surrogym_trainer.training.fast_ppo.actions import Bounded, Choices
-from surrogym_trainer.training.fast_ppo.learner import Learner, Objective, compiled_update, noisy, restored
+from surrogym_trainer.training.fast_ppo.learner import (
+    Bounded,
+    Choices,
+    Learner,
+    Objective,
+    compiled_update,
+    noisy,
+    restored,
+)
 from surrogym_trainer.training.fast_ppo.rollouts import Collector, RewardScale, Rollout
 from surrogym_trainer.training.search import search_for
 

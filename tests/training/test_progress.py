@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from surrogym_trainer.training import TrainProgress
-from surrogym_trainer.training.progress import ProgressEstimate, after
+from surrogym_trainer.training.settings import ProgressEstimate, after
 
 REPORTED = [  # of a demo, whose bar went back twice
     *((steps, 442_368) for steps in (8_192, 217_088, 434_176)),

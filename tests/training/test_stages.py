@@ -9,9 +9,9 @@ import pytest
 
 from support.plane import plane
 from surrogym_trainer.training import TrainSettings
-from surrogym_trainer.training.derived_settings import suggested_gamma
-from surrogym_trainer.training.fast_ppo.stages import SHORTER, SHORTEST, SIGHT, learn, refine
+from surrogym_trainer.training.fast_ppo.search import SHORTER, SHORTEST, SIGHT, learn, refine
 from surrogym_trainer.training.search import SearchTask
+from surrogym_trainer.training.settings import suggested_gamma
 
 
 class Described:

@@ -23,9 +23,8 @@ from surrogym_trainer.evaluation.imagined import observation_statistics
 from surrogym_trainer.policies import UnusablePolicy, load_policy
 from surrogym_trainer.policies.networks import WIDER, PaperPolicy
 from surrogym_trainer.training import TrainingInterrupted, TrainProgress, TrainSettings, train
-from surrogym_trainer.training.derived_settings import even_batch, suggested_gamma
 from surrogym_trainer.training.search import MAX_STEPS, SEARCHES, search_for
-from surrogym_trainer.training.settings import prolongs
+from surrogym_trainer.training.settings import even_batch, prolongs, suggested_gamma
 from surrogym_trainer.training.stable_baselines import search as training
 from surrogym_trainer.training.stable_baselines.algorithms import OffPolicySearch, OnPolicySearch
 from surrogym_trainer.training.stable_baselines.search import imagined_returns_of

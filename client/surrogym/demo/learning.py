@@ -25,8 +25,8 @@ from surrogym_shared.wire import SurrogateView
 from surrogym_trainer.evaluation.reporting import as_reported, paired_start
 from surrogym_trainer.policies import pushing
 from surrogym_trainer.policies.card import read_card
-from surrogym_trainer.training.progress import ProgressEstimate
 from surrogym_trainer.training.search import ALGORITHMS
+from surrogym_trainer.training.settings import ProgressEstimate
 from surrogym_trainer.training.words import words_of
 
 LEDGER = ("initial", "adaptive", "total", "unresolved", "audit")
@@ -112,9 +112,8 @@ class SurrogateRun:
             draw_all(self._folder, view, list(self._api.samples(name)), read_curve(self._curve), judgement.real.result)
 
     def _write_report(self, name: str) -> None:
-        from surrogym_trainer.report.files import write
         from surrogym_trainer.report.known import collect, cuts_of
-        from surrogym_trainer.report.page import page
+        from surrogym_trainer.report.page import page, write
 
         known = collect(self._api, name)
         write(self._folder / REPORT, page(known, cuts_of(self._api, known)[0]))

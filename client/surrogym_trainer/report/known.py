@@ -23,7 +23,7 @@ from surrogym_shared.wire import (
     SurrogateView,
 )
 from surrogym_trainer.policies.controller_check import StoredCheck, UnusableCheck, read_check
-from surrogym_trainer.report.maps import Cut, cuts
+from surrogym_trainer.report.coverage import Cut, cuts
 
 PREFERRED = "production"
 VIDEOS: dict[PolicyForm, str] = {"mp4": "video/mp4", "gif": "image/gif"}

@@ -13,16 +13,15 @@ from surrogym_shared.wire import SurrogateView
 from surrogym_trainer.evaluation.audit import AUDIT_STEPS, UNSURE, disappointed, wider
 from surrogym_trainer.policies.evidence import Audit
 from surrogym_trainer.policies.files import load_policy
-from surrogym_trainer.training.candidates import Candidates
-from surrogym_trainer.training.closed_loop import ClosedLoop, LoopSettings, visit
+from surrogym_trainer.training.closed_loop import Candidates, ClosedLoop, LoopSettings, visit
 from surrogym_trainer.training.handover import MOST_AUDITS, AuditSettings, Handover, Subject, hand_over
-from surrogym_trainer.training.progress import after
 from surrogym_trainer.training.search import search_for, with_algorithm
 from surrogym_trainer.training.settings import (
     TrainingInterrupted,
     TrainProgress,
     TrainResult,
     TrainSettings,
+    after,
     chosen_for,
     prolongs,
 )

@@ -1,4 +1,5 @@
-"""Settings, progress and result of a training, which are common to all policy searches."""
+"""Settings, progress and result of a training, which are common to all policy searches. Some settings follow from a
+specification, or from other settings."""
 
 from __future__ import annotations
 
@@ -179,3 +180,68 @@ class TrainingInterrupted(KeyboardInterrupt):
     def __init__(self, result: TrainResult) -> None:
         super().__init__()
         self.result = result
+
+
+BATCH = 1_024  # suggested size of a batch; large, because the time of an update depends mostly on the number of batches
+SHORTEST_SIGHT, LONGEST_SIGHT = 0.9, 0.999  # smallest and largest suggested discount factor
+
+
+def suggested_gamma(spec: EnvironmentSpec) -> float:
+    """Return the discount factor whose horizon, 1 / (1 - gamma), is a third of the time limit: 0.985 for 200 steps,
+    0.994 for 500."""
+    return min(max(1 - 3 / (spec.time_limit or 1_000), SHORTEST_SIGHT), LONGEST_SIGHT)
+
+
+def even_batch(rollout: int) -> int:
+    """Return a batch size near 1,024 that divides the number of steps in a rollout; the whole rollout if it
+    is smaller."""
+    return next(rollout // k for k in range(max(rollout // BATCH, 1), rollout + 1) if rollout % k == 0)
+
+
+class ProgressEstimate:
+    """The share of a training that is done.
+
+    A training may be extended: by a round, after an audit, or because it still gains. The part that is not done then
+    stands for all steps that are left, so that the share never falls.
+    """
+
+    def __init__(self) -> None:
+        # share of the training that is done: now, and when the total number of steps last changed
+        self._share = self._base = 0.0
+        self._steps = self._begun = 0  # virtual steps taken: now, and when the total number of steps last changed
+        self._total = 0
+        # virtual steps and seconds at the first call of words_of_time_left
+        self._first: tuple[int, float] | None = None
+
+    def share(self, steps: int, total: int) -> float:
+        """Return the share that is done, in [0, 1], after ``steps`` of ``total`` virtual steps."""
+        if total != self._total:
+            self._begun, self._base, self._total = self._steps, self._share, total
+        self._steps = max(self._steps, steps)
+        left = max(total - self._begun, 1)
+        done = self._base + (1 - self._base) * min((self._steps - self._begun) / left, 1.0)
+        self._share = max(self._share, done)
+        return self._share
+
+    def words_of_time_left(self, steps: int, total: int, seconds: float) -> str:
+        """Return in words an estimate of how long a training of ``total`` virtual steps still takes.
+
+        The pace is measured since the first call, because work before the first steps, such as compiling, happens only
+        once. So the first call gives no estimate, which is an empty text.
+
+        Args:
+            steps: virtual steps taken.
+            total: virtual steps of the whole training, as far as is known.
+            seconds: duration so far.
+        """
+        before, began = self._first = self._first or (steps, seconds)
+        if steps <= before or seconds <= began or steps >= total:
+            return ""
+        left = (total - steps) * (seconds - began) / (steps - before)
+        return f", about {f'{left:.0f} s' if left < 90 else f'{left / 60:.0f} min'} left"
+
+
+def after(now: TrainProgress, done: int, total: int = 0) -> TrainProgress:
+    """Return the progress ``now`` of a training, with the ``done`` virtual steps of earlier trainings added to its
+    steps and to its total. The total is at least ``total``."""
+    return replace(now, steps=done + now.steps, total_steps=max(total, done + now.total_steps))

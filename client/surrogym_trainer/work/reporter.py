@@ -16,7 +16,7 @@ from surrogym_client.transport.connection import Retries
 from surrogym_shared import wire
 from surrogym_trainer.policies.pushing import thinned
 from surrogym_trainer.training import TrainProgress
-from surrogym_trainer.training.progress import ProgressEstimate
+from surrogym_trainer.training.settings import ProgressEstimate
 
 AWAY = (ServerUnreachable, Unavailable)
 ONE_ATTEMPT = Retries(seconds=0)  # no retries, because the next report repeats a failed one

@@ -52,8 +52,7 @@ def command(
         # maps of the model's uncertainty; if they can't be computed, an empty list, and the reason in ``lacking``
         shown, lacking = cuts_of(api, known)
         update(0.3, "drawing")
-        from surrogym_trainer.report.files import write
-        from surrogym_trainer.report.page import page
+        from surrogym_trainer.report.page import page, write
 
         size = write(out, page(known, shown))
         update(1.0, "done")

@@ -233,7 +233,7 @@ def _recording(path: Path | None, curve: list[CurvePoint], update: Update) -> It
     """Context that records a training's progress. Yields a function that shows the present progress, adds it as a point
     to ``curve``, and appends it as a line to the file ``path``, which other processes can watch."""
     from surrogym_shared.wire import CurvePoint
-    from surrogym_trainer.training.progress import ProgressEstimate
+    from surrogym_trainer.training.settings import ProgressEstimate
     from surrogym_trainer.training.words import words_of
 
     started, estimate = time.monotonic(), ProgressEstimate()

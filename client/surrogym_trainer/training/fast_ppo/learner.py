@@ -5,7 +5,8 @@ Loss of a batch, with ratio r = p(a) / p_old(a) and advantages A of mean 0 and d
     -mean(min(r A, clip(r, 1 - c, 1 + c) A)) + v mean((V - R)^2)
 
 References: Schulman et al. (2017), arXiv 1707.06347, eq. 7; Kingma and Ba (2015). The constants are those of
-Stable-Baselines3; the update equals its update, apart from rounding.
+Stable-Baselines3; the update equals its update, apart from rounding. The action distributions are those of
+``surrogym_shared.distributions``; their initial parameters and derivatives are here.
 """
 
 from __future__ import annotations
@@ -16,23 +17,105 @@ from collections.abc import Callable, Mapping
 from dataclasses import astuple, dataclass, fields
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from surrogym_shared import distributions
 from surrogym_shared.acting import ActingPolicy
 from surrogym_shared.archives import Header, read_arrays, read_entries
 from surrogym_shared.compiled import available
+from surrogym_shared.distributions import Sampled, log_softmax, middle_and_reach
+from surrogym_shared.kinds import Activation
 from surrogym_shared.network import MAX_BYTES, Layer, Network, bounds_of, counts_of
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_trainer.policies.card import UnusablePolicy
-from surrogym_trainer.policies.defaults import CRITIC
+from surrogym_trainer.policies.defaults import CRITIC, EXPLORATION
 from surrogym_trainer.policies.files import load_network
 from surrogym_trainer.policies.predict import Predict
-from surrogym_trainer.training.fast_ppo.actions import distribution_of
 from surrogym_trainer.training.fast_ppo.adam import EPSILON, FIRST_DECAY, SECOND_DECAY
 from surrogym_trainer.training.fast_ppo.mlp import Array, Mlp, orthogonal
+
+
+class Distribution(Sampled, Protocol):
+    """A distribution of actions (B, F) with the derivatives that a learner needs."""
+
+    @property
+    def activation(self) -> Activation:
+        """The activation of the hidden layers of actor and critic."""
+        ...
+
+    def further(self) -> Array:
+        """Return the initial values (K,) of the distribution's parameters that are not outputs of the network."""
+        ...
+
+    def arrays(self) -> tuple[tuple[int, ...], Array, Array]:
+        """Return, for compiled code, the numbers of choices of discrete actions, and the centre (F,) and the reach
+        (F,), half the width, of the bounds of continuous actions. Parts that do not apply are empty."""
+        ...
+
+    def slopes(self, outputs: Array, further: Array, actions: Array, by: Array) -> tuple[Array, Array]:
+        """Return the derivatives of a loss with respect to the outputs (B, A) and to the further parameters (K,).
+
+        Args:
+            outputs: outputs of the actor (B, A).
+            further: the distribution's further parameters (K,).
+            actions: the actions taken (B, F).
+            by: the derivatives of the loss with respect to the log probabilities (B,).
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class Bounded(distributions.Bounded):
+    """Continuous actions within bounds; their standard deviations do not depend on the state."""
+
+    activation: Activation = "tanh"
+
+    def further(self) -> Array:
+        """Return the initial logarithms of the standard deviations (F,)."""
+        logarithms: Array = np.log(EXPLORATION * self.reach).astype(np.float32)
+        return logarithms
+
+    def arrays(self) -> tuple[tuple[int, ...], Array, Array]:
+        return (), self.centre, self.reach
+
+    def slopes(self, outputs: Array, further: Array, actions: Array, by: Array) -> tuple[Array, Array]:
+        bent = np.tanh(outputs)
+        z = (actions - self.centre - self.reach * bent) * np.exp(-further)
+        by_mean = by[:, None] * z * np.exp(-further)
+        return by_mean * self.reach * (1 - bent * bent), (by[:, None] * (z * z - 1)).sum(0)
+
+
+@dataclass(frozen=True)
+class Choices(distributions.Choices):
+    """Discrete actions, with a softmax for each entry."""
+
+    activation: Activation = "relu"
+
+    def further(self) -> Array:
+        return np.zeros(0, dtype=np.float32)
+
+    def arrays(self) -> tuple[tuple[int, ...], Array, Array]:
+        return self.counts, self.further(), self.further()
+
+    def slopes(self, outputs: Array, further: Array, actions: Array, by: Array) -> tuple[Array, Array]:
+        slopes, rows = [], np.arange(len(outputs))
+        for i, part in enumerate(self.parts(outputs)):
+            slope = -np.exp(log_softmax(part))
+            slope[rows, actions[:, i].astype(np.int64)] += 1
+            slopes.append(by[:, None] * slope)
+        return np.concatenate(slopes, 1), np.zeros_like(further)
+
+
+def distribution_of(counts: tuple[int, ...], low: NDArray[np.float64], high: NDArray[np.float64]) -> Distribution:
+    """Return the distribution of discrete actions with these numbers of choices, or of continuous actions within bounds
+    (F,)."""
+    if counts:
+        return Choices(counts)
+    return Bounded(*middle_and_reach(low, high, np.dtype(np.float32)))
+
 
 HIDDEN_GAIN, ACTION_GAIN, VALUE_GAIN = 2**0.5, 0.01, 1.0
 NARROWEST = 0.1  # if inputs are standardised again, the smallest new standard deviation, as a share of the previous one

@@ -1,4 +1,5 @@
-"""Proximal policy optimisation without torch, as a policy search in two stages: learn and refine."""
+"""Proximal policy optimisation without torch, as a policy search in two stages: learn and refine. A stage has starts
+and lengths of its episodes, and a discount factor."""
 
 from __future__ import annotations
 
@@ -16,11 +17,10 @@ from surrogym_client.environments.lanes import Lanes, session_request
 from surrogym_sampler.original.protocol import LONGEST_EPISODE
 from surrogym_shared.network import Network, counts_of
 from surrogym_shared.spec import EnvironmentSpec
-from surrogym_trainer.evaluation.imagined import observation_statistics
+from surrogym_trainer.evaluation.imagined import DECLARED, observation_statistics
 from surrogym_trainer.policies.defaults import HIDDEN, LANES, LEARNING_RATE, WIDER, decaying
 from surrogym_trainer.policies.predict import Predict
 from surrogym_trainer.training.checks import Checks, Returns, checked
-from surrogym_trainer.training.derived_settings import even_batch
 from surrogym_trainer.training.fast_ppo.learner import (
     Batch,
     LearnedNetwork,
@@ -31,9 +31,8 @@ from surrogym_trainer.training.fast_ppo.learner import (
     restored,
 )
 from surrogym_trainer.training.fast_ppo.rollouts import Collector
-from surrogym_trainer.training.fast_ppo.stages import Stage, learn, refine
 from surrogym_trainer.training.search import REFERENCE, SEARCHES, Found, PolicySearch, SearchTask
-from surrogym_trainer.training.settings import CHECKS, TrainProgress
+from surrogym_trainer.training.settings import CHECKS, TrainProgress, TrainSettings, even_batch, suggested_gamma
 
 RANGES = {  # Allowed range of each setting; settings with integer bounds must be integers.
     "n_steps": (1, 100_000),
@@ -347,3 +346,49 @@ def _reference() -> PolicySearch:
         ModuleNotFoundError: Stable-Baselines3 is not installed.
     """
     return SEARCHES.get(REFERENCE)()
+
+
+SHORTER = 5  # in the stage ``learn``, an episode is shorter than the time limit by this factor
+SHORTEST = 40  # in the stage ``learn``, an episode has at least this number of steps
+SIGHT = 1 / 2  # in short episodes, the discount horizon 1 / (1 - gamma) is this share of the length of an episode
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One stage of a training by FastPpo: its name, the settings of its episodes and their discount factor."""
+
+    name: str
+    settings: TrainSettings  # settings of the stage's episodes
+    gamma: float  # discount factor
+
+
+def learn(task: SearchTask) -> Stage:
+    """Return the stage of short episodes, half of which begin anywhere, with a discount horizon of half an episode.
+
+    A model can start anywhere, which a machine can't. In short episodes each lane sees many states, including those
+    near success, and a short horizon finds a first policy in a tenth of the steps. The last reward of a truncated
+    episode includes the critic's value of its last state, so short episodes don't change what is optimal. Starts and
+    lengths that the user chose are kept, and so are those of the preset ``paper``. The discount factor is then that of
+    whole episodes.
+    """
+    spec, settings = task.port.spec(), task.settings
+    ways = settings.start_box, settings.start_visited, settings.horizon
+    chosen = any(way is not None for way in ways) or not {"time_limit", "start_box"}.isdisjoint(settings.session)
+    if chosen or not spec.preset.adapts_training:
+        return Stage("learn", settings, suggested_gamma(spec))
+    limit = spec.time_limit or LONGEST_EPISODE
+    length = min(max(limit // SHORTER, SHORTEST), limit)
+    session = {**settings.session, "time_limit": length}
+    short = replace(settings, session=session, judge=settings.judging)
+    return Stage("learn", short, 1 - 1 / (SIGHT * length))
+
+
+def refine(task: SearchTask) -> Stage:
+    """Return the stage of whole episodes from the declared starts.
+
+    Episodes that start anywhere can have returns a thousand times as large as those from the declared starts. Critic
+    and advantages are then not precise enough for the declared starts.
+    """
+    settings = task.settings
+    session = {**settings.session, **DECLARED}
+    return Stage("refine", replace(settings, horizon=None, session=session), suggested_gamma(task.port.spec()))

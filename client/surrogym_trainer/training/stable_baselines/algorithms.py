@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_trainer.policies.defaults import LANES, decaying
 from surrogym_trainer.policies.networks import WIDER, PaperPolicy
-from surrogym_trainer.training.derived_settings import even_batch
+from surrogym_trainer.training.settings import even_batch
 from surrogym_trainer.training.stable_baselines.search import StableBaselinesSearch
 
 

@@ -1,17 +1,24 @@
-"""Training by an algorithm of Stable-Baselines3, for a fixed number of steps. The best policy of all checks is kept."""
+"""Training by an algorithm of Stable-Baselines3, for a fixed number of steps. The best policy of all checks is kept.
+
+A callback checks a training by the policy's imagined return. Training curves go to TensorBoard, Weights & Biases or
+MLflow.
+"""
 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
@@ -23,12 +30,9 @@ from surrogym_trainer.evaluation.imagined import observation_statistics
 from surrogym_trainer.policies.files import load_learner, save_policy
 from surrogym_trainer.policies.networks import Standardise
 from surrogym_trainer.policies.predict import Predict
-from surrogym_trainer.training.checks import Returns, checked
-from surrogym_trainer.training.derived_settings import suggested_gamma
+from surrogym_trainer.training.checks import Checks, Returns, checked
 from surrogym_trainer.training.search import Found, PolicySearch, SearchTask
-from surrogym_trainer.training.settings import TrainSettings
-from surrogym_trainer.training.stable_baselines.callback import Checking
-from surrogym_trainer.training.stable_baselines.tracking import tracking
+from surrogym_trainer.training.settings import CHECKS, TrainProgress, TrainSettings, suggested_gamma
 
 Statistics = tuple[Sequence[float], Sequence[float]]  # mean and standard deviation of observations, (D,) each
 
@@ -207,3 +211,140 @@ def _whole_rollouts(learner: BaseAlgorithm, total: int) -> int:
     """Round a number of steps down to whole rollouts, at least one. Stable-Baselines3 would round up."""
     rollout = learner.n_envs * (learner.n_steps if isinstance(learner, OnPolicyAlgorithm) else 1)
     return max(total // rollout, 1) * rollout
+
+
+class Checking(BaseCallback):
+    """Callback that measures the imagined return, keeps the best policy, and reports progress and the penalty's size.
+
+    Args:
+        total: virtual steps of the training.
+        progress: called after every rollout.
+        imagine: measures a learner's returns in virtual episodes.
+        untrained: a learner with an untrained network.
+    """
+
+    def __init__(
+        self,
+        total: int,
+        progress: Callable[[TrainProgress], None],
+        imagine: Callable[[BaseAlgorithm], Returns],
+        untrained: BaseAlgorithm,
+    ) -> None:
+        super().__init__()
+        self._total, self._progress, self._imagine = total, progress, imagine
+        self.checks = Checks(imagine(untrained))
+        # the best learner, and its parameters at the check
+        self._kept: tuple[BaseAlgorithm, dict[str, Any]] | None = None
+        self._penalty = self._size = 0.0
+        self._penalties: deque[float] = deque(maxlen=100)  # penalties of the last episodes
+        self._checked = 0  # number of checks that were due so far
+        self.steps = self.lost = 0
+
+    @property
+    def episode_penalty(self) -> float | None:
+        return float(np.mean(self._penalties)) if self._penalties else None
+
+    def check(self, learner: BaseAlgorithm) -> None:
+        """Measure a policy, and keep it if it is the best so far."""
+        if self.checks.add(self._imagine(learner)):
+            self._kept = learner, {name: tensor.clone() for name, tensor in learner.policy.state_dict().items()}
+
+    def best_of(self, last: BaseAlgorithm) -> BaseAlgorithm:
+        """Return the learner with the best imagined return of all checks, with its parameters of that check.
+
+        If there was no check, the last learner is returned.
+        """
+        if self._kept is None:
+            return last
+        learner, parameters = self._kept
+        learner.policy.load_state_dict(parameters)
+        return learner
+
+    def _on_step(self) -> bool:
+        infos, env = self.locals["infos"], self.training_env
+        assert isinstance(env, VecNormalize)
+        reward = env.get_original_reward()
+        mean = np.array([info["reward_mean"] for info in infos])
+        self._penalty += float(np.abs(mean - reward).sum())
+        self._size += float(np.abs(mean).sum())
+        self._penalties.extend(info["penalty"] for info in infos if "penalty" in info)
+        self.steps = self.num_timesteps
+        self.lost += sum("surrogym_session_lost" in info for info in infos)
+        return True
+
+    def _on_rollout_end(self) -> None:
+        share = self._penalty / self._size if self._size else 0.0
+        self._penalty = self._size = 0.0
+        self.logger.record("surrogym/penalty_share", share)
+        due = self.steps * CHECKS // self._total
+        if due > self._checked:
+            self._checked = due
+            self._check_now()
+        steps = min(self.steps, self._total)
+        self._progress(TrainProgress(steps, self._total, self.checks.latest, share, self.episode_penalty))
+
+    def _on_training_end(self) -> None:
+        self._check_now()
+
+    def _check_now(self) -> None:
+        self.check(self.model)
+        self.logger.record("surrogym/imagined_return", self.checks.latest)
+
+
+PROJECT = "surrogym"  # project or experiment of the runs in Weights & Biases and MLflow
+
+
+@contextmanager
+def tracking(settings: TrainSettings, out: Path) -> Iterator[list[BaseCallback]]:
+    """Context manager that returns the callbacks of a training's tracker. The tracker's run ends with the context.
+
+    TensorBoard needs no callback. Addresses and keys come from the trackers' own environment variables, such as
+    ``WANDB_MODE`` and ``MLFLOW_TRACKING_URI``.
+
+    Raises:
+        ModuleNotFoundError: the tracker is not installed.
+    """
+    config = {name: str(value) for name, value in asdict(settings).items() if value not in (None, {})}
+    if settings.tracker == "wandb":
+        import wandb
+        from wandb.integration.sb3 import WandbCallback
+
+        out.parent.mkdir(parents=True, exist_ok=True)
+        with wandb.init(project=PROJECT, name=out.stem, config=config, dir=out.parent, sync_tensorboard=True):
+            yield [WandbCallback()]
+    elif settings.tracker == "mlflow":
+        import mlflow
+
+        mlflow.set_experiment(PROJECT)
+        with mlflow.start_run(run_name=out.stem):
+            mlflow.log_params(config)
+            yield [Mlflow()]
+    else:
+        yield []
+
+
+class Mlflow(BaseCallback):
+    """Callback that sends the algorithm's logged numbers to the active run of MLflow."""
+
+    def _on_training_start(self) -> None:
+        self.logger.output_formats.append(MlflowWriter())
+
+    def _on_step(self) -> bool:
+        return True
+
+
+class MlflowWriter(KVWriter):
+    """Output format of Stable-Baselines3's logger that logs numbers as metrics of MLflow."""
+
+    def write(self, key_values: dict[str, Any], key_excluded: Mapping[str, Any], step: int = 0) -> None:
+        import mlflow
+
+        numbers = {
+            name: float(value)
+            for name, value in key_values.items()
+            if isinstance(value, int | float) and "mlflow" not in (key_excluded[name] or ())
+        }
+        mlflow.log_metrics(numbers, step=step)
+
+    def close(self) -> None:
+        """Do nothing: the context manager of the run closes the run."""
