@@ -33,8 +33,7 @@ from support.server import running_server
 from support.teaching import teach
 from surrogym_client.transport import Api, HttpSurrogate
 from surrogym_sampler.original.classic import pendulum
-from surrogym_server.features.ray.records import Checkpoint, SessionLease
-from surrogym_server.features.ray.store import LiveSessions
+from surrogym_server.features.ray.store import Checkpoint, LiveSessions, SessionLease
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.sql import open_storage
 from surrogym_shared.wire import OpenSession

@@ -43,8 +43,11 @@ def fill(url: str, surrogates: int, samples: int, sessions: int, checkpoint_byte
 def _sessions(storage: Storage, count: int, size: int) -> None:
     if not count:
         return
-    from surrogym_server.features.ray.records import Checkpoint, NewLiveSession  # late: a server may lack the feature
-    from surrogym_server.features.ray.store import LiveSessions
+    from surrogym_server.features.ray.store import (  # late: a server may lack the feature
+        Checkpoint,
+        LiveSessions,
+        NewLiveSession,
+    )
 
     surrogate, live = storage.surrogates.get(FIRST).id, storage.part(LiveSessions)
     for number in range(count):

@@ -1,4 +1,5 @@
-"""The service of jobs: it queues jobs for people, and leases them to trainer workers, which can wait for a job."""
+"""The service of jobs: it queues jobs for people, and leases them to trainer workers, which can wait for a job. It
+knows which workers called recently, and which jobs they accept."""
 
 from __future__ import annotations
 
@@ -10,7 +11,7 @@ from surrogym_server.errors import UnknownPolicy
 from surrogym_server.feature import Core
 from surrogym_server.features.jobs.records import JobProgress, JobRecord, JobResult, LeasedJob, NewJob
 from surrogym_server.features.jobs.store import Jobs
-from surrogym_server.features.jobs.workers import Offer, Workers
+from surrogym_server.services.activity import Alive
 from surrogym_server.services.claim_queues import ClaimQueues, Present
 from surrogym_server.services.metrics import ProcessMetrics
 from surrogym_server.services.notices import Notices
@@ -157,3 +158,26 @@ class JobService:
     def _changed(self, name: str, record: JobRecord) -> JobRecord:
         self._notices.post(name)
         return record
+
+
+class Offer(NamedTuple):
+    """Which jobs a trainer worker accepts: the largest number of real episodes of an evaluation, and whether it has a
+    reference controller."""
+
+    most_episodes: int = 0
+    reference: bool = False
+
+
+class Workers(Alive[Offer]):
+    """Time of the last call of each trainer worker, and the jobs that it accepts (its offer)."""
+
+    def heard(self, surrogate: str, worker: str, offer: Offer | None = None) -> bool:
+        """Record a claim or report of a worker, and return whether the worker is new. An ``offer`` of None keeps the
+        worker's earlier offer."""
+        if offer is None:
+            _, offer = self._heard.get(surrogate, {}).get(worker, (0.0, Offer()))
+        return self.note(surrogate, worker, offer)
+
+    def of(self, surrogate: str) -> dict[str, Offer]:
+        """Return the offers of a surrogate's workers that called recently, by the worker's name."""
+        return {worker: offer for owner, worker, offer in self.alive() if owner == surrogate}

@@ -8,7 +8,7 @@ from typing import Any
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection, Row
 
-from surrogym_server.errors import LeaseExpired, Overloaded, UnknownJob, UnknownSurrogate
+from surrogym_server.errors import LeaseExpired, Overloaded, UnknownJob
 from surrogym_server.features.jobs.records import (
     MAX_JOBS,
     MAX_OPEN,
@@ -27,12 +27,11 @@ from surrogym_server.storage.sql.rows import (
     find,
     has_ended,
     hold,
-    is_too_long,
     recall,
     remember,
-    shorten,
+    sweep_table,
 )
-from surrogym_server.storage.sql.tables import Id, Json, Word, checked, metadata, owner, row_id, surrogates
+from surrogym_server.storage.sql.tables import Id, Json, Word, checked, metadata, owner, row_id
 from surrogym_shared.states import JobKind, JobStatus
 
 jobs = checked(
@@ -219,23 +218,7 @@ class Jobs:
 
         A lease with more time left than its duration, because the clock was set back, is shortened to its duration.
         """
-        with self._database.read() as connection:
-            owners = sa.select(jobs.c.surrogate_id).where(has_ended(jobs, RUNNING)).distinct()
-            wanted = sa.select(surrogates.c.name).where(surrogates.c.id.in_(owners))
-            names = [*connection.execute(wanted).scalars()]
-            too_long = is_too_long(jobs, RUNNING)
-            set_back = connection.execute(sa.select(sa.exists().where(too_long))).scalar()
-        if set_back:
-            with self._database.write() as connection:
-                shorten(connection, jobs, RUNNING)
-        return sum(self._sweep(name) for name in names)
-
-    def _sweep(self, name: str) -> int:
-        try:
-            with self._database.write() as connection:
-                return _sweep(connection, hold(connection, name))
-        except UnknownSurrogate:  # the surrogate was just deleted
-            return 0
+        return sweep_table(self._database, jobs, RUNNING, _sweep)
 
 
 def _sweep(connection: Connection, held: Row[Any]) -> int:

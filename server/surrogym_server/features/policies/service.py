@@ -1,16 +1,18 @@
-"""The service of policies: it stores them with files and evaluations, returns them, and records aliases and drift."""
+"""The service of policies: it stores them with files and evaluations, returns them, and records aliases and drift. A
+file is checked without loading anything from it, neither arrays nor objects nor code."""
 
 from __future__ import annotations
 
 import asyncio
 import hashlib
+import io
 import json
 import logging
 import statistics
 import time
-from collections.abc import Iterator, Sequence
+import zipfile
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import Self
 
 from prometheus_client import Metric
@@ -19,7 +21,6 @@ from prometheus_client.core import GaugeMetricFamily
 from surrogym_server.errors import Damaged, Forbidden, InvalidInput, NotThere, SpecConflict, UnknownPolicy
 from surrogym_server.feature import Core
 from surrogym_server.features.policies.blobs import open_blobs
-from surrogym_server.features.policies.file_checks import check_file
 from surrogym_server.features.policies.records import (
     DRIFT,
     PUSHED_BY,
@@ -35,9 +36,10 @@ from surrogym_server.services.notices import Notices
 from surrogym_server.services.surrogates import Complete, difference, short
 from surrogym_server.storage.port import LATEST, Storage
 from surrogym_server.storage.records import JSON
-from surrogym_shared import intervals
+from surrogym_shared import intervals, network
 from surrogym_shared.checks import trace_fault
 from surrogym_shared.environments import is_name, is_same
+from surrogym_shared.wire import AddEvaluation
 
 logger = logging.getLogger(__name__)
 
@@ -45,23 +47,8 @@ MEBIBYTE = 2**20
 ORPHAN_SECONDS = 3_600.0  # age from which a file that no policy names is removed; an upload takes less time
 # Fields in which the specification in a policy's card (its description) must equal that of the surrogate.
 MUST_AGREE = ("observation", "action")
-
-
-@dataclass(frozen=True)
-class Episodes:
-    """Reported real episodes of a policy. ``returns``, ``lengths`` and ``success`` have one entry for each episode;
-    ``traces`` are of some episodes."""
-
-    controller: str
-    note: str
-    declared: bool
-    environment: str
-    seeded: bool
-    first_seed: int
-    returns: Sequence[float]
-    lengths: Sequence[int]
-    success: Sequence[bool] | None
-    traces: Sequence[JSON]
+# Fields of a reported evaluation that its summary repeats.
+DESCRIPTION = {"controller", "note", "declared", "environment", "seeded", "first_seed"}
 
 
 class PolicyService:
@@ -194,7 +181,7 @@ class PolicyService:
             raise UnknownPolicy(f"expected the format of a stored file of {place} ({there}), got {form!r}")
         return record.version, self._content(file.blob, file.digest, f"the {form} file of {place}")
 
-    def evaluate(self, name: str, version: int, episodes: Episodes, key: str) -> tuple[PolicyRecord, EvaluationRecord]:
+    def evaluate(self, name: str, version: int, episodes: AddEvaluation) -> tuple[PolicyRecord, EvaluationRecord]:
         """Store real episodes of a policy, once for each idempotency key. Return the policy and the evaluation.
 
         Raises:
@@ -202,12 +189,12 @@ class PolicyService:
             TooLarge: the files of the surrogate's policies would exceed their limit.
         """
         _require_lengths(episodes, self._storage.surrogates.get(name).spec)
-        episodewise = {name: getattr(episodes, name) for name in ("returns", "lengths", "success", "traces")}
+        episodewise = episodes.model_dump(mode="json", include={"returns", "lengths", "success", "traces"})
         content = json.dumps(episodewise, separators=(",", ":")).encode()
         digest = hashlib.sha256(content).hexdigest()
         blob = self._blobs.put(content)
         summary = {**_summary(episodes), "own": self._is_own(name, episodes.environment)}
-        new = NewEvaluation(key, summary, len(content), digest, blob)
+        new = NewEvaluation(episodes.idempotency_key, summary, len(content), digest, blob)
         with self._removed_if_refused(blob):
             stored, created, freed = self._policies.evaluate(name, version, new, self._most_bytes)
         self._changed(name, freed if created else (blob,))
@@ -341,7 +328,7 @@ class PolicyService:
         self._notices.post(name)
 
 
-def _require_lengths(episodes: Episodes, spec: JSON) -> None:
+def _require_lengths(episodes: AddEvaluation, spec: JSON) -> None:
     """Check the lengths of an evaluation's lists, and that its traces have the sizes of the specification's coordinates
     and actions. Raises ``InvalidInput``."""
     count = len(episodes.returns)
@@ -352,22 +339,17 @@ def _require_lengths(episodes: Episodes, spec: JSON) -> None:
     action = spec["action"]
     sizes = {"c": len(spec["coordinates"]), "f": len(action.get("low") or action.get("nvec") or (0,))}
     for number, trace in enumerate(episodes.traces):
-        if fault := trace_fault(trace["coordinates"], trace["action"], trace["reward"], **sizes):
+        if fault := trace_fault(trace.coordinates, trace.action, trace.reward, **sizes):
             raise InvalidInput(f"traces.{number}: {fault}")
 
 
-def _summary(episodes: Episodes) -> JSON:
+def _summary(episodes: AddEvaluation) -> JSON:
     """Return statistics of an evaluation's episodes, with 95 % intervals, as JSON."""
-    returns, success = list(episodes.returns), episodes.success
+    returns, success = episodes.returns, episodes.success
     share = None if success is None else intervals.of_share(sum(success), len(success))
     interval = intervals.of_mean(returns)
     return {
-        "controller": episodes.controller,
-        "note": episodes.note,
-        "declared": episodes.declared,
-        "environment": episodes.environment,
-        "seeded": episodes.seeded,
-        "first_seed": episodes.first_seed,
+        **episodes.model_dump(include=DESCRIPTION),
         "episodes": len(returns),
         "steps": sum(episodes.lengths),
         "mean": statistics.fmean(returns),
@@ -378,3 +360,59 @@ def _summary(episodes: Episodes) -> JSON:
         "success_rate": None if not success else sum(success) / len(success),
         "success_interval": None if share is None else share._asdict(),
     }
+
+
+MOST_ENTRIES = 10_000  # a zip file with more entries is not accepted as a policy
+ENTRY = b"PK\x01\x02"  # first bytes of each entry in the directory of a zip file
+STABLE_BASELINES = {"data", "policy.pth"}  # names of entries that a file of Stable-Baselines3 has
+
+
+def check_file(form: str, content: bytes, size: int, digest: str) -> None:
+    """Check the content of a policy's file.
+
+    Args:
+        form: format of the file, a key of ``FORMS``.
+        content: the file.
+        size: size in bytes that the sender announced.
+        digest: SHA-256 hash, as hex, that the sender announced.
+
+    Raises:
+        InvalidInput: the size or hash differs, or the content does not look like this format.
+    """
+    if len(content) != size:
+        raise InvalidInput(f"expected a file of {size} bytes, as announced, got {len(content)}: send the whole file")
+    found = hashlib.sha256(content).hexdigest()
+    if found != digest:
+        raise InvalidInput(f"expected a file with SHA-256 {digest}, as announced, got {found}: send the file again")
+    expected, looks_right = FORMS[form]
+    if not looks_right(content):
+        raise InvalidInput(f"expected {expected} for the format {form!r}, got content that begins with {content[:8]!r}")
+
+
+def _names(content: bytes) -> set[str]:
+    """Return the names of a zip file's entries; empty if the content is no zip file or has too many entries.
+
+    The entries are counted first, because a parsed entry takes ten times its size in the file.
+    """
+    if content.count(ENTRY) > MOST_ENTRIES:
+        return set()
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            names = archive.namelist()
+    except (zipfile.BadZipFile, NotImplementedError, ValueError):
+        return set()
+    return set(names)
+
+
+def _is_policy(content: bytes) -> bool:
+    names = _names(content)
+    return network.HEAD in names or names >= STABLE_BASELINES
+
+
+FORMS: dict[str, tuple[str, Callable[[bytes], bool]]] = {
+    "zip": (f"a zip of Stable-Baselines3, or of a network of arrays ({network.HEAD})", _is_policy),
+    "onnx": ("a model in ONNX", lambda content: content[:1] == b"\x08"),  # begins with the field of the format version
+    "pt2": ("a program of torch.export", lambda content: bool(_names(content))),
+    "mp4": ("an MP4 video", lambda content: content[4:8] == b"ftyp"),
+    "gif": ("a GIF", lambda content: content[:6] in (b"GIF87a", b"GIF89a")),
+}

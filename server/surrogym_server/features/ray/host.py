@@ -1,4 +1,7 @@
-"""A session host: a process of a Ray cluster that runs sessions for servers, with models from the database."""
+"""A session host: a process of a Ray cluster that runs sessions for servers, with models from the database.
+
+On machines of one kind, with the same versions of packages, a step gives the same bits.
+"""
 
 from __future__ import annotations
 
@@ -8,8 +11,10 @@ import platform
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from importlib.metadata import version
+from pathlib import Path
 from typing import Any
 from uuid import uuid4
+from zlib import crc32
 
 import torch
 from threadpoolctl import threadpool_limits
@@ -22,7 +27,6 @@ from surrogym_server.engine.models import ModelCache
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import SurrogymError
 from surrogym_server.features.ray.leases import Leases, Pace, seconds_now
-from surrogym_server.features.ray.machine import machine_kind
 from surrogym_server.features.ray.recorded import RecordedEngine, Surroundings
 from surrogym_server.features.ray.store import LiveSessions
 from surrogym_server.services.definitions import Definitions
@@ -31,6 +35,32 @@ from surrogym_server.settings import Settings
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.sql import open_storage
 from surrogym_shared.spec import EnvironmentSpec
+
+PROCESSORS = Path("/proc/cpuinfo")
+NAMES = ("model name", "flags", "Features")
+
+
+def machine_kind(device: str, threads: int) -> str:
+    """Describe processor, number of threads and device as one text, which is equal on machines that round equally.
+
+    Args:
+        device: "cpu" or "cuda".
+        threads: number of threads of a torch operation.
+    """
+    parts = [platform.machine(), _processor(), f"threads {threads}"]
+    return ", ".join([*parts, torch.cuda.get_device_name() if device == "cuda" else device])
+
+
+def _processor() -> str:
+    """Return the name of the first processor, and a hash of its instruction sets."""
+    try:
+        lines = PROCESSORS.read_text().split("\n\n")[0].splitlines()
+    except OSError:
+        return platform.processor()
+    told = {name.strip(): value.strip() for name, _, value in (line.partition(":") for line in lines)}
+    name, *abilities = (told.get(name, "") for name in NAMES)
+    return f"{name} {crc32(' '.join(abilities).encode()):08x}"
+
 
 OPERATIONS = frozenset(
     {

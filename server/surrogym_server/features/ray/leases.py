@@ -10,8 +10,7 @@ from dataclasses import dataclass, field
 
 from surrogym_server.engine.session import Session, session_to_bytes
 from surrogym_server.errors import SurrogymError, Unavailable
-from surrogym_server.features.ray.records import Checkpoint, NewLiveSession, SessionLease, TakenSession
-from surrogym_server.features.ray.store import LiveSessions
+from surrogym_server.features.ray.store import Checkpoint, LiveSessions, NewLiveSession, SessionLease, TakenSession
 
 logger = logging.getLogger(__name__)
 

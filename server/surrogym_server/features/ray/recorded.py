@@ -21,8 +21,7 @@ from surrogym_server.errors import (
     UnknownSession,
 )
 from surrogym_server.features.ray.leases import Leases
-from surrogym_server.features.ray.records import TakenSession
-from surrogym_server.features.ray.store import LiveSessions
+from surrogym_server.features.ray.store import LiveSessions, TakenSession
 
 UNKNOWN = -1
 

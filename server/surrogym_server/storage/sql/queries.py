@@ -28,7 +28,6 @@ from surrogym_server.errors import (
     InvalidInput,
     LeaseExpired,
     UnknownQuery,
-    UnknownSurrogate,
 )
 from surrogym_server.storage import port
 from surrogym_server.storage.port import MAX_ATTEMPTS
@@ -47,10 +46,9 @@ from surrogym_server.storage.sql.rows import (
     find,
     has_ended,
     hold,
-    is_too_long,
     recall,
     remember,
-    shorten,
+    sweep_table,
     touch,
     unknown_surrogate,
     within,
@@ -170,24 +168,7 @@ class SqlQueries(port.Queries):
             return query_counts(connection, (id, id)).get(id, QueryCounts())
 
     def sweep_expired(self) -> int:
-        with self._database.read() as connection:
-            ended = has_ended(leases, IS_OPEN)
-            owners = sa.select(leases.c.surrogate_id).where(ended).distinct()
-            statement = sa.select(surrogates.c.name).where(surrogates.c.id.in_(owners))
-            names = list(connection.execute(statement).scalars())
-            too_long = is_too_long(leases, IS_OPEN)
-            set_back = connection.execute(sa.select(sa.exists().where(too_long))).scalar()
-        if set_back:
-            with self._database.write() as connection:
-                shorten(connection, leases, IS_OPEN)
-        return sum(self._sweep(name) for name in names)
-
-    def _sweep(self, name: str) -> int:
-        try:
-            with self._database.write() as connection:
-                return sweep_leases(connection, hold(connection, name))
-        except UnknownSurrogate:  # the surrogate was just deleted
-            return 0
+        return sweep_table(self._database, leases, IS_OPEN, sweep_leases)
 
 
 def _require_room(connection: Connection, surrogate: Row[Any], steps: int) -> None:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection, Row
 
 from surrogym_server.errors import IdempotencyConflict, UnknownSurrogate
-from surrogym_server.storage.sql.database import NOW
+from surrogym_server.storage.sql.database import NOW, Database
 from surrogym_server.storage.sql.tables import events, requests, surrogates
 from surrogym_shared.states import EventKind
 
@@ -132,3 +134,23 @@ def shorten(connection: Connection, table: sa.Table, is_leased: Condition) -> No
     their duration from now."""
     too_long = sa.update(table).where(is_too_long(table, is_leased))
     connection.execute(too_long.values(expires=NOW + table.c.seconds))
+
+
+def sweep_table(
+    database: Database, table: sa.Table, is_leased: Condition, sweep: Callable[[Connection, Row[Any]], int]
+) -> int:
+    """End the expired leases of a table for all surrogates, and return their number. ``sweep`` ends those of one
+    surrogate, which is locked. Leases that are too long, because the clock was set back, are shortened."""
+    with database.read() as connection:
+        owners = sa.select(table.c.surrogate_id).where(has_ended(table, is_leased)).distinct()
+        statement = sa.select(surrogates.c.name).where(surrogates.c.id.in_(owners))
+        names = list(connection.execute(statement).scalars())
+        set_back = connection.execute(sa.select(sa.exists().where(is_too_long(table, is_leased)))).scalar()
+    if set_back:
+        with database.write() as connection:
+            shorten(connection, table, is_leased)
+    ended = 0
+    for name in names:
+        with suppress(UnknownSurrogate), database.write() as connection:  # the surrogate may just have been deleted
+            ended += sweep(connection, hold(connection, name))
+    return ended

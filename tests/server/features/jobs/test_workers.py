@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from surrogym_server.features.jobs.workers import Offer, Workers
+from surrogym_server.features.jobs.service import Offer, Workers
 from surrogym_server.services.activity import MOST_NAMES
 
 

@@ -10,7 +10,7 @@ import zipfile
 import pytest
 
 from surrogym_server.errors import InvalidInput
-from surrogym_server.features.policies.file_checks import MOST_ENTRIES, check_file
+from surrogym_server.features.policies.service import MOST_ENTRIES, check_file
 
 
 def zipped(entries: int) -> bytes:

@@ -13,16 +13,17 @@ from support import pendulum
 from surrogym_server.errors import Forbidden, TooLarge, Unavailable
 from surrogym_server.features.policies.blobs import RowBlobs
 from surrogym_server.features.policies.records import PolicyFile
-from surrogym_server.features.policies.service import Episodes, PolicyService
+from surrogym_server.features.policies.service import PolicyService
 from surrogym_server.features.policies.store import Policies
 from surrogym_server.services.notices import Notices
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import NewSurrogate
 from surrogym_server.storage.sql import open_storage
+from surrogym_shared.wire import AddEvaluation
 
 NAME = "pendulum"
 GIF = b"GIF89a and so on"
-EPISODES = Episodes("policy", "", True, "", True, 0, [-1.0], [3], None, [])
+EPISODES = AddEvaluation(first_seed=0, returns=[-1.0], lengths=[3], idempotency_key="key")
 
 
 @pytest.fixture
@@ -79,8 +80,8 @@ def test_an_evaluation_whose_commit_acknowledgement_was_lost_is_stored_once(
     with monkeypatch.context() as patched:
         lost_at_commit(patched, "evaluate")
         with pytest.raises(Unavailable, match="connection was lost"):
-            policies.evaluate(NAME, 1, EPISODES, "key")
-    _, stored = policies.evaluate(NAME, 1, EPISODES, "key")
+            policies.evaluate(NAME, 1, EPISODES)
+    _, stored = policies.evaluate(NAME, 1, EPISODES)
     assert policies.episodes(NAME, "1", stored.id)[2:] == (
         {"returns": [-1.0], "lengths": [3], "success": None, "traces": []},
         None,

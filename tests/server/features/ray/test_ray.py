@@ -29,8 +29,7 @@ from surrogym_server.engine.requests import Advance, Reply, Reset
 from surrogym_server.errors import InvalidInput, SeqConflict, Unavailable
 from surrogym_server.features.ray import pool
 from surrogym_server.features.ray.host import Refused
-from surrogym_server.features.ray.records import SessionHolder
-from surrogym_server.features.ray.store import LiveSessions
+from surrogym_server.features.ray.store import LiveSessions, SessionHolder
 from surrogym_server.settings import Settings
 from surrogym_server.storage.port import Storage
 from surrogym_server.testing import LAWS_OF_ENGINES, EngineCase

@@ -10,8 +10,14 @@ import pytest
 import sqlalchemy as sa
 
 from surrogym_server.errors import IdempotencyConflict, Unavailable, UnknownSession, UnknownSurrogate
-from surrogym_server.features.ray.records import Checkpoint, NewLiveSession, SessionLease, TakenSession
-from surrogym_server.features.ray.store import LiveSessions, live
+from surrogym_server.features.ray.store import (
+    Checkpoint,
+    LiveSessions,
+    NewLiveSession,
+    SessionLease,
+    TakenSession,
+    live,
+)
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.sql import database, open_storage
 
