@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from surrogym.cli.filming import film
+from surrogym.cli.commands.evaluate import film
 from surrogym_sampler.original.episodes import open_episode
 from surrogym_sampler.original.loading import make
 from surrogym_trainer.evaluation.evaluator import Evaluation, EvaluationSettings, Trace

@@ -6,8 +6,7 @@ import sys
 import pytest
 
 from support.commands import command_line
-from surrogym.cli import COMMANDS
-from surrogym.cli.help import ADVANCED, GROUPS
+from surrogym.cli import ADVANCED, COMMANDS, GROUPS
 
 
 @pytest.mark.parametrize("command", [*COMMANDS, "serve"])

@@ -6,7 +6,7 @@ import time
 
 import numpy as np
 
-from surrogym_client.surrogates.phases import COMPLETED
+from surrogym_client.surrogates.waiting import COMPLETED
 from surrogym_client.transport import Api
 from surrogym_sampler.original.gymnasium import GymnasiumEnvironment
 from surrogym_shared import wire

@@ -11,7 +11,7 @@ import pytest
 from support.server import ServerProcess, running_server
 from surrogym.cli import main
 from surrogym_client.errors import BeyondBudget
-from surrogym_client.surrogates.budget import BudgetTooSmall, words_of_rounds
+from surrogym_client.surrogates.waiting import BudgetTooSmall, words_of_rounds
 from surrogym_client.transport import Api
 from surrogym_sampler.original.classic import pendulum
 from surrogym_shared.spec import Design

@@ -11,7 +11,7 @@ import pytest
 from support.scripted_server import Answer, ScriptedServer, problem, reply, scripted_server, session_view
 from surrogym_client import errors
 from surrogym_client.transport import HttpSurrogate, Retries
-from surrogym_client.transport.resend_buffer import MAX_BYTES, ResendBuffer, Sent
+from surrogym_client.transport.http_surrogate import MAX_BYTES, ResendBuffer, Sent
 from surrogym_shared import wire
 from surrogym_shared.codes import Code
 

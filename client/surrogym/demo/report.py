@@ -10,7 +10,7 @@ from surrogym.demo.judging import Judgement
 from surrogym.demo.learning import REPORT, Learned
 from surrogym.demo.settings import DemoSettings, fingerprint
 from surrogym_client.runtime.versions import machine, versions
-from surrogym_client.surrogates.phases import IN_WORDS
+from surrogym_client.surrogates.waiting import IN_WORDS
 from surrogym_trainer.evaluation.evaluator import Evaluation
 from surrogym_trainer.policies.card import PolicyCard, read_card
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from math import ceil, hypot, log, sqrt
 from statistics import NormalDist
 
-from surrogym_client.surrogates.phases import COMPLETED
+from surrogym_client.surrogates.waiting import COMPLETED
 from surrogym_shared.environments import is_name
 from surrogym_shared.wire import DoubtfulRegion, ModelView, OutputFidelity, ReachedLimit, SurrogateView
 

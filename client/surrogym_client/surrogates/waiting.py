@@ -1,4 +1,8 @@
-"""Wait for other processes: for a surrogate to be registered, for queries to be answered, for a design to end."""
+"""Wait for other processes: for a surrogate to be registered, for queries to be answered, for a design to end.
+
+The phases in which a design has ended are here, surrogates whose design waits for a log, and the check that the
+budget is large enough for the rounds of a training.
+"""
 
 from __future__ import annotations
 
@@ -6,10 +10,67 @@ import time
 from collections.abc import Callable, Iterator
 
 from surrogym_client.errors import ServerUnreachable, SurrogymClientError, UnknownSurrogate
-from surrogym_client.surrogates.phases import COMPLETED, IN_WORDS
 from surrogym_client.transport.api import Api
+from surrogym_shared.states import COMPLETED as COMPLETED
+from surrogym_shared.states import ENDED as ENDED
+from surrogym_shared.states import Phase
 from surrogym_shared.wire import SurrogateView
 from surrogym_shared.words import counted
+
+IN_WORDS: dict[Phase, str] = {
+    "ready": "the design is ready",
+    "over_budget": "the design has spent its budget without being certain of its model",
+    "unsure": "the design has ended before its budget was spent, without being certain of its model",
+    "from_log": "the model is fitted to the log, and the design requests no real steps",
+    "failed": "the design has failed",
+}
+
+
+def awaits_log(view: SurrogateView) -> bool:
+    """Whether a design waits for the import of a log: its budget is 0, and it has neither samples nor queries."""
+    asked = view.queries.pending + view.queries.leased
+    return view.budget == 0 and view.model_version is None and not view.samples and not asked
+
+
+def words_of_no_log(name: str) -> str:
+    """Describe the state of a surrogate that waits for a log, with the command that imports one."""
+    return f"the design requests no real steps, and there is no log yet; next: surrogym import LOG --to {name}"
+
+
+class BudgetTooSmall(SurrogymClientError):
+    """The budget has too few real steps for the rounds of a training, and the token may not raise it."""
+
+
+def words_of_rounds(api: Api, name: str, queries: int, rounds: int) -> str:
+    """Describe how many real steps the rounds of a training may cost.
+
+    Args:
+        api: the server.
+        name: name of the surrogate.
+        queries: real steps of each round.
+        rounds: number of rounds.
+
+    Raises:
+        BudgetTooSmall: the budget has fewer steps left, and the token may not raise it.
+    """
+    view = api.surrogate(name)
+    if view.phase == "ready":
+        return f"the design of {name!r} is ready: its rounds take no real steps, unless an audit fails"
+    needed = queries * rounds
+    left = f"the budget of {name!r} has {view.budget_left} of {view.budget} real steps left"
+    if needed <= view.budget_left:
+        return f"up to {needed} more real steps ({rounds} rounds of {queries}); {left}"
+    budget = view.budget + needed - view.budget_left
+    if api.access().role == "admin":
+        return (
+            f"up to {needed} more real steps ({rounds} rounds of {queries}); {left}, and will be raised to at most "
+            f"{budget}"
+        )
+    raise BudgetTooSmall(
+        f"{rounds} rounds of {queries} queries need up to {needed} more real steps, and {left}: lower "
+        f"--improve or --rounds, or let an admin raise the budget (surrogym change {name} --budget {budget})"
+    )
+
 
 LOOK_SECONDS = 0.25
 MANY = 1_500  # number of samples from which the expected time of a fit is shown

@@ -1,7 +1,8 @@
-"""One typed method for each route of the server, except the routes of sessions, policies and jobs."""
+"""One typed method for each route of the server, except the routes of sessions."""
 
 from __future__ import annotations
 
+import hashlib
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Literal, Self, TypeVar
@@ -11,14 +12,222 @@ from pydantic import BaseModel
 from surrogym_client.errors import NoModel, ProtocolMismatch, ServerUnreachable
 from surrogym_client.transport import routes
 from surrogym_client.transport.connection import Connection, Retries, Timeouts
-from surrogym_client.transport.jobs import JobCalls
-from surrogym_client.transport.policies import PolicyCalls
-from surrogym_client.transport.replies import check_protocol, new_key, parse
+from surrogym_client.transport.routes import check_protocol, new_key, parse
 from surrogym_shared import wire
 from surrogym_shared.codes import STATUS, Code, Problem
 from surrogym_shared.spec import EnvironmentSpec
 
 R = TypeVar("R", bound=wire.Reply)
+
+
+class JobCalls:
+    """Methods for the routes of jobs: trainings and evaluations that trainer workers run.
+
+    Every method raises the errors of ``Api``, and ``UnknownJob`` for a job that does not exist.
+    """
+
+    def __init__(self, connection: Connection) -> None:
+        self._connection = connection
+
+    def list(self, surrogate: str) -> wire.JobList:
+        """List the jobs of a surrogate, newest first, and the workers that are connected."""
+        route = f"{routes.surrogate(surrogate)}/jobs"
+        return parse(wire.JobList, self._connection.send("GET", route), route)
+
+    def get(self, surrogate: str, id: int) -> wire.JobDetail:
+        """Return one job, with the curve of its training so far."""
+        route = routes.job(surrogate, id)
+        return parse(wire.JobDetail, self._connection.send("GET", route), route)
+
+    def add(self, surrogate: str, task: wire.Task, *, idempotency_key: str | None = None) -> wire.JobView:
+        """Queue a training or an evaluation.
+
+        Raises:
+            NoModel: a training needs a model.
+            UnknownPolicy: the policy to evaluate does not exist.
+            Overloaded: too many jobs are queued or running.
+        """
+        body = wire.AddJob(task=task, idempotency_key=idempotency_key)
+        return self._post(wire.JobView, f"{routes.surrogate(surrogate)}/jobs", body, repeatable=bool(idempotency_key))
+
+    def cancel(self, surrogate: str, id: int) -> wire.JobView:
+        """Cancel a queued job, or ask the worker of a running job to stop."""
+        route = f"{routes.job(surrogate, id)}:cancel"
+        return parse(wire.JobView, self._connection.send("POST", route), route)
+
+    def claim(
+        self,
+        surrogate: str,
+        worker: str,
+        *,
+        most_episodes: int = 0,
+        reference: bool = False,
+        wait_seconds: float = 0.0,
+        lease_seconds: float = wire.JOB_LEASE_SECONDS,
+    ) -> wire.LeasedJob | None:
+        """Lease a job for a worker, and wait up to ``wait_seconds`` until there is one.
+
+        A claim whose reply is lost is not sent again. Its lease expires, and the job returns to the queue.
+
+        Args:
+            surrogate: name of the surrogate.
+            worker: name of the worker.
+            most_episodes: largest number of real episodes of an evaluation that the worker accepts; 0: trainings only.
+            reference: whether the worker has a reference controller, which some evaluations need.
+            wait_seconds: longest wait for a job.
+            lease_seconds: length of the lease.
+        """
+        body = wire.ClaimJob(
+            worker=worker,
+            most_episodes=most_episodes,
+            reference=reference,
+            wait_seconds=wait_seconds,
+            lease_seconds=lease_seconds,
+        )
+        timeout = self._connection.timeouts.request + wait_seconds
+        route = f"{routes.surrogate(surrogate)}/jobs:claim"
+        return self._post(wire.ClaimedJob, route, body, timeout=timeout, repeatable=False).job
+
+    def report(
+        self,
+        surrogate: str,
+        id: int,
+        lease_token: str,
+        *,
+        state: wire.JobState | None = None,
+        lease_seconds: float = wire.JOB_LEASE_SECONDS,
+        retries: Retries | None = None,
+    ) -> bool:
+        """Renew the lease of a job, and store its progress. Returns whether the worker has to stop, because a person
+        cancelled the job.
+
+        Raises:
+            LeaseExpired: the job has ended, or another worker has it.
+        """
+        body = wire.ReportJob(lease_token=lease_token, lease_seconds=lease_seconds, state=state)
+        return self._post(wire.ReportedJob, f"{routes.job(surrogate, id)}:report", body, retries=retries).cancel
+
+    def finish(
+        self,
+        surrogate: str,
+        id: int,
+        lease_token: str,
+        status: wire.JobEnd,
+        *,
+        error: str | None = None,
+        version: int | None = None,
+        evaluation: int | None = None,
+    ) -> wire.JobView:
+        """Report that a job has ended. Repeating it is harmless. Raises ``LeaseExpired`` if another worker has it."""
+        body = wire.FinishJob(
+            lease_token=lease_token, status=status, error=error, version=version, evaluation=evaluation
+        )
+        return self._post(wire.JobView, f"{routes.job(surrogate, id)}:finish", body)
+
+    def _post(
+        self,
+        reply: type[R],
+        route: str,
+        body: BaseModel,
+        *,
+        timeout: float | None = None,
+        repeatable: bool = True,
+        retries: Retries | None = None,
+    ) -> R:
+        content = body.model_dump_json().encode()
+        options = {"timeout": timeout, "repeatable": repeatable, "retries": retries}
+        return parse(reply, self._connection.send("POST", route, content, **options), route)  # type: ignore[arg-type]
+
+
+_FILE = "application/octet-stream"
+_SECONDS = 300.0  # time-out of a file's transfer, enough for the largest file over a slow connection
+
+
+class PolicyCalls:
+    """Methods for the routes of stored policies. ``which`` is the version of a policy, an alias, or ``latest``.
+
+    Every method raises the errors of ``Api``, and ``UnknownPolicy`` for a policy that does not exist.
+    """
+
+    def __init__(self, connection: Connection) -> None:
+        self._connection = connection
+
+    def list(self, surrogate: str) -> list[wire.PolicyView]:
+        """List all policies of a surrogate, newest first."""
+        route = f"{routes.surrogate(surrogate)}/policies"
+        return parse(wire.PolicyList, self._connection.send("GET", route), route).policies
+
+    def get(self, surrogate: str, which: str | int = "latest") -> wire.PolicyDetail:
+        """Return one policy, with the settings and the curve of its training."""
+        route = routes.policy(surrogate, which)
+        return parse(wire.PolicyDetail, self._connection.send("GET", route), route)
+
+    def push(
+        self,
+        surrogate: str,
+        card: wire.PushedCard,
+        curve: Sequence[wire.CurvePoint],
+        form: wire.PolicyForm,
+        file: bytes,
+    ) -> wire.PushedPolicy:
+        """Store a policy with its file. A version never changes: the same file with another card is a new version.
+
+        Raises:
+            SpecConflict: the policy was made for other observations or actions.
+            InvalidInput: the file is not of this form.
+        """
+        notice = wire.FileNotice(form=form, bytes=len(file), digest=_digest(file))
+        body = wire.AddPolicy(card=card, curve=[*curve], file=notice)
+        route = f"{routes.surrogate(surrogate)}/policies"
+        pushed = parse(wire.PushedPolicy, self._connection.send("POST", route, body.model_dump_json().encode()), route)
+        if not all(one.stored for one in pushed.files if one.form == form):
+            stored = self.put_file(surrogate, pushed.version, form, file)
+            return wire.PushedPolicy(**stored.model_dump(), created=pushed.created)
+        return pushed
+
+    def put_file(self, surrogate: str, version: int, form: wire.PolicyForm, file: bytes) -> wire.PolicyView:
+        """Store a further file of a policy. A stored file is never replaced: another file of the same form is an
+        error."""
+        route = f"{routes.policy(surrogate, version)}/files/{form}"
+        digest = {"digest": _digest(file)}
+        reply = self._connection.send("PUT", route, file, params=digest, media_type=_FILE, timeout=_SECONDS)
+        return parse(wire.PolicyView, reply, route)
+
+    def file(self, surrogate: str, which: str | int, form: wire.PolicyForm) -> bytes:
+        """Return the content of a policy's file."""
+        return self._connection.send("GET", f"{routes.policy(surrogate, which)}/files/{form}", timeout=_SECONDS)
+
+    def evaluate(self, surrogate: str, version: int, evaluation: wire.AddEvaluation) -> wire.EvaluationView:
+        """Store the results of real episodes of a policy, once for each idempotency key. This does not change the
+        surrogate's counts of real steps, see ``Api.report_steps``."""
+        route = f"{routes.policy(surrogate, version)}/evaluations"
+        reply = self._connection.send("POST", route, evaluation.model_dump_json().encode())
+        return parse(wire.EvaluationView, reply, route)
+
+    def evaluation(self, surrogate: str, which: str | int, id: int) -> wire.EvaluationDetail:
+        """Return the results of a stored evaluation: the return of each real episode, and the traces of some."""
+        route = f"{routes.policy(surrogate, which)}/evaluations/{id}"
+        return parse(wire.EvaluationDetail, self._connection.send("GET", route), route)
+
+    def put_alias(self, surrogate: str, alias: str, version: int) -> wire.PolicyView:
+        """Point an alias to a version of the policies. This needs a token of role admin."""
+        route = f"{routes.policy(surrogate, 'aliases')}/{routes.alias(alias)}"
+        reply = self._connection.send("PUT", route, wire.PutAlias(version=version).model_dump_json().encode())
+        return parse(wire.PolicyView, reply, route)
+
+    def drop_alias(self, surrogate: str, alias: str) -> None:
+        """Remove an alias. This needs a token of role admin."""
+        self._connection.send("DELETE", f"{routes.policy(surrogate, 'aliases')}/{routes.alias(alias)}")
+
+    def delete(self, surrogate: str, version: int) -> None:
+        """Delete a policy with its files and evaluations. This needs a token of role admin."""
+        self._connection.send("DELETE", routes.policy(surrogate, version))
+
+
+def _digest(file: bytes) -> str:
+    return hashlib.sha256(file).hexdigest()
+
+
 P = TypeVar("P", wire.Uncertainty, wire.Prediction)
 
 _EVENT_SILENCE_SECONDS = 60.0

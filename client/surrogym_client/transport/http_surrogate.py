@@ -1,12 +1,17 @@
-"""HttpSurrogate: implements SurrogatePort for a server, by a stream of frames, or by HTTP with frames or JSON."""
+"""HttpSurrogate: implements SurrogatePort for a server, by a stream of frames, or by HTTP with frames or JSON.
+
+It keeps the last requests of a session, which are sent again if the server restores an older checkpoint of it.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import math
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar, get_args
 
 import numpy as np
@@ -14,8 +19,7 @@ import numpy as np
 from surrogym_client.errors import ProtocolMismatch, SeqConflict, SessionLost, SurrogymClientError, refused_here
 from surrogym_client.transport import routes
 from surrogym_client.transport.connection import Connection, Retries, Timeouts
-from surrogym_client.transport.replies import check_protocol, new_key, parse
-from surrogym_client.transport.resend_buffer import ResendBuffer, Sent, digest_of
+from surrogym_client.transport.routes import check_protocol, new_key, parse
 from surrogym_client.transport.step_codecs import UNREADABLE, BinaryForm, Form, JsonForm
 from surrogym_client.transport.stream import Stream, StreamLost, StreamUnavailable
 from surrogym_shared import wire
@@ -26,6 +30,50 @@ from surrogym_shared.spec import EnvironmentSpec
 
 if TYPE_CHECKING:
     from surrogym_shared.acting import ActingPolicy, NoiseKey
+
+MAX_BYTES = 32 * 2**20
+
+
+@dataclass(frozen=True)
+class Sent:
+    """A request of a session, and the digest of its answer once it has been answered."""
+
+    seq: int
+    what: str
+    content: bytes = field(repr=False)
+    read: Callable[[bytes, Shape], tuple[int, Any]]
+    timeout: float
+    digest: bytes = b""
+
+
+class ResendBuffer:
+    """Buffer of the last answered requests of a session, in order.
+
+    Args:
+        most: number of requests to keep. Their contents take at most 32 MiB together.
+    """
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._sent: deque[Sent] = deque()
+        self._bytes = 0
+
+    def keep(self, sent: Sent) -> None:
+        self._sent.append(sent)
+        self._bytes += len(sent.content)
+        while len(self._sent) > self._most or self._bytes > MAX_BYTES:
+            self._bytes -= len(self._sent.popleft().content)
+
+    def since(self, seq: int) -> list[Sent] | None:
+        """Return the requests from number ``seq`` on; None if the first of these requests are no longer kept."""
+        if not self._sent or self._sent[0].seq > seq:
+            return None
+        return [sent for sent in self._sent if sent.seq >= seq]
+
+
+def digest_of(answer: bytes) -> bytes:
+    return hashlib.blake2b(answer, digest_size=16).digest()
+
 
 Transport = Literal["auto", "stream", "binary", "json"]
 T = TypeVar("T")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from surrogym_client.transport import routes
 from surrogym_client.transport.connection import Connection
-from surrogym_client.transport.replies import parse
+from surrogym_client.transport.routes import parse
 from surrogym_shared.wire.priors import PriorView
 
 

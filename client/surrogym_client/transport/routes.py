@@ -1,14 +1,20 @@
-"""Routes of the server. Only this module turns names into parts of a URL.
+"""Routes of the server and their replies. Only this module turns names into parts of a URL.
 
-Names are checked as well as quoted: ``..`` has no quoted form, and a server undoes the quoting of a slash.
+Names are checked as well as quoted: ``..`` has no quoted form, and a server undoes the quoting of a slash. Replies
+become wire models. A repeated request has a key by which the server recognises it.
 """
 
 from __future__ import annotations
 
 import re
+from typing import TypeVar
 from urllib.parse import quote
+from uuid import uuid4
 
-from surrogym_client.errors import refused_here
+from pydantic import ValidationError
+
+from surrogym_client.errors import ProtocolMismatch, refused_here
+from surrogym_shared import wire
 from surrogym_shared.codes import Code
 from surrogym_shared.patterns import ALIAS, IN_WORDS, NAME, POLICY
 
@@ -46,3 +52,33 @@ def _segment(text: str, pattern: str, expected: str) -> str:
     if not re.fullmatch(pattern, text):
         raise refused_here(Code.INVALID_REQUEST, f"{expected}, got {text!r}")
     return quote(text, safe="")
+
+
+R = TypeVar("R", bound=wire.Reply)
+
+
+def parse(reply: type[R], content: bytes, path: str) -> R:
+    """Parse the content of a server's reply from ``path`` into its wire model.
+
+    Raises:
+        ProtocolMismatch: the content does not fit the model.
+    """
+    try:
+        return reply.model_validate_json(content)
+    except ValidationError as error:
+        from surrogym_shared.faults import first_fault  # imported here, because only an error needs it
+
+        raise ProtocolMismatch(
+            f"the server's answer to {path} can't be read: {first_fault(error)}; upgrade the older of client and server"
+        ) from error
+
+
+def new_key() -> str:
+    """Return a new idempotency key, by which the server recognises a repeated request."""
+    return uuid4().hex
+
+
+def check_protocol(protocol: int, url: str) -> None:
+    """Raise ``ProtocolMismatch`` if the server at ``url`` has another version of the protocol."""
+    if protocol != wire.PROTOCOL:
+        raise ProtocolMismatch(f"expected protocol {wire.PROTOCOL} at {url}, got {protocol}: upgrade the older side")

@@ -12,7 +12,7 @@ from typing import TypeVar, get_args
 import numpy as np
 
 from surrogym_client.errors import InvalidInput, LeaseExpired, NotThere
-from surrogym_client.surrogates.phases import ENDED
+from surrogym_client.surrogates.waiting import ENDED
 from surrogym_client.transport.api import Api
 from surrogym_client.transport.connection import Retries
 from surrogym_sampler.original.errors import QueryRefused, SnapshotGone, StepFailed, StepRefused, message_of

@@ -16,7 +16,7 @@ import numpy as np
 
 from surrogym_client.errors import SurrogymClientError
 from surrogym_client.runtime.versions import versions
-from surrogym_client.surrogates.phases import IN_WORDS
+from surrogym_client.surrogates.waiting import IN_WORDS
 from surrogym_shared.limits import words_of_steps
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import ModelView, OutputFidelity, Phase, SampleView, SurrogateView

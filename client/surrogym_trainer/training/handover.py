@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from surrogym_client.environments.lanes import Lanes, session_request
 from surrogym_client.errors import BeyondBudget
-from surrogym_client.surrogates.phases import COMPLETED
-from surrogym_client.surrogates.waiting import NobodyAnswers, wait_for_answers, wait_for_design
+from surrogym_client.surrogates.waiting import COMPLETED, NobodyAnswers, wait_for_answers, wait_for_design
 from surrogym_client.transport.api import Api
 from surrogym_sampler.original.actions import decode_actions
 from surrogym_sampler.original.protocol import LONGEST_EPISODE

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from surrogym_client.transport import routes
 from surrogym_client.transport.api import Api
-from surrogym_client.transport.replies import parse
+from surrogym_client.transport.routes import parse
 from surrogym_shared.spec import BoxAction, EnvironmentSpec, limits
 from surrogym_shared.wire import PolicyView, SurrogateView
 from surrogym_shared.wire.drifts import AddDrift

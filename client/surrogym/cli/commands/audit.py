@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from surrogym.cli.groups import Output, PolicyReading, Service
-from surrogym.cli.options import FallbackProgram, SpecFile, read_spec
-from surrogym.cli.pushing import push_or_say
+from surrogym.cli.options import FallbackProgram, SpecFile, push_or_say, read_spec
 
 if TYPE_CHECKING:
     from surrogym_sampler.original.episode import Episode

@@ -1,4 +1,4 @@
-"""``surrogym evaluate``: measure a policy in the original environment."""
+"""``surrogym evaluate``: measure a policy in the original environment, and film it with ``--video``."""
 
 from __future__ import annotations
 
@@ -11,12 +11,10 @@ import typer
 
 from surrogym.cli.beside import Beside
 from surrogym.cli.disagreement import Differences, Imagining
-from surrogym.cli.filming import film
 from surrogym.cli.groups import Output, PolicyReading, Service
 from surrogym.cli.learning import kept
 from surrogym.cli.opening import opener_for_policy
-from surrogym.cli.options import NAMES, FallbackProgram, SpecFile, read_spec
-from surrogym.cli.pushing import push_or_say
+from surrogym.cli.options import NAMES, FallbackProgram, SpecFile, push_or_say, read_spec
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -29,7 +27,6 @@ if TYPE_CHECKING:
     from surrogym_trainer.policies.card import PolicyCard
     from surrogym_trainer.policies.evidence import Promise
     from surrogym_trainer.policies.predict import Acting
-
 
 Environment = Annotated[
     str | None,
@@ -453,3 +450,56 @@ def _words(reports: Sequence[tuple[Controller, Evaluation]], promise: Promise | 
         return f"{table}\n{few} to judge the promise: take {FEWEST_TO_JUDGE} or more"
     kept = "kept: the mean return is at least" if _kept(promise, reports[0][1]) else "broken: the mean return is below"
     return f"{table}\nthe promise of {promise.low:.4g} to {promise.high:.4g} was {kept} its lower end"
+
+
+def film(
+    policy: Path,
+    env: str | None,
+    card: PolicyCard,
+    opener: Callable[[], Episode],
+    result: Evaluation,
+    settings: EvaluationSettings,
+    *,
+    quiet: bool,
+) -> Path | None:
+    """Write a video of the best, median and worst episode beside the policy, and return its path.
+
+    An older video is replaced. If no video can be made, the reason is printed, and the result is None, because a video
+    must not spoil an evaluation.
+    """
+    from surrogym_client.environments.pictures import NotRenderable
+    from surrogym_shared.terminal import progress, say
+    from surrogym_trainer.evaluation.reporting import words_of
+    from surrogym_trainer.evaluation.videos import FORMS, record
+
+    try:
+        spec = _spec(env, card, opener)
+        with progress("video", quiet=quiet) as update:
+            update(None, "drawing the best, the median and the worst episode")
+            video = record(spec, env or spec.environment, result, words_of(settings))
+    except NotRenderable as error:
+        say(f"no video: {error}", quiet=quiet)
+        return None
+    except Exception as error:  # a user's environment may raise any exception
+        say(f"no video: {type(error).__name__}: {error}", quiet=quiet)
+        return None
+    for form in FORMS:
+        policy.with_suffix(f".{form}").unlink(missing_ok=True)
+    path = policy.with_suffix(f".{video.form}")
+    path.write_bytes(video.content)
+    say(f"video written to {path} ({len(video.content) / 1000:.0f} kB)", quiet=quiet)
+    return path
+
+
+def _spec(env: str | None, card: PolicyCard, opener: Callable[[], Episode]) -> EnvironmentSpec:
+    """Return the specification of the environment to draw. The environment is opened to get it, unless it is a user's
+    own environment, which may be a machine, and the policy's card contains a specification."""
+    from surrogym_sampler.original.loading import is_own
+
+    if env is not None and is_own(env) and card.spec is not None:
+        return card.spec
+    episode = opener()
+    try:
+        return episode.spec
+    finally:
+        episode.close()

@@ -279,7 +279,7 @@ def _with_tolerances(spec: EnvironmentSpec, tolerances: dict[str, float]) -> Env
 
 
 def _words(view: SurrogateView, environment: str, file: Path | None) -> str:
-    from surrogym_client.surrogates.phases import awaits_log, words_of_no_log
+    from surrogym_client.surrogates.waiting import awaits_log, words_of_no_log
     from surrogym_sampler.original.loading import is_known, sample_command
 
     registered = f"{view.name}: {view.environment or 'own environment'}, {len(view.spec.coordinates)} coordinates"

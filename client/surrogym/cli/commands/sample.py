@@ -354,7 +354,7 @@ def _telling(api: Api, surrogate: str, *, quiet: bool, plain: bool = False) -> I
 
 def _without_queries(view: SurrogateView, output: Output, *, until_done: bool) -> bool:
     """Print a remark if the design has no queries until a log is imported. Returns whether the command ends now."""
-    from surrogym_client.surrogates.phases import awaits_log, words_of_no_log
+    from surrogym_client.surrogates.waiting import awaits_log, words_of_no_log
     from surrogym_sampler.queries.settings import SamplerReport
     from surrogym_shared.terminal import say
 
@@ -370,7 +370,7 @@ def _without_queries(view: SurrogateView, output: Output, *, until_done: bool) -
 
 def _words_of_end(surrogate: str, phase: Phase) -> str:
     """Describe the end of a design while the sampler waits for further queries, such as those of an audit."""
-    from surrogym_client.surrogates.phases import COMPLETED, IN_WORDS
+    from surrogym_client.surrogates.waiting import COMPLETED, IN_WORDS
 
     following = (
         f"; next: surrogym train {surrogate}" if phase in COMPLETED else f": surrogym status {surrogate} says why"
@@ -398,7 +398,7 @@ def _restarts(count: int) -> str:
 
 
 def _words(surrogate: str, report: SamplerReport) -> str:
-    from surrogym_client.surrogates.phases import COMPLETED, IN_WORDS
+    from surrogym_client.surrogates.waiting import COMPLETED, IN_WORDS
 
     others = {name: getattr(report, name) for name in ("failed", "dropped", "refused", "impossible")}
     apart = "".join(f", {count} {outcome}" for outcome, count in others.items() if count)

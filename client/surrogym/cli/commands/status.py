@@ -198,7 +198,7 @@ def _steps(seen: SurrogateSummary) -> str:
 
 def _hint(view: SurrogateView) -> str | None:
     """Return the next step if the surrogate waits for an action of the user; else None."""
-    from surrogym_client.surrogates.phases import awaits_log, words_of_no_log
+    from surrogym_client.surrogates.waiting import awaits_log, words_of_no_log
     from surrogym_sampler.original.loading import sample_command
 
     if view.phase == "from_log":

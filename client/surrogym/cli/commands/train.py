@@ -21,10 +21,10 @@ from surrogym.cli.options import (
     awaited_surrogate,
     connect,
     given_here,
+    push_or_say,
     require_known,
     typed,
 )
-from surrogym.cli.pushing import push_or_say
 from surrogym.cli.train_options import LogOptions, LoopOptions, SearchOptions, SessionOptions, StartOptions
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ def command(
     Example: surrogym train pendulum --out policy.zip --seed 0
     """
     from surrogym_client.runtime.lifetime import exit_with_parent as watch_parent
-    from surrogym_client.surrogates.budget import words_of_rounds
+    from surrogym_client.surrogates.waiting import words_of_rounds
     from surrogym_sampler.original.fitting import check_shape
     from surrogym_sampler.original.loading import env_option, sample_command
     from surrogym_shared.terminal import say
@@ -183,8 +183,8 @@ def _trainable(
         CommandError: the surrogate has no model yet.
     """
     from surrogym.cli.errors import CommandError
-    from surrogym_client.surrogates.phases import COMPLETED
     from surrogym_client.surrogates.waiting import (
+        COMPLETED,
         share_of_design,
         wait_for_design,
         words_of_design,
