@@ -14,7 +14,7 @@ from surrogym_server.api.door import ADMIN, READ, ConcurrencyLimit, DoorRoute, e
 from surrogym_server.api.problems import documented
 from surrogym_server.api.state import Use
 from surrogym_server.convert import resources
-from surrogym_server.convert.numbers import numbers
+from surrogym_server.convert.sessions import numbers
 from surrogym_shared.codes import Code
 from surrogym_shared.wire import Imagine, Imagined, ModelList, ModelView, Points, Prediction, Uncertainty
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from surrogym_server.convert.numbers import as_tuple, numbers
+from surrogym_server.convert.sessions import as_tuple, numbers
 from surrogym_server.convert.stored import read_stored
 from surrogym_server.errors import InvalidInput
 from surrogym_server.sampling.uncertainty import UncertaintyResult
@@ -31,6 +31,11 @@ from surrogym_shared import spec as wire
 from surrogym_shared import wire as replies
 from surrogym_shared.nouns import Query, Vector
 
+# Fields of a summary that are sent as they are stored.
+SUMMARY_FIELDS = (
+    *("name", "environment", "phase", "paused", "round", "model_version", "confidence_index", "target", "budget"),
+    "created_at",
+)
 FIDELITY = "the confidence index with the errors of a model"  # how error messages name a stored fidelity
 
 
@@ -52,15 +57,7 @@ def created(status: SurrogateStatus, *, created: bool) -> replies.CreatedSurroga
 
 
 def checked(name: str, spec: wire.EnvironmentSpec, budget: int, found: Checked) -> replies.CheckedSurrogate:
-    return replies.CheckedSurrogate(
-        name=name,
-        spec=spec,
-        budget=budget,
-        target=spec.design.target,
-        initial=found.initial,
-        outputs=list(found.outputs),
-        exists=found.exists,
-    )
+    return replies.CheckedSurrogate(name=name, spec=spec, budget=budget, target=spec.design.target, **vars(found))
 
 
 def improved(status: SurrogateStatus, raised: int) -> replies.ImprovedSurrogate:
@@ -83,21 +80,12 @@ def _view_fields(status: SurrogateStatus) -> dict[str, Any]:
 def _summary_fields(listed: Listed) -> dict[str, Any]:
     summary = listed.summary
     return {
-        "name": summary.name,
-        "environment": summary.environment,
-        "phase": summary.phase,
-        "paused": summary.paused,
-        "round": summary.round,
+        **{name: getattr(summary, name) for name in SUMMARY_FIELDS},
         "samples": summary.ledger.samples,
-        "model_version": summary.model_version,
-        "confidence_index": summary.confidence_index,
-        "target": summary.target,
-        "budget": summary.budget,
         "ledger": _ledger_fields(summary.ledger),
         "queries": vars(summary.queries),
         "samplers": list(listed.samplers),
         "sessions": listed.sessions,
-        "created_at": summary.created_at,
     }
 
 
@@ -148,20 +136,8 @@ def query_list(records: Iterable[QueryRecord]) -> replies.QueryList:
 
 
 def query_view(record: QueryRecord) -> replies.QueryView:
-    return replies.QueryView(
-        id=record.id,
-        purpose=record.purpose,
-        status=record.status,
-        round=record.round,
-        kind=record.kind,
-        coordinates=list(record.coordinates) or None,
-        actions=_rows(record.actions),
-        snapshot=record.snapshot,
-        attempts=record.attempts,
-        sampler=record.sampler,
-        error=record.error,
-        lease_seconds_left=record.lease_seconds_left,
-    )
+    fields = {"kind": record.kind, "coordinates": record.coordinates or None}
+    return replies.QueryView(**vars(record) | fields)
 
 
 def _rows(actions: Iterable[Vector]) -> list[list[float]]:
@@ -173,12 +149,13 @@ def new_sample(sample: replies.NewSample) -> NewSample:
 
 
 def added_samples(added: Added) -> replies.AddedSamples:
+    stored = added.stored
     return replies.AddedSamples(
-        sample_ids=list(added.ids),
-        duplicates=added.duplicates,
+        sample_ids=list(stored.ids),
+        duplicates=stored.duplicates,
         ledger=ledger(added.ledger),
-        digest=added.digest,
-        restart=added.restart,
+        digest=stored.digest,
+        restart=stored.restart,
     )
 
 

@@ -1,15 +1,15 @@
-"""Conversion for sessions: requests to the engine's types, and the engine's answers to JSON replies and frames."""
+"""Conversion for sessions: requests to the engine's types, and the engine's answers to JSON replies and frames; and
+conversion between arrays and nested lists."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import fields
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from surrogym_server.convert.numbers import numbers
 from surrogym_server.engine.requests import Array, Opening, Reply, SessionInfo
 from surrogym_server.engine.tallies import SessionActivity
 from surrogym_server.environment import definition as core
@@ -22,21 +22,32 @@ from surrogym_shared.network import Layer
 from surrogym_shared.port import PolicyRollout, ResetResult, StepResult
 
 
+def numbers(what: str, rows: Sequence[Any]) -> NDArray[np.float64]:
+    """Convert nested lists of numbers to an array. ``what`` is their name in the error message.
+
+    Raises:
+        InvalidInput: the rows have different lengths.
+    """
+    try:
+        return np.array(rows, dtype=np.float64)
+    except (ValueError, TypeError) as error:
+        raise InvalidInput(f"{what}: expected rows of equal length, got rows of different lengths") from error
+
+
+def as_tuple(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list) else value
+
+
+CONVERTED = {"penalty", "sensor_noise", "residual"}
+# Options of a session that the core takes as they are sent.
+SAME = {field.name for field in fields(VirtualSettings)} & replies.OpenSession.model_fields.keys() - CONVERTED
+
+
 def opening(request: replies.OpenSession) -> Opening:
     settings = VirtualSettings(
-        num_envs=request.num_envs,
-        variant=request.variant,
-        autoreset_mode=request.autoreset_mode,
-        time_limit=request.time_limit,
+        **{name: getattr(request, name) for name in SAME},
         penalty=request.penalty or 0.0,
-        start_box=request.start_box,
-        start_visited=request.start_visited,
-        process_noise=request.process_noise,
         sensor_noise=tuple(sorted(request.sensor_noise.items())),
-        trust=request.trust,
-        particles=request.particles,
-        spread=request.spread,
-        functions=request.functions,
         residual=None if request.residual is None else residual(request.residual),
     )
     return Opening(

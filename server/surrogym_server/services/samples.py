@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from surrogym_server.services.activity import Samplers
 from surrogym_server.services.definitions import Definitions, check_coordinates
 from surrogym_server.services.notices import Notices
 from surrogym_server.storage.port import Storage
-from surrogym_server.storage.records import LedgerRecord, LogPart, NewSample, SampleRecord
+from surrogym_server.storage.records import AddedSamples, LedgerRecord, LogPart, NewSample, SampleRecord
 from surrogym_shared.nouns import Vector
 
 PAGE = 10_000
@@ -23,13 +24,11 @@ BATCH = 500  # steps of a log are stored in batches of this size, each in one da
 LOG = "log"  # steps of a log are stored with this name in place of a sampler's name
 
 
-@dataclass(frozen=True)
-class Added:
-    ids: tuple[int, ...]
-    duplicates: int
+class Added(NamedTuple):
+    """Result of adding samples, and the counts of real steps after it."""
+
+    stored: AddedSamples
     ledger: LedgerRecord
-    digest: str | None = None  # hash of all steps of a log up to the last stored one; None for steps of no log
-    restart: str | None = None
 
 
 @dataclass(frozen=True)
@@ -88,7 +87,7 @@ class SampleService:
             self._withdraw_covered(name, definition)
         self._samplers.heard(name, sampler)
         self._notices.post(name)
-        return Added(added.ids, added.duplicates, self._storage.ledger.read(name), added.digest, added.restart)
+        return Added(added, self._storage.ledger.read(name))
 
     def add_log(self, name: str, samples: Sequence[NewSample], origin: str | None = None) -> AddedLog:
         """Store all steps of a log, in batches. A repeat stores only steps that are not stored yet, for example after
@@ -100,7 +99,7 @@ class SampleService:
         first, duplicates, after = 0, 0, origin
         while first < len(samples):
             batch = samples[first : first + BATCH]
-            added = self.add(name, LOG, batch, None, LogPart(after, complete=first + BATCH >= len(samples)))
+            added = self.add(name, LOG, batch, None, LogPart(after, complete=first + BATCH >= len(samples))).stored
             if added.restart is not None:
                 first, duplicates, after = 0, 0, added.restart
             else:

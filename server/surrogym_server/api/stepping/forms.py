@@ -15,7 +15,7 @@ import msgspec
 from surrogym_server.api.door import parse_as
 from surrogym_server.api.problems import shown
 from surrogym_server.convert import sessions
-from surrogym_server.convert.numbers import numbers
+from surrogym_server.convert.sessions import numbers
 from surrogym_server.engine.port import SessionEngine
 from surrogym_server.engine.requests import Advance, PolicySteps, Reply, Reset, Rollout, Step
 from surrogym_server.engine.session import steps_of
