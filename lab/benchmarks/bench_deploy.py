@@ -40,8 +40,7 @@ from surrogym_shared.network import Layer, Network
 from surrogym_shared.spec import DiscreteAction, EnvironmentSpec
 from surrogym_shared.terms import observe as declared
 from surrogym_trainer.deployment.c import write
-from surrogym_trainer.deployment.c.compiling import running
-from surrogym_trainer.deployment.c.files import prefix_of, sensors_of
+from surrogym_trainer.deployment.c.files import prefix_of, running, sensors_of
 from surrogym_trainer.deployment.controller import Array, Choices, Controller
 from surrogym_trainer.deployment.graph import write as write_onnx
 from surrogym_trainer.deployment.reading import controller_of

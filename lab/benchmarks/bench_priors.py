@@ -38,7 +38,7 @@ from surrogym_lab.reproduce.rows import read_records, write_records
 from surrogym_sampler import original
 from surrogym_sampler.original.episodes import SteppedEpisode
 from surrogym_sampler.original.protocol import RealStep
-from surrogym_sampler.priors.parameters import adjustable
+from surrogym_sampler.priors.calibration import adjustable
 from surrogym_sampler.priors.prior import silent
 from surrogym_server.environment.actions import model_actions
 from surrogym_server.local import LocalSurrogate

@@ -73,7 +73,7 @@ def is_near(margin: Array, now: Array, before: Array) -> Bools:
 
     The sampler's guard and ``surrogym_trainer.deployment.reference`` call this function. Three files write the rule in
     another form, and must agree with it: ``surrogym_server.environment.safety`` for tensors,
-    ``surrogym_trainer.deployment.c.source`` in C, and ``surrogym_trainer.deployment.st.source`` in structured text.
+    ``surrogym_trainer.deployment.c.source`` in C, and ``surrogym_trainer.deployment.st`` in structured text.
     """
     # A limit without ends has infinite distances: inf - inf gives NaN, which fmin ignores.
     with np.errstate(invalid="ignore"):

@@ -11,8 +11,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
 from surrogym_trainer.policies.card import UnusablePolicy
-from surrogym_trainer.policies.files import load_learner, load_policy, save_policy
-from surrogym_trainer.policies.normalisation import statistics_path
+from surrogym_trainer.policies.files import load_learner, load_policy, save_policy, statistics_path
 
 SHOWN = np.array([[1.0, 0.0, 5.0], [-0.3, 0.9, -7.0]], dtype=np.float32)
 SETTINGS = {

@@ -17,12 +17,10 @@ from support.server import ServerProcess
 from surrogym_client.transport import Api
 from surrogym_shared import wire
 from surrogym_shared.spec import Inequality, Success, Term
-from surrogym_trainer.report.cost import cost
 from surrogym_trainer.report.coverage import Cut
-from surrogym_trainer.report.decision import decision
+from surrogym_trainer.report.decision import cost, decision, outcome
 from surrogym_trainer.report.known import Known, chosen_real, chosen_reference, chosen_without
 from surrogym_trainer.report.page import NoPdf, as_pdf
-from surrogym_trainer.report.prediction import outcome
 from surrogym_trainer.report.wording import criterion, original, share
 
 SEED = 10_000

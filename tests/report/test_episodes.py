@@ -7,7 +7,7 @@ import pytest
 
 from surrogym_sampler.original.classic import pendulum
 from surrogym_shared.wire import EpisodeTrace, EvaluationDetail
-from surrogym_trainer.report.episodes import Meet, draw_episodes
+from surrogym_trainer.report.decision import Meet, draw_episodes
 from surrogym_trainer.report.known import with_whole_traces
 
 ONE = [[3.0, 0.0], [-3.0, 0.0], [3.1, 0.0], [-3.1, 0.0]]

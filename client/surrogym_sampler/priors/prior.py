@@ -17,8 +17,7 @@ from surrogym_sampler.original.episodes import draw
 from surrogym_sampler.original.errors import StepRefused, UnknownEnvironment
 from surrogym_sampler.original.loading import Respecified, is_own, make, with_choices
 from surrogym_sampler.original.protocol import Array, OriginalEnvironment, RealStep
-from surrogym_sampler.priors.calibration import Calibration, RealTransitions, calibrate
-from surrogym_sampler.priors.parameters import adjustable, read_parameters
+from surrogym_sampler.priors.calibration import Calibration, RealTransitions, adjustable, calibrate, read_parameters
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.surrogate_file import SurrogateFile
 from surrogym_shared.wire.priors import CalibratedParameter, PriorAbout

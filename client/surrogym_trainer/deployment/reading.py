@@ -130,8 +130,7 @@ def _of_learner(policy: Path, algorithm: str, *, trust: bool) -> Decision:
     """
     from gymnasium import spaces
 
-    from surrogym_trainer.policies.files import read_learner
-    from surrogym_trainer.policies.normalisation import Normalisation, is_normalised, statistics_path
+    from surrogym_trainer.policies.files import Normalisation, is_normalised, read_learner, statistics_path
 
     learner = read_learner(policy, algorithm, trust, {})
     observed, acted = learner.observation_space, learner.action_space

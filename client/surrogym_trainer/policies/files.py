@@ -1,4 +1,8 @@
-"""Readers of policy files that run no code from them: those of Stable-Baselines3, networks of arrays, and ONNX."""
+"""Readers of policy files that run no code from them: those of Stable-Baselines3, networks of arrays, and ONNX.
+
+The file of a policy of Stable-Baselines3 lacks the statistics with which ``VecNormalize`` normalised the
+observations. They are read from a file of arrays beside it, because the file of ``VecNormalize.save`` is pickled.
+"""
 
 from __future__ import annotations
 
@@ -12,17 +16,59 @@ from numpy.typing import NDArray
 
 from surrogym_shared.network import Network
 from surrogym_trainer.policies.card import DEFAULT_ALGORITHM, PolicyCard, UnusablePolicy, read_card
-from surrogym_trainer.policies.normalisation import (
-    Normalisation,
-    is_normalised,
-    missing_statistics,
-    statistics_path,
-)
 from surrogym_trainer.policies.onnx_files import load_onnx
 from surrogym_trainer.policies.predict import Predict
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
+
+Floats = NDArray[np.float32]
+ENDING = ".vecnormalize.npz"
+
+
+def is_normalised(model: BaseAlgorithm) -> bool:
+    """Return whether a policy learned with observations that ``VecNormalize`` normalised: then Stable-Baselines3 also
+    stores the original observation. ``surrogym train`` normalises only rewards, and removes that entry from its
+    files."""
+    return getattr(model, "_last_original_obs", None) is not None
+
+
+def statistics_path(policy: Path) -> Path:
+    """Return the path of the statistics beside a policy, such as ``mine.vecnormalize.npz``."""
+    return policy.with_suffix(ENDING)
+
+
+def missing_statistics(policy: Path) -> UnusablePolicy:
+    """Return the error for a policy without a file of its statistics, with the code that writes one."""
+    arrays = "mean=env.obs_rms.mean, var=env.obs_rms.var, epsilon=env.epsilon, clip=env.clip_obs"
+    return UnusablePolicy(
+        f"{policy} learned in a VecNormalize, whose statistics are not in the file: expected them in "
+        f'{statistics_path(policy)}; with env = VecNormalize.load(...), numpy.savez("{statistics_path(policy)}", '
+        f"{arrays}) writes it (mean=0, var=1, epsilon=0, clip=numpy.inf if it normalised rewards only)"
+    )
+
+
+class Normalisation:
+    """The normalisation of observations as in ``VecNormalize``: (o - mean) / sqrt(var + epsilon), clipped to +-clip."""
+
+    def __init__(self, path: Path) -> None:
+        """Read the statistics from a file. Raises ``UnusablePolicy`` if the file does not contain them."""
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                self.mean, variance, epsilon, self.clip = (
+                    np.asarray(file[name], dtype=np.float64) for name in ("mean", "var", "epsilon", "clip")
+                )
+        except (OSError, ValueError, KeyError) as error:
+            raise UnusablePolicy(
+                f"{path}: expected the arrays mean, var, epsilon and clip ({error}): write the file again"
+            ) from error
+        self.spread = np.sqrt(variance + epsilon)
+
+    def __call__(self, observations: Floats) -> Floats:
+        """Return the normalised observations (N, D)."""
+        scaled = (observations - self.mean) / self.spread
+        return np.clip(scaled, -self.clip, self.clip).astype(np.float32)
+
 
 # settings for loading a policy that only acts; they save memory, because it stores no experience
 BUFFERLESS = {"n_envs": 1, "n_steps": 1, "buffer_size": 1}

@@ -1,25 +1,42 @@
 """The first part of the report, for decisions: cost, result, prediction, doubts, and recommended next steps.
 
 A section with missing data names what is missing, and shows the rest. Each sentence about untested points and next
-steps follows from stored data.
+steps follows from stored data. The cost is that of real steps: each purpose has a line, and the lines add up to the
+total. The result compares the controller with other controllers, from the same starts. Lines in figures of episodes
+differ in stroke, so that they can be distinguished in black and white.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from statistics import fmean
+from typing import Literal, NamedTuple
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from surrogym_client.surrogates.advice import advice, verdict
 from surrogym_sampler.original.loading import env_option, is_known, sample_command
-from surrogym_shared.wire import EvaluationDetail, EvaluationView, OutputFidelity, PolicyView
+from surrogym_shared import intervals
+from surrogym_shared.spec import Coordinate, EnvironmentSpec
+from surrogym_shared.wire import (
+    Controller,
+    EpisodeTrace,
+    EvaluationDetail,
+    EvaluationView,
+    Interval,
+    OutputFidelity,
+    PolicyPromise,
+    PolicyView,
+    SurrogateView,
+)
 from surrogym_shared.words import counted
-from surrogym_trainer.report.comparisons import beside, in_short
-from surrogym_trainer.report.cost import cost, tests
 from surrogym_trainer.report.coverage import Cut
-from surrogym_trainer.report.episodes import draw_episodes, turns
-from surrogym_trainer.report.figures import svg
+from surrogym_trainer.report.figures import WIDTH, svg, with_unit
 from surrogym_trainer.report.html import bullets, moving, on_screen, paragraph, picture, section, table
 from surrogym_trainer.report.known import PREFERRED, Known
-from surrogym_trainer.report.prediction import outcome_of, prediction
 from surrogym_trainer.report.wording import (
     criterion,
     mean,
@@ -285,3 +302,372 @@ def _other_machines(policy: PolicyView) -> bool:
 def _of_the_model(known: Known) -> list[str]:
     said = advice(known.view, known.models)
     return [f"To make the model surer: {said}"] if said else []
+
+
+ACTING: dict[Controller, str] = {
+    "policy": "the controller",
+    "zero": "no controller (an action of zero all the time)",
+    "random": "no controller (random actions)",
+    "reference": "the reference controller",
+}
+
+
+def cost(known: Known) -> str:
+    """Return the report's section about the number of real steps, as HTML."""
+    ledger, policy = known.view.ledger, known.policy
+    counted = [(name, count) for name, count in purposes(known) if count]
+    rows = [*counted, ("all together", sum(count for _, count in counted))]
+    said = [
+        table(("real steps for", "steps"), [(name, f"{count:,}") for name, count in rows], "What was done in reality"),
+        paragraph(plan(known.view)),
+    ]
+    if policy is not None and policy.virtual_steps:
+        said.append(
+            paragraph(
+                f"The controller practised for {policy.virtual_steps:,} steps in the model. They cost computing time "
+                "alone. Without a model, each of them would have been a real step."
+            )
+        )
+    if ledger.logged:
+        said.append(paragraph(f"{steps(ledger.logged)} were recorded before, and cost nothing."))
+    if ledger.unresolved:
+        said.append(paragraph(f"Up to {steps(ledger.unresolved)} more may have been taken by samplers that failed."))
+    return section("What it cost", "".join(said))
+
+
+def purposes(known: Known) -> list[tuple[str, int]]:
+    """Return the number of real steps by purpose; each step is counted once. Steps of logs are left out."""
+    ledger = known.view.ledger
+    return [
+        ("learning the model: the first ones, spread over the declared ranges", ledger.initial),
+        ("learning the model: chosen by the model, where it was unsure", ledger.adaptive),
+        ("learning the model: sent without a query", ledger.manual),
+        ("testing the prediction beforehand (audit)", ledger.audit),
+        *tests(known),
+    ]
+
+
+def tests(known: Known) -> list[tuple[str, int]]:
+    """Return the number of real steps in all evaluation episodes, by controller and starts."""
+    own = [] if known.policy is None else known.policy.evaluations
+    lines = [
+        (f"{counted(one.episodes, 'episode')} with {ACTING[one.controller]}, {starts_of(one)}", one.steps)
+        for one in own
+    ]
+    others = sum(one.steps for policy in known.others for one in policy.evaluations)
+    lines.append((f"episodes with {counted(len(known.others), 'other version')} of the controller", others))
+    unnamed = known.view.ledger.evaluation - sum(count for _, count in lines)
+    return [*lines, ("other real episodes, of which no result is stored", max(unnamed, 0))]
+
+
+def plan(view: SurrogateView) -> str:
+    """Return sentences about the planned and the taken steps for learning the model."""
+    taken, first, allowed = view.ledger.total, view.spec.design.budget, view.budget
+    if not allowed:
+        return "No real step was planned for learning the model: it was learned from recorded ones."
+    said = f"For learning the model, at most {steps(allowed)} were allowed, and {taken:,} were taken."
+    if first is not None and first < allowed:
+        said = (
+            f"For learning the model, {steps(first)} were planned at first. {allowed - first:,} more were allowed "
+            "later, because a training or a person asked for steps where the controller goes. "
+            f"{taken:,} were taken."
+        )
+    return f"{said} {_ended(view, taken, allowed)}".rstrip()
+
+
+def _ended(view: SurrogateView, taken: int, allowed: int) -> str:
+    """Return a sentence about why learning ended; empty if it has not."""
+    if view.phase == "ready" and taken < allowed:
+        return "The rest was not needed, because the model was known well enough."
+    if view.phase == "over_budget":
+        return "Then learning ended, although the model was not yet known well enough everywhere."
+    if view.phase == "unsure":
+        return "Learning ended before that, although the model was not yet known well enough everywhere."
+    return ""
+
+
+SHORT_NAMES = {"zero": "no controller", "random": "random actions", "reference": "reference controller"}
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """The mean returns of two controllers from the same starts.
+
+    Attributes:
+        starts: number of these starts.
+        mine, theirs: mean return of the policy and of the other controller.
+        gain: 95 % interval of the difference; None if the returns of single episodes are not known.
+    """
+
+    starts: int
+    mine: float
+    theirs: float
+    gain: intervals.Interval | None
+
+    @property
+    def shown(self) -> bool:
+        """Whether the interval of the difference excludes 0."""
+        return self.gain is not None and (self.gain.low > 0 or self.gain.high < 0)
+
+
+def compare(real: EvaluationDetail, other: EvaluationDetail) -> Comparison | None:
+    """Compare the mean returns of two controllers over the first starts, as many as both ran; None if their returns
+    are not known."""
+    count = min(real.episodes, other.episodes)
+    if min(len(real.returns), len(other.returns)) >= count:
+        mine, theirs = real.returns[:count], other.returns[:count]
+        return Comparison(
+            count, fmean(mine), fmean(theirs), intervals.of_mean([a - b for a, b in zip(mine, theirs, strict=True)])
+        )
+    return Comparison(count, real.mean, other.mean, None) if real.episodes == other.episodes else None
+
+
+def in_short(real: EvaluationDetail, other: EvaluationDetail) -> str:
+    """Return the comparison with another controller as a sentence."""
+    found, name = compare(real, other), ACTING[other.controller]
+    if found is None:
+        return f"With {name}, {counted(other.episodes, 'episode')} earned {number(other.mean)} on average."
+    starts = f"From {_starts(found.starts, real)}" if found.starts < real.episodes else "From the same starts"
+    return f"{starts}, it earned {number(found.mine)} on average, and {name} earned {number(found.theirs)}."
+
+
+def beside(known: Known) -> str:
+    """Return the report's section that compares episodes with and without the controller, as HTML."""
+    real, title = known.real, "With and without the controller"
+    if real is None:
+        return section(title, paragraph("There is nothing to compare yet."))
+    others = [one for one in (known.without, known.reference) if one is not None]
+    said = "".join(paragraph(_gained(real, other)) for other in others)
+    if known.without is None:
+        said += paragraph("The same starts were not run without the controller.")
+    return section(title, said + _from_one_start(known, real, others))
+
+
+def _gained(real: EvaluationDetail, other: EvaluationDetail) -> str:
+    """Return sentences about the difference in return from another controller."""
+    found, name = compare(real, other), ACTING[other.controller]
+    if found is None:
+        return (
+            f"{counted(real.episodes, 'episode')} with the controller earned {number(real.mean)} on average, and "
+            f"{counted(other.episodes, 'episode')} with {name} earned {number(other.mean)}. Their starts can't be "
+            "compared one by one, because the single episodes are not known."
+        )
+    return (
+        f"From {_starts(found.starts, real)}, the average return was {number(found.mine)} with the controller and "
+        f"{number(found.theirs)} with {name}. {_difference(found)} The {other.steps:,} real steps with {name} are "
+        "counted above."
+    )
+
+
+def _starts(count: int, real: EvaluationDetail) -> str:
+    return f"the first {count} of these {real.episodes} starts" if count < real.episodes else f"the same {count} starts"
+
+
+def _difference(found: Comparison) -> str:
+    gain = found.mine - found.theirs
+    if found.gain is None:
+        return f"That is {number(abs(gain))} {'more' if gain > 0 else 'less'} with it."
+    if not found.shown:
+        return (
+            f"No difference was shown: the controller's gain is {number(gain)} (95 %: {number(found.gain.low)} to "
+            f"{number(found.gain.high)})."
+        )
+    low, high = sorted((abs(found.gain.low), abs(found.gain.high)))
+    more = "more" if gain > 0 else "less"
+    return f"That is {number(abs(gain))} {more} with it (95 %: {number(low)} to {number(high)})."
+
+
+def _from_one_start(known: Known, real: EvaluationDetail, others: Sequence[EvaluationDetail]) -> str:
+    """Return a picture of one episode of each controller from the same state, as HTML; empty if such episodes are not
+    known."""
+    pairs = [(_paired(real), "with the controller"), *((_paired(one), SHORT_NAMES[one.controller]) for one in others)]
+    shown = [(name, trace) for trace, name in pairs if trace is not None]
+    if len(shown) < 2 or len({trace.seed for _, trace in shown}) > 1:
+        return ""
+    alt = f"Coordinates and actions of one episode each, from the same start: {', '.join(name for name, _ in shown)}"
+    words = "They begin in the same state. It is the start from which the controller had its median return."
+    image = svg(draw_episodes(known.view.spec, shown, meet="start"))
+    return picture(image, alt) + paragraph(f"{words} {turns(known.view.spec)}".rstrip())
+
+
+def _paired(evaluation: EvaluationDetail) -> EpisodeTrace | None:
+    return next((trace for trace in evaluation.traces if trace.rank == "paired"), None)
+
+
+class Outcome(NamedTuple):
+    """The result of comparing a prediction with reality.
+
+    Attributes:
+        verdict: ``better`` if the whole interval of the real average lies above the predicted interval, ``worse`` if it
+            lies below, ``perhaps worse`` if only the real average itself lies below, and ``as predicted`` otherwise.
+        beyond: distance of the real average from the predicted interval; 0 if it is inside.
+    """
+
+    verdict: Literal["as predicted", "better", "worse", "perhaps worse"]
+    beyond: float
+
+
+def outcome(promise: PolicyPromise, real: EvaluationView) -> Outcome:
+    """Compare a prediction with real episodes from the declared starts. Differences that vanish by rounding don't
+    count."""
+    low, high = _ends(real.mean_interval)
+    below, above = promise.low - real.mean, real.mean - promise.high
+    if below > 0 and number(real.mean) != number(promise.low):
+        return Outcome("worse" if (real.mean if high is None else high) < promise.low else "perhaps worse", below)
+    if above > 0 and number(real.mean) != number(promise.high) and (real.mean if low is None else low) > promise.high:
+        return Outcome("better", above)
+    return Outcome("as predicted", max(below, above, 0.0))
+
+
+def outcome_of(known: Known) -> Outcome | None:
+    """Return the outcome for the policy of a report; None if there is no promise, or no episodes to which
+    it applies."""
+    promise = None if known.policy is None else known.policy.promise
+    return outcome(promise, known.real) if promise and known.real and known.real.declared else None
+
+
+def prediction(known: Known) -> str:
+    """Return the report's section that compares the policy's promise with its evaluation, as HTML."""
+    policy, real, title = known.policy, known.real, "Was it predicted?"
+    promise = None if policy is None else policy.promise
+    if policy is None or promise is None:
+        return section(title, paragraph("Nothing was predicted." if policy else "There is no controller yet."))
+    ranges = [Range("predicted, 90 %", promise.median, promise.low, promise.high)]
+    said = ["Nobody judged the prediction."]
+    if policy.trusted is not None:
+        said = [f"The prediction was {'trusted' if policy.trusted else 'not trusted'}: {policy.reason}."]
+    found = outcome_of(known)
+    if found is None or real is None:
+        said.append("It has not been compared with reality from the same kind of starts.")
+    else:
+        ranges.append(_range("real", real))
+        said.append(_words(found, promise, real))
+    ranges += [_range(SHORT_NAMES[one.controller], one) for one in (known.without, known.reference) if one is not None]
+    alt = "; ".join(f"{one.label}: {number(one.value)}" for one in ranges)
+    picture_ = picture(svg(draw_ranges(ranges, "average return")), alt)
+    return section(title, paragraph(" ".join(said)) + picture_ + paragraph(_caption(real)))
+
+
+def _words(found: Outcome, promise: PolicyPromise, real: EvaluationView) -> str:
+    predicted = f"{number(promise.low)} to {number(promise.high)}"
+    match found.verdict:
+        case "worse":
+            return f"Reality was worse than predicted, by {number(found.beyond)} beyond the interval of {predicted}."
+        case "better":
+            return f"Reality was better than predicted, by {number(found.beyond)} beyond the interval of {predicted}."
+        case "perhaps worse":
+            return (
+                f"The real average lies {number(found.beyond)} below the predicted interval of {predicted}. This may "
+                f"be chance: the interval of {counted(real.episodes, 'real episode')} overlaps with the predicted one."
+            )
+        case _ if found.beyond > 0:
+            return "Reality came out as predicted: the intervals of the real and of the predicted average overlap."
+        case _:
+            return "Reality came out as predicted: the real average lies within the predicted interval."
+
+
+def _caption(real: EvaluationView | None) -> str:
+    words = "A dot is an average, and a line is its interval. Farther right is better."
+    return words if real is None else f"{words} Rows with fewer episodes have the first of the same starts."
+
+
+def _range(label: str, one: EvaluationView) -> Range:
+    return Range(f"{label}, {counted(one.episodes, 'episode')}, 95 %", one.mean, *_ends(one.mean_interval))
+
+
+def _ends(interval: Interval | None) -> tuple[float | None, float | None]:
+    return (None, None) if interval is None else (interval.low, interval.high)
+
+
+Array = NDArray[np.float64]
+Meet = Literal["start", "end"]
+TURN = 2 * np.pi
+
+
+class Stroke(NamedTuple):
+    """The look of a line: colour, style and width."""
+
+    colour: str
+    style: str
+    width: float
+
+
+STROKES = (Stroke("black", "-", 1.6), Stroke("#2457c5", "--", 1.4), Stroke("#b3261e", ":", 2.0))
+
+
+class Range(NamedTuple):
+    """A mean return of one kind of episodes, with its interval."""
+
+    label: str
+    value: float
+    low: float | None
+    high: float | None
+
+
+def draw_episodes(spec: EnvironmentSpec, shown: Sequence[tuple[str, EpisodeTrace]], meet: Meet = "end") -> Figure:
+    """Draw coordinates and actions over the steps, one line for each of at most three episodes.
+
+    Angles are drawn without jumps. At the step ``meet`` (the first or the last), the lines of an angle are shifted by
+    full turns to be as near to each other as possible.
+    """
+    actions = len(shown[0][1].action[0]) if shown[0][1].action else 0
+    labels = [
+        *map(with_unit, spec.coordinates),
+        *(f"action {i + 1}" if actions > 1 else "action" for i in range(actions)),
+    ]
+    figure = Figure(figsize=(1.5 * WIDTH, 1.5 * len(labels) + 0.6), layout="constrained")
+    grid = figure.subplots(len(labels), 1, sharex=True, squeeze=False)[:, 0]
+    first = shown[0][1].coordinates[_place(meet)]
+    for (name, trace), stroke in zip(shown, STROKES, strict=False):
+        states, given = np.array(trace.coordinates), np.array(trace.action).reshape(len(trace.action), -1)
+        lines = [unbroken(c, states[:, i], meet, first[i]) for i, c in enumerate(spec.coordinates)]
+        lines += [given[:, i] for i in range(actions)]
+        for axes, line in zip(grid, lines, strict=True):
+            axes.plot(line, color=stroke.colour, linestyle=stroke.style, linewidth=stroke.width, label=name)
+    for axes, label in zip(grid, labels, strict=True):
+        axes.set(ylabel=label)
+        axes.grid(alpha=0.3)
+    grid[-1].set(xlabel="step")
+    figure.align_ylabels()
+    handles, names = grid[0].get_legend_handles_labels()
+    figure.legend(handles, names, loc="outside upper left", ncols=3, frameon=False)
+    return figure
+
+
+def turns(spec: EnvironmentSpec) -> str:
+    """Return a sentence about how angles are drawn; empty if there is no angle."""
+    if all(coordinate.kind != "angle" for coordinate in spec.coordinates):
+        return ""
+    return "Angles are drawn without a jump after a full turn: values that are 6.28 rad apart are the same position."
+
+
+def draw_ranges(ranges: Sequence[Range], label: str) -> Figure:
+    """Draw numbers with their intervals one below the other, on one axis."""
+    figure = Figure(figsize=(1.5 * WIDTH, 0.55 * len(ranges) + 0.9), layout="constrained")
+    axes = figure.add_subplot()
+    places = list(range(len(ranges)))[::-1]
+    for place, one in zip(places, ranges, strict=True):
+        if one.low is not None and one.high is not None:
+            axes.plot([one.low, one.high], [place, place], color="black", linewidth=2, marker="|", markersize=12)
+        axes.plot([one.value], [place], color="black", marker="o", markersize=8, linestyle="none")
+        axes.annotate(f"{one.value:.4g}", (one.value, place), (0, 9), textcoords="offset points", ha="center")
+    axes.set(yticks=places, yticklabels=[one.label for one in ranges], ylim=(-0.6, len(ranges) - 0.3), xlabel=label)
+    axes.margins(x=0.12)
+    axes.grid(axis="x", alpha=0.3)
+    return figure
+
+
+def unbroken(coordinate: Coordinate, values: Array, meet: Meet, to: float) -> Array:
+    """Return the values (n,) of a coordinate for a picture. An angle is continued without jumps from pi to -pi, and
+    shifted by full turns so that it is as near to ``to`` as possible at the step ``meet``."""
+    if coordinate.kind != "angle":
+        return values
+    turned = np.unwrap(values)
+    away = np.round((turned[_place(meet)] - to) / TURN)
+    shown: Array = turned - TURN * away
+    return shown
+
+
+def _place(meet: Meet) -> int:
+    """Return the index of the step at which drawn lines of an angle are to coincide: the first or the last."""
+    return 0 if meet == "start" else -1

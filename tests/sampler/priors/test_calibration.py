@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from support.hinge import Backwards, Broken, Real, Textbook, hinge_spec, steps_of
-from surrogym_sampler.priors.calibration import Calibration, NotCalibrated, RealTransitions, calibrate
-from surrogym_sampler.priors.parameters import Parameter
+from surrogym_sampler.priors.calibration import Calibration, NotCalibrated, Parameter, RealTransitions, calibrate
 
 RANGES = (Parameter("mass", 0.5, 2.0), Parameter("length", 0.5, 2.0), Parameter("friction", 0.1, 0.8))
 TRUE = {"mass": Real.mass, "length": Real.length, "friction": Real.friction}

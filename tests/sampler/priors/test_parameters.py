@@ -7,7 +7,7 @@ import pytest
 from support.hinge import Textbook
 from surrogym_sampler import original
 from surrogym_sampler.original.errors import UnknownEnvironment
-from surrogym_sampler.priors.parameters import Parameter, adjustable, read_parameters
+from surrogym_sampler.priors.calibration import Parameter, adjustable, read_parameters
 
 
 def test_numeric_attributes_of_a_simulator_are_its_parameters():

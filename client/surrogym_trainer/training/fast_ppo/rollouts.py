@@ -13,8 +13,7 @@ from surrogym_client.environments.acting import ActingLanes
 from surrogym_client.environments.lanes import Lanes
 from surrogym_shared.acting import NoiseKey
 from surrogym_shared.port import PolicyRollout
-from surrogym_trainer.training.fast_ppo.learner import Batch, Learner
-from surrogym_trainer.training.fast_ppo.mlp import Array
+from surrogym_trainer.training.fast_ppo.learner import Array, Batch, Learner
 
 LARGEST_REWARD = 10.0  # largest absolute reward after scaling
 LATEST_EPISODES = 100

@@ -1,7 +1,8 @@
-"""A controller as one function block of structured text, with its numbers in constant arrays.
+"""The target ``st``: a controller as one function block of structured text of IEC 61131-3, for programmable logic
+controllers, with its numbers in constant arrays.
 
-``surrogym_trainer.deployment.reference`` computes the same in NumPy. Names avoid the keywords of IEC 61131-3, such as
-ACTION and STEP. The block calls no functions other than EXP, SIN, COS, TRUNC and conversions of types.
+``surrogym_trainer.deployment.reference`` computes the same in NumPy. Names avoid the keywords of IEC 61131-3, such
+as ACTION and STEP. The block calls no functions other than EXP, SIN, COS, TRUNC and conversions of types.
 
 Shapes: R measurements, D observation entries, A outputs, F action entries.
 """
