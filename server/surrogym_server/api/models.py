@@ -59,7 +59,7 @@ def list_all(name: str, use: Use) -> ModelList:
 def get(name: str, version: int, use: Use, format: Literal["json", "safetensors"] = "json") -> ModelView | Response:
     """Return a model's structure and fidelity, or with ``format=safetensors`` the complete model as a file."""
     if format == "json":
-        return resources.model_view(use.models.get(name, version))
+        return resources.model_view(use.storage.models.get(name, version))
     return Response(use.models.export(name, version), media_type=SAFETENSORS)
 
 

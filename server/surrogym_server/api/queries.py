@@ -129,4 +129,4 @@ def withdraw(name: str, body: Annotated[WithdrawQueries, example(examples.WITHDR
 def list_all(name: str, use: Use, status: Annotated[list[QueryStatus], Query()] = []) -> QueryList:  # noqa: B006
     """List the queries of a surrogate, oldest first. With ``status``, which can be given several times, list only the
     queries that have one of these statuses."""
-    return resources.query_list(use.queries.list(name, status))
+    return resources.query_list(use.storage.queries.list(name, status))

@@ -97,7 +97,7 @@ def samples(
 )
 def snapshots(name: str, use: Use) -> SnapshotList:
     """List the snapshots (saved states to which a sampler can return), oldest first. ``add_sample`` adds snapshots."""
-    return resources.snapshot_list(use.samples.snapshots(name))
+    return resources.snapshot_list(use.storage.snapshots.all(name))
 
 
 @router.post(
@@ -123,7 +123,10 @@ def drop_snapshots(
 def report(name: str, body: Annotated[ReportSteps, example(examples.LEDGER)], use: Use) -> Ledger:
     """Report real steps of an evaluation, which are counted separately from those of the design. Reports with the same
     idempotency key count once."""
-    return resources.ledger(use.samples.report_steps(name, body.steps, body.episodes, body.note, body.idempotency_key))
+    counts = use.storage.ledger.report(
+        name, body.steps, key=body.idempotency_key, episodes=body.episodes, note=body.note
+    )
+    return resources.ledger(counts)
 
 
 def _attachment(name: str) -> dict[str, str]:

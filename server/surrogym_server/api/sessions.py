@@ -47,7 +47,7 @@ async def open_session(name: str, body: Annotated[OpenSession, example(examples.
     """Open a session: a virtual environment with N lanes, a seed, a variant and an autoreset mode. The reply has the
     observation and action spaces and the seed."""
     session = await use.sessions.open(name, sessions.opening(body))
-    return sessions.session_view(session, use.sessions.idle_seconds, use.sessions.replay)
+    return sessions.session_view(session, use.engine.idle_seconds, use.engine.replay)
 
 
 @router.get(
@@ -65,7 +65,7 @@ async def list_sessions(name: str, use: Use) -> SessionList:
 @router.get("/sessions/{id}", summary="Describe a session", dependencies=[TRAIN], responses=documented(*SESSION_ERRORS))
 async def get_session(id: str, use: Use) -> SessionView:
     """Return a session's options, the last sequence number that was answered, and the model version of each lane."""
-    return sessions.session_view(await use.sessions.get(id), use.sessions.idle_seconds, use.sessions.replay)
+    return sessions.session_view(await use.sessions.get(id), use.engine.idle_seconds, use.engine.replay)
 
 
 @router.get(
@@ -76,7 +76,7 @@ async def get_session(id: str, use: Use) -> SessionView:
 )
 async def session_coordinates(id: str, use: Use) -> SessionCoordinates:
     """Return the present coordinates of each lane. The original environment can be set to such coordinates."""
-    return sessions.session_coordinates(await use.sessions.coordinates(id))
+    return sessions.session_coordinates(await use.engine.coordinates(id))
 
 
 @router.delete(
@@ -88,7 +88,7 @@ async def session_coordinates(id: str, use: Use) -> SessionCoordinates:
 )
 async def close_session(id: str, use: Use) -> Response:
     """Close a session. Does nothing if the session has ended already."""
-    await use.sessions.close(id)
+    await use.engine.close(id)
     return Response(status_code=204)
 
 

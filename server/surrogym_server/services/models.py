@@ -98,10 +98,6 @@ class ModelService:
         self._storage.surrogates.get(name)
         return self._storage.models.list(name)
 
-    def get(self, name: str, version: int) -> ModelRecord:
-        """Return the stored record of a model, without the model itself. Raises ``UnknownModel``."""
-        return self._storage.models.get(name, version)
-
     def export(self, name: str, version: int) -> bytes:
         """Return a model as a safetensors file. Raises ``UnknownModel`` or ``Damaged``."""
         return stored_model(self._storage, name, version)

@@ -14,7 +14,7 @@ from surrogym_server.services.notices import Notices
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import LeasedQuery, QueryRecord
 from surrogym_shared.nouns import Query
-from surrogym_shared.states import ENDED, Phase, Purpose, QueryStatus
+from surrogym_shared.states import ENDED, Phase, Purpose
 
 
 @dataclass(frozen=True)
@@ -140,11 +140,6 @@ class QueryService:
         if withdrawn:
             self._notices.post(name)
         return withdrawn
-
-    def list(self, name: str, statuses: Sequence[QueryStatus]) -> list[QueryRecord]:
-        """Return the queries of the surrogate ``name`` whose status is in ``statuses``, or all if this is empty, oldest
-        first."""
-        return self._storage.queries.list(name, statuses)
 
 
 def _finished_since(first: Claim, now: Claim) -> bool:

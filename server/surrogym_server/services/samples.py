@@ -17,7 +17,6 @@ from surrogym_server.services.definitions import Definitions, check_coordinates
 from surrogym_server.services.notices import Notices
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import AddedSamples, LedgerRecord, LogPart, NewSample, SampleRecord
-from surrogym_shared.nouns import Vector
 
 PAGE = 10_000
 BATCH = 500  # steps of a log are stored in batches of this size, each in one database transaction
@@ -127,10 +126,6 @@ class SampleService:
         """Return up to ``limit`` samples with an id above ``after``, in order. Raises ``UnknownSurrogate``."""
         return self._storage.samples.page(name, after, limit)
 
-    def snapshots(self, name: str) -> dict[str, Vector]:
-        """Return the coordinates (C,) of each snapshot (saved state) to which samplers can return, by its name."""
-        return self._storage.snapshots.all(name)
-
     def drop_snapshots(self, name: str, snapshots: Sequence[str]) -> int:
         """Remove snapshots that no sampler holds any more, and return the number removed. Queries that begin at a
         removed snapshot are replaced by new queries."""
@@ -149,11 +144,6 @@ class SampleService:
     def coordinate_names(self, name: str) -> tuple[str, ...]:
         """Return the names of a surrogate's coordinates, in their order in a sample."""
         return self._definitions.get(name).coordinate_names
-
-    def report_steps(self, name: str, steps: int, episodes: int, note: str, key: str) -> LedgerRecord:
-        """Add ``steps`` real steps of an evaluation of ``episodes`` episodes to the surrogate's counts, once for each
-        key. Return the counts. ``note`` is a text about the evaluation."""
-        return self._storage.ledger.report(name, steps, key=key, episodes=episodes, note=note)
 
 
 def check_trajectories(samples: Sequence[NewSample]) -> None:

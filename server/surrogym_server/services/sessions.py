@@ -39,16 +39,6 @@ class SessionService:
         self._definitions = definitions
         self._engine = engine
 
-    @property
-    def idle_seconds(self) -> float:
-        return self._engine.idle_seconds
-
-    @property
-    def replay(self) -> int:
-        """Number of a session's last requests that a client should keep, to repeat them if the session goes back to a
-        checkpoint."""
-        return self._engine.replay
-
     async def open(self, surrogate: str, opening: Opening) -> SessionInfo:
         """Open a session of a surrogate. Raises ``UnknownSurrogate``, and the errors of ``SessionEngine.open``."""
         return await self._engine.open(await asyncio.to_thread(self._request, surrogate, opening))
@@ -67,14 +57,6 @@ class SessionService:
                 f"session {id!r} has lost its last steps, because the process that ran it died: open a new session"
             )
         return info
-
-    async def coordinates(self, id: str) -> Array:
-        """Return the coordinates of all lanes, (N, C). Raises ``UnknownSession`` or ``SessionExpired``."""
-        return await self._engine.coordinates(id)
-
-    async def close(self, id: str) -> None:
-        """End a session. Does nothing if the session has ended already."""
-        await self._engine.close(id)
 
     async def submit_occupancy(self, id: str, checkpoint: str) -> tuple[int, float]:
         """Store the states that a session visited, under the name ``checkpoint``.
