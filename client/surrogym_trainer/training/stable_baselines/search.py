@@ -236,7 +236,7 @@ class Checking(BaseCallback):
         # the best learner, and its parameters at the check
         self._kept: tuple[BaseAlgorithm, dict[str, Any]] | None = None
         self._penalty = self._size = 0.0
-        self._penalties: deque[float] = deque(maxlen=100)  # penalties of the last episodes
+        self._penalties: deque[float] = deque(maxlen=100)  # penalties for uncertainty of the last episodes
         self._checked = 0  # number of checks that were due so far
         self.steps = self.lost = 0
 
