@@ -50,7 +50,7 @@ def block_of(controller: Controller) -> Block:
         )
     prefix = prefix_of(controller)
     names = {"prefix": prefix, "PREFIX": prefix.upper(), "fallback": ", ".join(map(number, controller.fallback))}
-    glue = Template(files(__package__).joinpath("block.c.txt").read_text(encoding="utf-8")).substitute(names)
+    glue = Template(files(__package__).joinpath("fmu_block.c.txt").read_text(encoding="utf-8")).substitute(names)
     digests = ", ".join(f"{name} {value[:16]}" for name, value in sorted(controller.digests.items()))
     return Block(
         name=f"{prefix}_controller",
@@ -72,8 +72,8 @@ def _sources(controller: Controller) -> dict[str, str]:
 
 
 def _variables(controller: Controller) -> Iterator[Variable]:
-    """Yield all variables of a controller's FMU, in the order in which ``block.c.txt`` reads their values. If a name is
-    already used, the variable's kind is put before the name."""
+    """Yield all variables of a controller's FMU, in the order in which ``fmu_block.c.txt`` reads their values. If a
+    name is already used, the variable's kind is put before the name."""
     free = Names().free
     for one in controller.measurements:
         about = f"measurement, from {one.lowest:.6g} to {one.highest:.6g}"
