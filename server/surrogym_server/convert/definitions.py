@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import math
-
 from surrogym_server.environment import definition as core
-from surrogym_server.environment import distributions
 from surrogym_server.environment.observation_inverse import ObservationInverse
-from surrogym_server.errors import InvalidSpec
 from surrogym_server.models.registry import GAUSSIAN_PROCESS, in_full, learner_of
 from surrogym_server.plugins import Choice
 from surrogym_server.sampling.acquisition import check_acquisition
@@ -38,7 +34,8 @@ def stored_definition(spec: wire.EnvironmentSpec) -> core.EnvironmentDefinition:
         InvalidSpec: the preset can't represent this environment.
     """
     definition = core.EnvironmentDefinition(
-        coordinates=tuple(_coordinate(c, spec) for c in spec.coordinates),
+        coordinates=spec.coordinates,
+        start=tuple(spec.start[name] for name in spec.coordinate_names),
         observation=spec.observation,
         action=_action(spec.action),
         termination_groups=spec.termination_groups,
@@ -114,38 +111,6 @@ def _choice(given: str | wire.Choice | None, usual: str) -> Choice:
 def _max_rollout(spec: wire.EnvironmentSpec) -> int:
     longest = spec.max_rollout or LONGEST_ROLLOUT
     return longest if spec.time_limit is None else min(longest, spec.time_limit)
-
-
-def _coordinate(coordinate: wire.Coordinate, spec: wire.EnvironmentSpec) -> core.CoordinateDefinition:
-    bounds = coordinate.bounds
-    stops = None if bounds is None or bounds.stops is None else spec.coordinate_names.index(bounds.stops)
-    return core.CoordinateDefinition(
-        name=coordinate.name,
-        kind=coordinate.kind,
-        sampling=_distribution(coordinate.sampling),
-        start=_distribution(spec.start[coordinate.name]),
-        low=-math.inf if bounds is None else _or(bounds.low, -math.inf),
-        high=math.inf if bounds is None else _or(bounds.high, math.inf),
-        stops=stops,
-        lag=None if coordinate.lag is None else _lag(coordinate.lag, spec.coordinate_names),
-    )
-
-
-def _lag(lag: wire.Lag, names: tuple[str, ...]) -> core.LagDefinition:
-    if lag.entry is not None:
-        return core.LagDefinition(lag.kind, lag.entry)
-    return core.LagDefinition(lag.kind, 0 if lag.of is None else names.index(lag.of))
-
-
-def _distribution(distribution: wire.Uniform | wire.Normal | wire.Fixed) -> distributions.Distribution:
-    match distribution:
-        case wire.Uniform(low=low, high=high):
-            return distributions.UniformDefinition(low, high)
-        case wire.Normal(mean=mean, std=std):
-            return distributions.NormalDefinition(mean, std, *distribution.limits)
-        case wire.Fixed(value=value):
-            return distributions.FixedDefinition(value)
-    raise InvalidSpec(f"distribution of a coordinate: expected uniform, normal or fixed, got {distribution!r}")
 
 
 def _penalty(spec: wire.EnvironmentSpec) -> float:

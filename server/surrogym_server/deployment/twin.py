@@ -15,13 +15,15 @@ import torch
 
 from surrogym_server.convert import stored_definition
 from surrogym_server.engine.requests import limits_rewards
-from surrogym_server.environment.definition import CoordinateDefinition, EnvironmentDefinition
+from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_server.environment.distributions import quantile
 from surrogym_server.errors import InvalidInput
 from surrogym_server.models.abilities import StepSource, WrittenInC, offers
 from surrogym_server.models.files import from_bytes
 from surrogym_server.models.port import DynamicsModel
 from surrogym_server.virtual import reward_limits
 from surrogym_shared.fmu import Block, Causality, Names, Variable, WrittenFmu, write_fmu
+from surrogym_shared.spec import Coordinate
 from surrogym_shared.surrogate_file import SurrogateFile
 
 MOST_NUMBERS = 4_000_000  # models with more numbers are refused: C code of this size takes a minute and 1 GB to compile
@@ -70,7 +72,7 @@ def twin_of(file: SurrogateFile, period: float | None = None) -> Block:
     return Block(
         name=file.name,
         description=f"Surrogate {file.name}: {model.samples} real steps, model {model.digest[:16]}",
-        variables=tuple(_variables(definition, [c.unit for c in file.spec.coordinates])),
+        variables=tuple(_variables(definition)),
         period=seconds,
         stop=None if definition.time_limit is None else definition.time_limit * seconds,
         sources={**source.files, **own},
@@ -110,9 +112,8 @@ def _source_of(model: DynamicsModel) -> StepSource:
     return source
 
 
-def _variables(definition: EnvironmentDefinition, units: Sequence[str]) -> Iterator[Variable]:
-    """Yield the variables of the FMU, in the order of the values in ``twin.c``. ``units`` has a unit for each
-    coordinate.
+def _variables(definition: EnvironmentDefinition) -> Iterator[Variable]:
+    """Yield the variables of the FMU, in the order of the values in ``twin.c``.
 
     If two have the same name, the second gets its kind as a prefix, such as ``observation``.
     """
@@ -127,7 +128,7 @@ def _variables(definition: EnvironmentDefinition, units: Sequence[str]) -> Itera
             low, high = action.low[entry], action.high[entry]
             yield Variable(name, "Float64", "input", min(max(0.0, low), high), low, high)
     for index, coordinate in enumerate(definition.coordinates):
-        yield _coordinate(coordinate, free(coordinate.name, "state"), units[index], _start(definition, index))
+        yield _coordinate(coordinate, free(coordinate.name, "state"), _start(definition, index))
     for name in definition.observation_names:
         yield Variable(free(name, "observation"), "Float64", "output", description="observation")
     for name in definition.outputs:
@@ -138,9 +139,9 @@ def _variables(definition: EnvironmentDefinition, units: Sequence[str]) -> Itera
     yield Variable(free("terminated", "twin"), "Boolean", "output", description=about)
 
 
-def _coordinate(coordinate: CoordinateDefinition, name: str, unit: str, start: float) -> Variable:
-    low, high = (limit if math.isfinite(limit) else None for limit in (coordinate.low, coordinate.high))
-    unit = unit or ("rad" if coordinate.kind == "angle" else "")
+def _coordinate(coordinate: Coordinate, name: str, start: float) -> Variable:
+    low, high = (limit if math.isfinite(limit) else None for limit in coordinate.saturation)
+    unit = coordinate.unit or ("rad" if coordinate.kind == "angle" else "")
     causality: Causality = "parameter" if coordinate.kind == "constant" else "output"
     return Variable(name, "Float64", causality, start, low, high, unit, "coordinate of the state")
 
@@ -151,7 +152,7 @@ def _start(definition: EnvironmentDefinition, index: int) -> float:
     if definition.starts:
         return definition.starts[0][index]
     middle = torch.tensor(0.5, dtype=torch.float64)
-    return float(definition.coordinates[index].start.quantile(middle))
+    return float(quantile(definition.start[index], middle))
 
 
 def _header(definition: EnvironmentDefinition, model: DynamicsModel, rewards: tuple[float, float]) -> Iterator[str]:
@@ -165,8 +166,9 @@ def _header(definition: EnvironmentDefinition, model: DynamicsModel, rewards: tu
     yield f"#define REWARD_HIGH {_written(rewards[1])}"
     yield _array("action_low", low)
     yield _array("action_high", high)
-    yield _array("state_low", [max(one.low, -_LARGEST) for one in coordinates])
-    yield _array("state_high", [min(one.high, _LARGEST) for one in coordinates]) + "\n"
+    low, high = zip(*(one.saturation for one in coordinates), strict=True)
+    yield _array("state_low", [max(one, -_LARGEST) for one in low])
+    yield _array("state_high", [min(one, _LARGEST) for one in high]) + "\n"
 
 
 _LARGEST = torch.finfo(torch.float64).max  # replaces infinite bounds, so that the FMU refuses an infinite start value

@@ -1,14 +1,13 @@
 """EnvironmentDefinition: one environment in the form with which the core computes.
 
 A specification (``surrogym_shared.spec``) is what a person writes: it leaves defaults open, and is checked when it is
-made. A definition is derived from it, only in ``convert.definitions``: it has every default. Both have the same terms,
-inequalities, rewards and limits, of the frozen types in ``surrogym_shared.spec``. The core makes none of them. What a
-step needs is compiled from them when it is first used, with an index in place of each name.
+made. A definition is derived from it, only in ``convert.definitions``: it has every default. Both have the same
+coordinates, distributions, terms, inequalities, rewards and limits, of the frozen types in ``surrogym_shared.spec``,
+which the core makes nowhere. What a step needs is compiled when it is first used, with an index in place of each name.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -21,52 +20,19 @@ from torch import Tensor
 
 from surrogym_server.environment.conditions import Conditions
 from surrogym_server.environment.declared_reward import RewardFunction
-from surrogym_server.environment.distributions import Distribution
+from surrogym_server.environment.distributions import Distribution, quantiles
 from surrogym_server.environment.safety import LimitSet
 from surrogym_server.environment.terms import TermSet, compile_terms
 from surrogym_server.plugins import Choice
 from surrogym_server.tensors import CPU, cached, to_device
-from surrogym_shared.kinds import CoordinateKind, LagKind, RewardTiming
+from surrogym_shared.kinds import RewardTiming
 from surrogym_shared.presets import InputProbability, Moves, Stopping, Tolerance
-from surrogym_shared.spec import DeclaredReward, Inequality, Limits, ObservationEntry, Reward
+from surrogym_shared.spec import Coordinate, DeclaredReward, Inequality, Limits, ObservationEntry, Reward, limits
 
 REWARD = "reward"
 REACH = 1e6  # a prediction without a bound is clipped at this many widths of the sampling range beyond that range
 SCALING_POINTS = 4_096  # mean and standard deviation of the observation are computed from this many sampled states
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class LagDefinition:
-    """Kind and source of the past value that a coordinate (a lag) repeats; ``spec.Lag`` explains the kinds."""
-
-    kind: LagKind
-    source: int = 0  # index of the coordinate, or of the action entry, whose past value this coordinate repeats
-
-
-@dataclass(frozen=True)
-class CoordinateDefinition:
-    """One coordinate of the state: its name, distributions and bounds, and the past value that it repeats, if any."""
-
-    name: str
-    kind: CoordinateKind
-    sampling: Distribution  # distribution of the coordinate in queries (requested real steps)
-    start: Distribution  # distribution of the coordinate in the first state of an episode
-    low: float = -np.inf  # lower bound, at which the coordinate stays if the dynamics would move it further
-    high: float = np.inf  # upper bound, at which the coordinate stays if the dynamics would move it further
-    stops: int | None = None  # index of another coordinate, which becomes 0 at a bound of this one: speed at a wall
-    lag: LagDefinition | None = None
-
-    @property
-    def saturates(self) -> bool:
-        return bool(np.isfinite(self.low) or np.isfinite(self.high))
-
-    @property
-    def settable(self) -> tuple[float, float]:
-        """Range of values to which the original environment can be set. Each end is the bound, or the end of the
-        sampling range if there is no bound on this side."""
-        low = self.low if np.isfinite(self.low) else self.sampling.low
-        return low, self.high if np.isfinite(self.high) else self.sampling.high
 
 
 @dataclass(frozen=True)
@@ -156,7 +122,8 @@ class RateDefinition:
 class EnvironmentDefinition:
     """One environment, with C coordinates, D observation entries and F action entries."""
 
-    coordinates: tuple[CoordinateDefinition, ...]
+    coordinates: tuple[Coordinate, ...]
+    start: tuple[Distribution, ...]  # (C,) distribution of each coordinate in the first state of an episode
     observation: tuple[ObservationEntry, ...]
     action: ActionDefinition
     termination_groups: tuple[tuple[Inequality, ...], ...]
@@ -173,7 +140,7 @@ class EnvironmentDefinition:
     # state, so that a query is a single step.
     max_rollout: int | None = None
     snapshots: bool = False  # whether a query may begin at a snapshot (a saved state) instead of a reset
-    # States at which episodes start; if there are none, starts are drawn from the coordinates' distributions ``start``.
+    # States at which episodes start; if there are none, starts are drawn from the distributions ``start``.
     starts: tuple[tuple[float, ...], ...] = ()
     # A virtual episode that leaves the sampling range ends, and gets this reward for each step up to the time limit.
     # None: leaving the range does not end an episode.
@@ -224,7 +191,7 @@ class EnvironmentDefinition:
     def moving(self) -> tuple[int, ...]:
         """Indices of the coordinates that the dynamics move: all except constants and lags (they repeat a past
         value)."""
-        return tuple(i for i, c in enumerate(self.coordinates) if c.kind != "constant" and c.lag is None)
+        return tuple(i for i, c in enumerate(self.coordinates) if c.moves)
 
     @cached_property
     def lags(self) -> tuple[int, ...]:
@@ -235,24 +202,43 @@ class EnvironmentDefinition:
     def ages(self) -> tuple[int, ...]:
         """Number of steps that each coordinate looks back, (C,); 0 for coordinates that repeat no past value."""
         ages: list[int] = []
-        for c in self.coordinates:
+        for c, source in zip(self.coordinates, self.sources, strict=True):
             if c.lag is None or c.lag.kind == "steps":
                 ages.append(0)
             else:
-                ages.append(1 + (ages[c.lag.source] if c.lag.kind == "value" else 0))
+                ages.append(1 + (ages[source] if c.lag.kind == "value" else 0))
         return tuple(ages)
+
+    @cached_property
+    def sources(self) -> tuple[int, ...]:
+        """Index, in [coordinates, action], of the value from which each coordinate that is a lag follows, (C,). A
+        counter of steps follows from itself. Coordinates that are no lags have their own index."""
+        names, sources = self.coordinate_names, list(range(len(self.coordinates)))
+        for index in self.lags:
+            lag = self.coordinates[index].lag
+            if lag is not None and lag.of is not None:
+                sources[index] = names.index(lag.of)
+            elif lag is not None and lag.entry is not None:
+                sources[index] = len(names) + lag.entry
+        return tuple(sources)
+
+    @cached_property
+    def stopped(self) -> tuple[int | None, ...]:
+        """Index of the coordinate that becomes 0 at the bounds of each coordinate, such as the speed at a wall, (C,);
+        None for a coordinate that is no wall."""
+        stops = [None if c.bounds is None else c.bounds.stops for c in self.coordinates]
+        return tuple(None if name is None else self.coordinate_names.index(name) for name in stops)
 
     @cached_property
     def counter(self) -> int | None:
         """Index of the coordinate that counts the steps since a reset; None if there is none."""
-        counting = [i for i in self.lags if (lag := self.coordinates[i].lag) is not None and lag.kind == "steps"]
-        return counting[0] if counting else None
+        return next((i for i, c in enumerate(self.coordinates) if c.counted), None)
 
     @property
     def unknown_steps(self) -> int:
         """Number of steps at the beginning of an episode from which a model does not learn, because lags (coordinates
         that repeat a past value) are not known yet."""
-        return 0 if self.counter is None else math.ceil(self.coordinates[self.counter].high)
+        return max(c.counted for c in self.coordinates)
 
     def known(self, q: Tensor) -> Tensor:
         """Return for which of the states q (..., C) all lags are known, (...) bool. A lag is a coordinate that repeats
@@ -295,15 +281,14 @@ class EnvironmentDefinition:
         has standard deviation 1."""
         probabilities = np.random.default_rng(0).uniform(size=(SCALING_POINTS, len(self.coordinates)))
         p = torch.from_numpy(probabilities).to(self.device)
-        q = torch.stack([c.sampling.quantile(p[:, i]) for i, c in enumerate(self.coordinates)], -1)
-        shown = self.observe(q)
+        shown = self.observe(quantiles([c.sampling for c in self.coordinates], p))
         std = shown.std(0, correction=0)
         return shown.mean(0), torch.where(std > 1e-9, std, 1.0)
 
     @cached
     def bounds(self) -> tuple[Tensor, Tensor]:
         """Lower and upper saturation bounds, (C,) each."""
-        low, high = self._columns([(c.low, c.high) for c in self.coordinates])
+        low, high = self._columns([c.saturation for c in self.coordinates])
         return low, high
 
     @cached
@@ -381,7 +366,7 @@ class EnvironmentDefinition:
     @cached
     def sampled(self) -> tuple[Tensor, Tensor]:
         """Lower and upper ends of the sampling range, (C,) each."""
-        low, high = self._columns([(c.sampling.low, c.sampling.high) for c in self.coordinates])
+        low, high = self._columns([limits(c.sampling) for c in self.coordinates])
         return low, high
 
     def _columns(self, rows: Sequence[tuple[float, ...]]) -> tuple[Tensor, ...]:

@@ -7,83 +7,51 @@ random generator of an episode.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Iterable
 
 import torch
 from torch import Tensor
 
+from surrogym_shared.spec import Fixed, Normal, Uniform
 
-@dataclass(frozen=True)
-class UniformDefinition:
-    """Uniform distribution on [low, high]."""
-
-    low: float
-    high: float
-
-    def quantile(self, p: Tensor) -> Tensor:
-        """Return the value below which a share p of the distribution lies, for each entry of p, of any shape."""
-        return self.low + (self.high - self.low) * p
-
-    def log_density(self, value: Tensor) -> Tensor:
-        """Return 0 for each value: the log density within the limits, less its maximum."""
-        return torch.zeros_like(value)
+Distribution = Uniform | Normal | Fixed
 
 
-@dataclass(frozen=True)
-class NormalDefinition:
-    """Normal distribution, truncated to [low, high]."""
-
-    mean: float
-    std: float
-    low: float
-    high: float
-
-    def quantile(self, p: Tensor) -> Tensor:
-        """Return the value below which a share p of the distribution lies, for each entry of p, of any shape."""
-        edges = torch.tensor([self.low, self.high], dtype=p.dtype, device=p.device)
-        below, above = torch.special.ndtr((edges - self.mean) / self.std)
-        value: Tensor = self.mean + self.std * torch.special.ndtri(below + (above - below) * p)
-        return torch.clamp(value, self.low, self.high)
-
-    def log_density(self, value: Tensor) -> Tensor:
-        """Return the log density at each entry of ``value``, of any shape and within the limits, less the log density
-        at the mean."""
-        return -0.5 * ((value - self.mean) / self.std).square()
+def quantiles(distributions: Iterable[Distribution], p: Tensor) -> Tensor:
+    """Return the ``quantile`` of each of C distributions for its column of p (n, C), (n, C)."""
+    return torch.stack([quantile(one, column) for one, column in zip(distributions, p.unbind(-1), strict=True)], -1)
 
 
-@dataclass(frozen=True)
-class FixedDefinition:
-    """Distribution of a constant."""
-
-    value: float
-
-    @property
-    def low(self) -> float:
-        return self.value
-
-    @property
-    def high(self) -> float:
-        return self.value
-
-    def quantile(self, p: Tensor) -> Tensor:
-        """Return the constant, for any p."""
-        return torch.full_like(p, self.value)
-
-    def log_density(self, value: Tensor) -> Tensor:
-        """Return 0, for any value."""
-        return torch.zeros_like(value)
+def quantile(distribution: Distribution, p: Tensor) -> Tensor:
+    """Return the value below which a share p of the distribution lies, for each entry of p, of any shape."""
+    match distribution:
+        case Uniform(low=low, high=high):
+            return low + (high - low) * p
+        case Normal(mean=mean, std=std):
+            low, high = distribution.limits
+            edges = torch.tensor([low, high], dtype=p.dtype, device=p.device)
+            below, above = torch.special.ndtr((edges - mean) / std)
+            value: Tensor = mean + std * torch.special.ndtri(below + (above - below) * p)
+            return torch.clamp(value, low, high)
+        case Fixed(value=constant):
+            return torch.full_like(p, constant)
 
 
-Distribution = UniformDefinition | NormalDefinition | FixedDefinition
+def log_density(distribution: Distribution, value: Tensor) -> Tensor:
+    """Return the log density at each entry of ``value``, of any shape and within the limits, less its maximum: the log
+    density at the mean of a normal distribution; 0 for other distributions."""
+    if isinstance(distribution, Normal):
+        return -0.5 * ((value - distribution.mean) / distribution.std).square()
+    return torch.zeros_like(value)
 
 
 def scaling(distribution: Distribution) -> tuple[float, float]:
     """Return a centre and a scale such that (value - centre) / scale has mean 0 and standard deviation about 1 for
     sampled values."""
     match distribution:
-        case UniformDefinition(low, high):
+        case Uniform(low=low, high=high):
             return (low + high) / 2, (high - low) / math.sqrt(12)
-        case NormalDefinition(mean, std):
+        case Normal(mean=mean, std=std):
             return mean, std
-        case FixedDefinition(value):
+        case Fixed(value=value):
             return value, 1.0

@@ -72,7 +72,7 @@ def leading(definition: EnvironmentDefinition) -> tuple[int, ...]:
     return tuple(
         i
         for i in definition.moving
-        if (c := definition.coordinates[i]).stops is None and math.isfinite(c.low) and math.isfinite(c.high)
+        if definition.stopped[i] is None and all(map(math.isfinite, definition.coordinates[i].saturation))
     )
 
 

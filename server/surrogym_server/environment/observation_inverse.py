@@ -15,7 +15,7 @@ from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.terms import parts_of
 from surrogym_server.errors import InvalidSpec
 from surrogym_shared.kinds import Function
-from surrogym_shared.spec import ends_of
+from surrogym_shared.spec import ends_of, limits
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class ObservationInverse:
 
 def _source(definition: EnvironmentDefinition, index: int) -> tuple[int, ...]:
     coordinate = definition.coordinates[index]
-    direct = _entry(definition, "linear", index, coordinate.sampling.low, coordinate.sampling.high)
+    direct = _entry(definition, "linear", index, *limits(coordinate.sampling))
     if direct is not None:
         return (direct,)
     cosine, sine = (_entry(definition, "cos", index, -1.0, 1.0), _entry(definition, "sin", index, -1.0, 1.0))

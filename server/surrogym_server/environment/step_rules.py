@@ -25,12 +25,13 @@ def settle(definition: EnvironmentDefinition, q: Tensor) -> Tensor:
     """Return coordinates q (..., C) with the rules of the environment applied: they are clipped to bounds, a speed that
     points into a wall becomes 0, and angles are wrapped."""
     inside = clip(definition, q)
-    for index, coordinate in enumerate(definition.coordinates):
-        if coordinate.stops is not None:
-            speed = inside[..., coordinate.stops]
-            into_low = (inside[..., index] <= coordinate.low) & (speed < 0)
-            into_high = (inside[..., index] >= coordinate.high) & (speed > 0)
-            inside[..., coordinate.stops] = torch.where(into_low | into_high, 0.0, speed)
+    for index, (coordinate, stopped) in enumerate(zip(definition.coordinates, definition.stopped, strict=True)):
+        if stopped is not None:
+            low, high = coordinate.saturation
+            speed = inside[..., stopped]
+            into_low = (inside[..., index] <= low) & (speed < 0)
+            into_high = (inside[..., index] >= high) & (speed > 0)
+            inside[..., stopped] = torch.where(into_low | into_high, 0.0, speed)
         if coordinate.kind == "angle":
             inside[..., index] = wrap(inside[..., index])
     return inside
@@ -76,15 +77,15 @@ def with_lags(definition: EnvironmentDefinition, q: Tensor, u: Tensor, q_next: T
 def _repeated(definition: EnvironmentDefinition, index: int, q: Tensor, u: Tensor, q_next: Tensor) -> Tensor:
     """Return the value (m,) of the coordinate ``index``, which is a lag (it repeats a past value), after each of m
     steps from q (m, C) under u (m, F) to q_next (m, C)."""
-    lag = definition.coordinates[index].lag
+    lag, source = definition.coordinates[index].lag, definition.sources[index]
     assert lag is not None
     match lag.kind:
         case "action":
-            return u[:, lag.source].to(q.dtype)
+            return u[:, source - len(definition.coordinates)].to(q.dtype)
         case "value":
-            return q[:, lag.source]
+            return q[:, source]
         case "steps":
-            return q[:, index] + 1
+            return q[:, source] + 1
         case "change":
-            change = q_next[:, lag.source] - q[:, lag.source]
-            return wrap(change) if definition.coordinates[lag.source].kind == "angle" else change
+            change = q_next[:, source] - q[:, source]
+            return wrap(change) if definition.coordinates[source].kind == "angle" else change

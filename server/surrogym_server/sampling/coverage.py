@@ -7,6 +7,7 @@ import scipy  # SciPy imports its submodules on first use, so a server that need
 from numpy.typing import NDArray
 
 from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_shared.spec import limits
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -47,7 +48,7 @@ def _places(definition: EnvironmentDefinition, q: Array, u: Array) -> Array:
         if coordinate.kind == "angle":
             columns += [np.sin(q[:, index]) / 2, np.cos(q[:, index]) / 2]
         else:
-            low, high = coordinate.sampling.low, coordinate.sampling.high
+            low, high = limits(coordinate.sampling)
             columns.append((q[:, index] - low) / ((high - low) or 1.0))
     for entry, count in enumerate(definition.action.nvec):
         columns += [np.where(u[:, entry] == value, np.sqrt(0.5), 0.0) for value in range(count)]

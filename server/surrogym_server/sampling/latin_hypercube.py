@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_server.environment.distributions import quantiles
 
 Array = NDArray[np.float64]
 # Greatest number of times that points in terminal states, or within the margin of a declared limit, are drawn again.
@@ -59,7 +60,7 @@ def from_unit(definition: EnvironmentDefinition, p: Tensor) -> tuple[Tensor, Ten
     """Map probabilities p (n, C + F) in [0, 1) to coordinates (n, C) and actions (n, F) by the quantile functions of
     the sampling distributions."""
     size = len(definition.coordinates)
-    q = torch.stack([c.sampling.quantile(p[:, i]) for i, c in enumerate(definition.coordinates)], -1)
+    q = quantiles([c.sampling for c in definition.coordinates], p[:, :size])
     action, u = definition.action, p[:, size:]
     if action.nvec:
         return q, torch.floor(u * torch.tensor(action.nvec, dtype=p.dtype))

@@ -32,8 +32,9 @@ def reached_limits(definition: EnvironmentDefinition, samples: Samples) -> tuple
     sides = limit_sides(definition, samples.q_next)
     for index in definition.moving:
         coordinate, side = definition.coordinates[index], sides[:, index]
+        low, high = coordinate.saturation
         limits += [
-            Limit(coordinate.name, "lower", coordinate.low, float((side < 0).double().mean())),
-            Limit(coordinate.name, "upper", coordinate.high, float((side > 0).double().mean())),
+            Limit(coordinate.name, "lower", low, float((side < 0).double().mean())),
+            Limit(coordinate.name, "upper", high, float((side > 0).double().mean())),
         ]
     return tuple(sorted((one for one in limits if one.share >= MANY), key=lambda one: -one.share))

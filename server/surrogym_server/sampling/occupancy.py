@@ -11,8 +11,9 @@ import math
 import torch
 from torch import Tensor
 
-from surrogym_server.environment.definition import CoordinateDefinition, EnvironmentDefinition
+from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.distributions import scaling
+from surrogym_shared.spec import Coordinate, limits
 
 FLOOR = 0.1  # share of the uniform density in the mixture with the density of visited states
 BLOCK = 2**17  # number of kernel values computed at once, so that they stay in the cache of a processor core
@@ -36,7 +37,7 @@ def log_occupancy(definition: EnvironmentDefinition, states: Tensor, q: Tensor, 
     return torch.logaddexp(math.log1p(-floor) + density, density.new_tensor(math.log(floor)))
 
 
-def _log_kernel(coordinate: CoordinateDefinition, at: Tensor, states: Tensor, bandwidth: float) -> Tensor:
+def _log_kernel(coordinate: Coordinate, at: Tensor, states: Tensor, bandwidth: float) -> Tensor:
     """Return the log density, relative to a uniform density, of one coordinate at m points ``at`` under a kernel around
     each of v ``states``, (m, v)."""
     difference = at[:, None] - states[None]
@@ -47,7 +48,8 @@ def _log_kernel(coordinate: CoordinateDefinition, at: Tensor, states: Tensor, ba
         return kappa * (difference.cos() - 1) - log_normaliser
     _, scale = scaling(coordinate.sampling)
     width = (bandwidth * states.std(correction=0)).clamp_min(1e-3 * scale)
-    log_uniform = -math.log(coordinate.sampling.high - coordinate.sampling.low)
+    low, high = limits(coordinate.sampling)
+    log_uniform = -math.log(high - low)
     return -0.5 * (difference / width).square() - width.log() - 0.5 * math.log(2 * math.pi) - log_uniform
 
 

@@ -17,6 +17,7 @@ from surrogym_server.environment.points import Points
 from surrogym_server.environment.samples import Samples
 from surrogym_server.models.abilities import RewardPeaks, offers
 from surrogym_server.models.port import DynamicsModel
+from surrogym_shared.spec import limits
 
 # The search climbs from this many points, tries this many random steps from each in an iteration, and has this many
 # iterations.
@@ -119,7 +120,7 @@ def _in_space(definition: EnvironmentDefinition, points: Tensor) -> Tensor:
 def _limits(definition: EnvironmentDefinition) -> tuple[Tensor, Tensor]:
     """Return the lower and upper ends of the ranges of all coordinates and action entries, (C + F,) each."""
     action = definition.action
-    ranges = [(c.sampling.low, c.sampling.high) for c in definition.coordinates]
+    ranges = [limits(c.sampling) for c in definition.coordinates]
     ranges += [(0.0, n - 1.0) for n in action.nvec] or list(zip(action.low, action.high, strict=True))
     low, high = torch.tensor(ranges, dtype=torch.float64).T
     return low, high

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from surrogym_server.environment.definition import EnvironmentDefinition
-from surrogym_server.environment.distributions import scaling
+from surrogym_server.environment.distributions import log_density, quantile, scaling
 from surrogym_server.models.abilities import PathOutlook, PredictedSteps
 from surrogym_server.models.port import DynamicsModel
 from surrogym_server.sampling.acquisition import PathView, path_value_of
@@ -180,8 +180,8 @@ def start_points(definition: EnvironmentDefinition, count: int, rng: np.random.G
     """Draw states after a reset, (count, C), from the declared start distribution. Each coordinate is stratified: it
     has one value in each of ``count`` intervals of equal probability."""
     columns = [
-        c.start.quantile(torch.from_numpy((rng.permutation(count) + rng.random(count)) / count))
-        for c in definition.coordinates
+        quantile(start, torch.from_numpy((rng.permutation(count) + rng.random(count)) / count))
+        for start in definition.start
     ]
     if definition.counter is not None:
         columns[definition.counter] = torch.zeros(count, dtype=torch.float64)
@@ -297,7 +297,7 @@ def _weights(definition: EnvironmentDefinition, aim: Aim, paths: Paths) -> Tenso
     weight = paths.running * definition.in_range(paths.q) * definition.known(paths.q) * (-0.5 * paths.drift).exp()
     if aim.snapshots:
         columns = zip(definition.coordinates, paths.q.unbind(-1), strict=True)
-        weight = weight * (0.5 * torch.stack([c.sampling.log_density(q) for c, q in columns]).sum(0)).exp()
+        weight = weight * (0.5 * torch.stack([log_density(c.sampling, q) for c, q in columns]).sum(0)).exp()
     if aim.states is None or not len(aim.states):
         return weight
     density = log_occupancy(definition, aim.states, paths.q.flatten(0, 1)).exp().reshape(weight.shape)

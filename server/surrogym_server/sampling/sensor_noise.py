@@ -27,6 +27,7 @@ from torch import Tensor
 from surrogym_server.environment.samples import Samples, preceding
 from surrogym_server.models.abilities import AtSamples, LearnedNoise, SampledFunctions, offers
 from surrogym_server.models.port import DynamicsModel
+from surrogym_shared.spec import limits
 
 FEWEST = 12  # the test for sensor noise needs at least this many pairs of consecutive steps
 MOST = 256  # greatest number of samples in the test for sensor noise, whose time grows with their third power
@@ -194,8 +195,8 @@ def _slopes(model: DynamicsModel, samples: Samples, column: int, index: int) -> 
 def _differences(model: DynamicsModel, samples: Samples, index: int) -> Tensor:
     """Return the derivatives of all outputs with respect to the coordinate with index ``index``, at the samples, (n,
     O)."""
-    sampling = model.definition.coordinates[index].sampling
+    low, high = limits(model.definition.coordinates[index].sampling)
     step = torch.zeros_like(samples.q)
-    step[:, index] = DIFFERENCE * max(sampling.high - sampling.low, 1e-12)
+    step[:, index] = DIFFERENCE * max(high - low, 1e-12)
     above, below = (model.means(samples.q + sign * step, samples.u) for sign in (1, -1))
     return (above - below) / (2 * step[:, index : index + 1])

@@ -8,9 +8,11 @@ import torch
 from torch import Tensor
 
 from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_server.environment.distributions import quantiles
 from surrogym_server.environment.step_rules import settle
 from surrogym_server.virtual.lanes import LaneState
 from surrogym_server.virtual.noise import Purpose, normal_noise, uniform_noise
+from surrogym_shared.spec import limits
 
 
 def start_coordinates(
@@ -30,15 +32,14 @@ def start_coordinates(
         visited_share: share of the episodes that start at one of the states ``visited``.
         visited: (k, C) states at which episodes can start, or None if ``visited_share`` is 0.
     """
-    coordinates = definition.coordinates
-    p = uniform_noise(lanes, Purpose.START, len(coordinates))
+    p = uniform_noise(lanes, Purpose.START, len(definition.coordinates))
     if definition.starts:
         declared = _one_of(definition.start_states, p[:, 0])
     else:
-        declared = torch.stack([c.start.quantile(p[:, i]) for i, c in enumerate(coordinates)], -1)
+        declared = quantiles(definition.start, p)
     if box_share == 0 and visited_share == 0:
         return declared
-    anywhere = torch.stack([c.sampling.quantile(p[:, i]) for i, c in enumerate(coordinates)], -1)
+    anywhere = quantiles([c.sampling for c in definition.coordinates], p)
     kind = uniform_noise(lanes, Purpose.BOX_START, 1)
     if visited is not None:
         declared = torch.where(kind < box_share + visited_share, _one_of(visited, p[:, 0]), declared)
@@ -66,5 +67,5 @@ def _std(definition: EnvironmentDefinition, index: int, spread: float) -> float:
     coordinate = definition.coordinates[index]
     if coordinate.kind == "constant":
         return 0.0
-    width = 2 * math.pi if coordinate.kind == "angle" else coordinate.sampling.high - coordinate.sampling.low
-    return spread * width
+    low, high = (-math.pi, math.pi) if coordinate.kind == "angle" else limits(coordinate.sampling)
+    return spread * (high - low)

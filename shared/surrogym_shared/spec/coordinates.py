@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 from surrogym_shared.checks import Number, Width, require, require_range
 from surrogym_shared.kinds import CoordinateKind, LagKind
 from surrogym_shared.patterns import VISIBLE
-from surrogym_shared.spec.base import Frozen, Name
+from surrogym_shared.spec.base import Frozen, Name, ends_of
 from surrogym_shared.spec.terms import Term
 
 
@@ -152,9 +152,14 @@ class Coordinate(Frozen):
     @property
     def counted(self) -> int:
         """Number of steps that a lag of kind ``steps`` counts up to; 0 for other coordinates."""
-        if self.lag is None or self.lag.kind != "steps" or self.bounds is None or self.bounds.high is None:
-            return 0
-        return math.ceil(self.bounds.high)
+        _, high = self.saturation
+        return 0 if self.lag is None or self.lag.kind != "steps" or math.isinf(high) else math.ceil(high)
+
+    @property
+    def saturation(self) -> tuple[float, float]:
+        """Lower and upper bound, at which the coordinate stays if the dynamics would move it further; an infinity where
+        there is no bound."""
+        return (-math.inf, math.inf) if self.bounds is None else ends_of(self.bounds.low, self.bounds.high)
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -167,12 +172,9 @@ class Coordinate(Frozen):
         if self.kind != "linear":
             require(self.bounds is None, f"coordinate {self.name!r}: only a linear coordinate can have bounds")
         if self.bounds is not None:
-            low, high = limits(self.sampling)
-            inside = (self.bounds.low is None or self.bounds.low <= low) and (
-                self.bounds.high is None or high <= self.bounds.high
-            )
+            (least, most), (low, high) = self.saturation, limits(self.sampling)
             require(
-                inside,
+                least <= low and high <= most,
                 f"coordinate {self.name!r}: sampling range [{low}, {high}] leaves its bounds "
                 f"[{self.bounds.low}, {self.bounds.high}]",
             )
@@ -182,8 +184,5 @@ class Coordinate(Frozen):
     def settable(self) -> tuple[float, float]:
         """Range of values to which the original environment can be set: the bounds of the coordinate, or its sampling
         range where it has no bound."""
-        low, high = limits(self.sampling)
-        if self.bounds is None:
-            return low, high
-        least, most = self.bounds.low, self.bounds.high
-        return low if least is None else least, high if most is None else most
+        (least, most), (low, high) = self.saturation, limits(self.sampling)
+        return low if math.isinf(least) else least, high if math.isinf(most) else most

@@ -201,12 +201,10 @@ class EnvironmentSpec(Frozen):
                 if c.bounds.stops is not None:
                     require_known(f"coordinate {c.name!r}: stops", (c.bounds.stops,), moving)
                     self._require_stoppable(c.name, c.bounds.stops)
-                low, high = limits(self.start[c.name])
-                inside = (c.bounds.low is None or low >= c.bounds.low) and (
-                    c.bounds.high is None or high <= c.bounds.high
-                )
+                (least, most), (low, high) = c.saturation, limits(self.start[c.name])
                 require(
-                    inside, f"start of {c.name!r}, [{low}, {high}], leaves its bounds [{c.bounds.low}, {c.bounds.high}]"
+                    least <= low and high <= most,
+                    f"start of {c.name!r}, [{low}, {high}], leaves its bounds [{c.bounds.low}, {c.bounds.high}]",
                 )
         for start in self.starts:
             require(len(start) == len(names), f"starts: expected {len(names)} entries, got {len(start)}")
@@ -304,11 +302,11 @@ class EnvironmentSpec(Frozen):
 
     def _require_stoppable(self, name: str, stopped: str) -> None:
         require(stopped != name, f"coordinate {name!r}: expected another coordinate in its bounds' stops, got itself")
-        bounds = self.coordinates[self.coordinate_names.index(stopped)].bounds
+        coordinate = self.coordinates[self.coordinate_names.index(stopped)]
+        (low, high), bounds = coordinate.saturation, coordinate.bounds
         if bounds is not None:
-            holds = (bounds.low is None or bounds.low <= 0) and (bounds.high is None or bounds.high >= 0)
             require(
-                holds,
+                low <= 0 <= high,
                 f"coordinate {name!r} sets {stopped!r} to 0 at its bounds: expected bounds of {stopped!r} that contain "
                 f"0, got [{bounds.low}, {bounds.high}]",
             )

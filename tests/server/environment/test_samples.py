@@ -21,7 +21,7 @@ def test_angle_increments_take_the_shorter_direction_round_the_circle(pendulum_d
 
 def test_constant_coordinates_are_not_learned(pendulum_definition):
     angle, speed = pendulum_definition.coordinates
-    definition = replace(pendulum_definition, coordinates=(replace(angle, kind="constant"), speed))
+    definition = replace(pendulum_definition, coordinates=(angle.model_copy(update={"kind": "constant"}), speed))
     torch.testing.assert_close(
         increments(definition, samples([[1.0, 1.0]], [[1.0, 3.0]])), torch.tensor([[2.0]], dtype=torch.float64)
     )

@@ -12,15 +12,16 @@ from scipy.stats import truncnorm
 
 from surrogym_sampler.original.classic import acrobot, pendulum
 from surrogym_server.convert import definition_from_spec
-from surrogym_server.environment.definition import ActionDefinition, CoordinateDefinition
-from surrogym_server.environment.distributions import Distribution, FixedDefinition, NormalDefinition, UniformDefinition
+from surrogym_server.environment.definition import ActionDefinition
+from surrogym_server.environment.distributions import Distribution
 from surrogym_server.sampling.latin_hypercube import going_on, latin_hypercube, random_points
+from surrogym_shared.spec import Coordinate, Normal, Uniform, limits
 
 PENDULUM = definition_from_spec(pendulum())
 
-uniform = st.builds(lambda low, width: UniformDefinition(low, low + width), st.floats(-10, 10), st.floats(0.1, 20))
+uniform = st.builds(lambda low, width: Uniform(low=low, high=low + width), st.floats(-10, 10), st.floats(0.1, 20))
 normal = st.builds(
-    lambda mean, std, a, b: NormalDefinition(mean, std, mean - a * std, mean + b * std),
+    lambda mean, std, a, b: Normal(mean=mean, std=std, low=mean - a * std, high=mean + b * std),
     st.floats(-10, 10),
     st.floats(0.1, 5),
     st.floats(0.5, 4),
@@ -34,14 +35,14 @@ actions = st.one_of(
 )
 
 
-def coordinate(distribution: Distribution) -> CoordinateDefinition:
-    return CoordinateDefinition("x", "linear", distribution, FixedDefinition(0))
+def coordinate(distribution: Uniform | Normal) -> Coordinate:
+    return Coordinate(name="x", sampling=distribution)
 
 
 def probability(distribution: Distribution, values: np.ndarray) -> np.ndarray:
     """Share of the distribution below each value, by other means than its quantiles."""
-    low, high = distribution.low, distribution.high
-    if isinstance(distribution, UniformDefinition):
+    low, high = limits(distribution)
+    if isinstance(distribution, Uniform):
         return (values - low) / (high - low)
     mean, std = distribution.mean, distribution.std
     return truncnorm((low - mean) / std, (high - mean) / std, loc=mean, scale=std).cdf(values)
@@ -70,7 +71,7 @@ def test_a_latin_hypercube_has_one_point_per_stratum_of_each_dimension(distribut
     for i, distribution in enumerate(distributions):
         assert_stratified(probability(distribution, q[:, i].numpy()))
     for entry in range(len(action.low)):
-        assert_stratified(probability(UniformDefinition(action.low[entry], action.high[entry]), u[:, entry].numpy()))
+        assert_stratified(probability(Uniform(low=action.low[entry], high=action.high[entry]), u[:, entry].numpy()))
     for entry, n in enumerate(action.nvec):
         counts = np.bincount(u[:, entry].long().numpy(), minlength=n)
         assert len(counts) == n
@@ -97,7 +98,7 @@ def test_of_several_latin_hypercubes_the_one_with_the_largest_minimum_distance_i
 
 
 def test_random_points_follow_the_sampling_distributions():
-    distribution = NormalDefinition(1, 2, -2, 3)
+    distribution = Normal(mean=1, std=2, low=-2, high=3)
     definition = replace(PENDULUM, coordinates=(coordinate(distribution),))
     q, u = random_points(definition, 4_000, np.random.default_rng(0))
     p = probability(distribution, q[:, 0].numpy())

@@ -11,6 +11,7 @@ from support.exact_models import exact_pendulum
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.samples import Samples
 from surrogym_server.sampling.limits import MANY, reached_limits
+from surrogym_shared.spec import Bounds
 
 
 @pytest.fixture
@@ -18,7 +19,7 @@ def definition() -> EnvironmentDefinition:
     """The second coordinate is limited to -8 and 8."""
     whole = exact_pendulum().definition
     first, speed = whole.coordinates
-    return replace(whole, coordinates=(first, replace(speed, low=-8.0, high=8.0)))
+    return replace(whole, coordinates=(first, speed.model_copy(update={"bounds": Bounds(low=-8.0, high=8.0)})))
 
 
 def samples(*speeds: float) -> Samples:
@@ -44,5 +45,5 @@ def test_a_limit_reached_by_few_samples_is_not_reported(definition: EnvironmentD
 
 def test_a_coordinate_without_limits_is_never_reported_at_a_limit() -> None:
     whole = exact_pendulum().definition
-    free = tuple(replace(one, low=-float("inf"), high=float("inf")) for one in whole.coordinates)
+    free = tuple(one.model_copy(update={"bounds": None}) for one in whole.coordinates)
     assert reached_limits(replace(whole, coordinates=free), samples(1e9, -1e9)) == ()

@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from support.exact_models import ExactModel
-from surrogym_server.environment.distributions import UniformDefinition
 from surrogym_server.virtual import step
+from surrogym_shared.spec import Uniform
 
 STATES = ((0.1, 1.0), (-2.0, 0.5), (3.0, -1.0))
 OUTSIDE = -7.0
@@ -21,7 +21,7 @@ STILL = np.zeros((2, 1))
 def of_a_log(pendulum_model: ExactModel) -> ExactModel:
     """The pendulum, whose log has three states; its speed is sampled up to 4, and nothing stops it there."""
     angle, speed = pendulum_model.definition.coordinates
-    slow = replace(speed, sampling=UniformDefinition(-4.0, 4.0))
+    slow = speed.model_copy(update={"sampling": Uniform(low=-4.0, high=4.0)})
     definition = replace(
         pendulum_model.definition, starts=STATES, outside_reward=OUTSIDE, coordinates=(angle, slow), time_limit=10
     )

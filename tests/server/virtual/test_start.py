@@ -8,9 +8,9 @@ import pytest
 import torch
 from scipy.stats import kstest
 
-from surrogym_server.environment.distributions import FixedDefinition, NormalDefinition
 from surrogym_server.errors import InvalidInput
 from surrogym_server.virtual import VirtualSettings, create, reset
+from surrogym_shared.spec import Fixed, Normal
 
 
 @pytest.fixture
@@ -77,11 +77,7 @@ def test_reset_masks_and_seeds_of_wrong_length_are_refused(definition, options, 
 
 
 def test_start_states_follow_the_declared_distribution(definition):
-    angle, speed = definition.coordinates
-    declared = replace(
-        definition,
-        coordinates=(replace(angle, start=FixedDefinition(0.5)), replace(speed, start=NormalDefinition(1, 2, -3, 5))),
-    )
+    declared = replace(definition, start=(Fixed(value=0.5), Normal(mean=1, std=2, low=-3, high=5)))
     observation = starts(declared, 2_000)[0]
     np.testing.assert_allclose(observation[:, 0], math.cos(0.5), atol=1e-6)
     assert observation[:, 2].min() >= -3
@@ -111,9 +107,8 @@ def test_particles_start_around_the_reset_state_with_the_given_spread(definition
 
 def test_initial_particles_keep_constant_coordinates_and_stay_within_bounds(definition):
     angle, speed = definition.coordinates
-    fixed = replace(
-        definition, coordinates=(replace(angle, kind="constant"), replace(speed, start=FixedDefinition(8.0)))
-    )
+    constant = angle.model_copy(update={"kind": "constant"})
+    fixed = replace(definition, coordinates=(constant, speed), start=(definition.start[0], Fixed(value=8.0)))
     settings = VirtualSettings(1, variant="probabilistic", particles=50, spread=0.2)
     lanes, _ = reset(fixed, settings, create(fixed, settings, 0))
     assert (lanes.particles[..., 0] == lanes.q[:, :1]).all()

@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 
 from surrogym_server.compiled.elementary import wrapped
 from surrogym_server.compiled.tables import TablesBuilder, matrix
-from surrogym_server.environment.definition import EnvironmentDefinition, LagDefinition
+from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.observation_inverse import ObservationInverse
 from surrogym_shared.compiled.jit import compiled, inlined
+from surrogym_shared.kinds import LagKind
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -32,24 +33,20 @@ def add_rules(tables: TablesBuilder, definition: EnvironmentDefinition) -> int:
     return tables.add(
         [
             (
-                *(low[i], high[i], c.low, c.high, -1 if c.stops is None else c.stops, c.kind == "angle"),
-                *((-1, -1) if c.lag is None else _lag(definition, i, c.lag)),
+                *(low[i], high[i], *c.saturation, -1 if stopped is None else stopped, c.kind == "angle"),
+                *((-1, -1) if c.lag is None else (_lag(definition, c.lag.kind, source), source)),
             )
-            for i, c in enumerate(definition.coordinates)
+            for i, (c, stopped, source) in enumerate(
+                zip(definition.coordinates, definition.stopped, definition.sources, strict=True)
+            )
         ]
     )
 
 
-def _lag(definition: EnvironmentDefinition, index: int, lag: LagDefinition) -> tuple[int, int]:
-    match lag.kind:
-        case "steps":
-            return COUNT, index
-        case "action":
-            return REPEAT, len(definition.coordinates) + lag.source
-        case "value":
-            return REPEAT, lag.source
-        case "change":
-            return TURN if definition.coordinates[lag.source].kind == "angle" else CHANGE, lag.source
+def _lag(definition: EnvironmentDefinition, kind: LagKind, source: int) -> int:
+    if kind == "change":
+        return TURN if definition.coordinates[source].kind == "angle" else CHANGE
+    return COUNT if kind == "steps" else REPEAT
 
 
 def add_inverse(tables: TablesBuilder, inverse: ObservationInverse | None) -> int:

@@ -41,7 +41,7 @@ def stopped(definition: EnvironmentDefinition, index: int, q_next: Tensor) -> Te
 
     A limit of another coordinate that is no wall, such as the pressure limit of a relief valve, does not count.
     """
-    limits = [i for i in definition.moving if i != index and definition.coordinates[i].stops is None]
+    limits = [i for i in definition.moving if i != index and definition.stopped[i] is None]
     others = q_next.clone()
     others[:, limits] = math.nan
     return saturated(definition, others)

@@ -114,7 +114,7 @@ def test_a_model_file_of_another_format_or_environment_is_refused(pendulum_defin
             from_bytes(pendulum_definition, rewritten(data, header_of(data) | {"format": other}))
     with pytest.raises(InvalidInput, match="outputs"):
         from_bytes(cartpole_definition, data)
-    renamed = replace(pendulum_definition.coordinates[0], name="angle")
+    renamed = pendulum_definition.coordinates[0].model_copy(update={"name": "angle"})
     other = replace(pendulum_definition, coordinates=(renamed, pendulum_definition.coordinates[1]))
     with pytest.raises(InvalidInput, match="angle"):
         from_bytes(other, data)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 
 from surrogym_server.environment.angle_unwrapping import angle_increments
-from surrogym_server.environment.definition import EnvironmentDefinition, LagDefinition
+from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.distributions import scaling
 from surrogym_server.environment.features import Drift
 from surrogym_server.environment.samples import Samples
@@ -25,7 +25,11 @@ def learn_drift(definition: EnvironmentDefinition, samples: Samples) -> Drift:
     Angles and past actions among the coordinates have the weight 0. The result is () if there is no angle or if there
     are too few samples.
     """
-    moved_by = [i for i, c in enumerate(definition.coordinates) if c.kind == "linear" and not _is_action(c.lag)]
+    moved_by = [
+        i
+        for i, c in enumerate(definition.coordinates)
+        if c.kind == "linear" and (c.lag is None or c.lag.kind != "action")
+    ]
     if not definition.angles or not moved_by or len(samples) < POINTS_A_WEIGHT * (len(moved_by) + 1):
         return ()
     centre, scale = torch.tensor([scaling(definition.coordinates[i].sampling) for i in moved_by], dtype=torch.float64).T
@@ -35,7 +39,3 @@ def learn_drift(definition: EnvironmentDefinition, samples: Samples) -> Drift:
     weights = torch.zeros(len(definition.angles), len(definition.coordinates), dtype=torch.float64)
     weights[:, moved_by] = coefficients[1:].T / scale
     return tuple(tuple(row) for row in weights.tolist())
-
-
-def _is_action(lag: LagDefinition | None) -> bool:
-    return lag is not None and lag.kind == "action"

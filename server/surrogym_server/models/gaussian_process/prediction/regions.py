@@ -39,7 +39,7 @@ class Axes:
         """Build the axes for the moving coordinates, and for those observation entries that differ from all of these
         coordinates."""
         coordinates = definition.coordinate_names
-        shown = [(coordinates[i], Term.linear(**{coordinates[i]: 1.0})) for i in definition.moving]
+        shown = [(c.name, c.term) for c in definition.coordinates if c.moves]
         shown += [(entry.name, entry.term) for entry in definition.observation]
         different: dict[object, tuple[str, Term]] = {}
         for name, term in shown:
