@@ -91,7 +91,7 @@ def real_step(definition: EnvironmentDefinition, step: RealStep) -> RealStep:
         _near(definition, what, check_coordinates(definition, what, _row(what, getattr(step, what))))
         for what in ("coordinates", "next_coordinates")
     )
-    u = model_actions(definition.action, _row("action", step.action))
+    u = model_actions(definition, _row("action", step.action))
     reward = _numbers("reward", step.reward)
     if reward.shape != () or not np.isfinite(reward) or abs(reward) > LARGEST:
         raise InvalidInput(

@@ -95,7 +95,7 @@ class Draws:
 
     def _act(self, q: Array) -> Array:
         chosen = decode_actions(self.spec, self.predict(observe(self.spec, q).astype(np.float32)), len(q))
-        return model_actions(self.model.definition.action, chosen)
+        return model_actions(self.model.definition, chosen)
 
     def _shock(self, count: int) -> torch.Tensor | None:
         if self.noise is None:

@@ -173,7 +173,7 @@ def error_of(model: LocalSurrogate, plant: Any, seed: int) -> float:
         else rng.integers(0, space.n, (TESTS, 1)).astype(float)
     )
     reached = np.array([plant.step_from(q, u).next_coordinates for q, u in zip(starts, actions, strict=True)])
-    taken = model_actions(model.model.definition.action, actions)
+    taken = model_actions(model.model.definition, actions)
     found = model.model.transition(torch.from_numpy(starts), torch.from_numpy(taken)).q_next.numpy()
     angles = np.array([one.kind == "angle" for one in spec.coordinates])
 

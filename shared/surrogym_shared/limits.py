@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from surrogym_shared.checks import require, require_known, require_unique
-from surrogym_shared.spec import BoxAction, DiscreteAction, EnvironmentSpec, limits
+from surrogym_shared.spec import BoxAction, EnvironmentSpec, limits
 from surrogym_shared.spec.safety import Limit, Limits, NamedFallback
 from surrogym_shared.terms import evaluate
 
@@ -90,7 +90,7 @@ def fallback_action(spec: EnvironmentSpec, coordinates: Array) -> Array:
 
 def clipped_action(spec: EnvironmentSpec, action: ArrayLike) -> Array:
     """Return an action (F,), clipped to its range."""
-    low, high = np.array(_action_ranges(spec)).T
+    low, high = np.array(spec.action.ranges).T
     return np.asarray(np.clip(action, low, high), dtype=np.float64)
 
 
@@ -220,7 +220,7 @@ def _check_fallback(spec: EnvironmentSpec, declared: Limits) -> None:
         len(declared.fallback) == size,
         f"limits: expected a fallback of {size} terms, one for each entry of the action, got {len(declared.fallback)}",
     )
-    for number, (term, (low, high)) in enumerate(zip(declared.fallback, _action_ranges(spec), strict=True)):
+    for number, (term, (low, high)) in enumerate(zip(declared.fallback, spec.action.ranges, strict=True)):
         for part in term.parts:
             require_known(f"limits: entry {number} of the fallback", part.weights, spec.coordinate_names)
         constant = all(part.function == "one" for part in term.parts)
@@ -234,13 +234,6 @@ def _check_fallback(spec: EnvironmentSpec, declared: Limits) -> None:
             f"limits: entry {number} of the fallback leaves the action's range: expected {low:g} to {high:g}, "
             f"got {value:g}",
         )
-
-
-def _action_ranges(spec: EnvironmentSpec) -> list[tuple[float, float]]:
-    action = spec.action
-    if isinstance(action, BoxAction):
-        return list(zip(action.low, action.high, strict=True))
-    return [(0, n - 1) for n in ((action.n,) if isinstance(action, DiscreteAction) else action.nvec)]
 
 
 def _starts(spec: EnvironmentSpec) -> Iterator[Array]:

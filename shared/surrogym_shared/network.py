@@ -21,7 +21,7 @@ from pydantic import BaseModel, Field, PositiveInt, ValidationError
 
 from surrogym_shared.kinds import Activation
 from surrogym_shared.policy_sizes import MAX_LAYERS
-from surrogym_shared.spec import BoxAction, DiscreteAction, EnvironmentSpec, MultiDiscreteAction
+from surrogym_shared.spec import BoxAction, EnvironmentSpec
 
 if TYPE_CHECKING:
     from surrogym_shared.archives import Header
@@ -88,7 +88,7 @@ class Network:
             weights = vector[..., begin:middle].reshape(*vector.shape[:-1], inputs, outputs)
             layers.append(Layer(weights / np.sqrt(inputs), vector[..., middle:end]))
             begin = end
-        return cls(mean, deviation, tuple(layers), *bounds_of(spec), counts_of(spec))
+        return cls(mean, deviation, tuple(layers), *bounds_of(spec), spec.action.policy_counts)
 
     @staticmethod
     def size(spec: EnvironmentSpec, units: int | Sequence[int]) -> int:
@@ -181,17 +181,6 @@ def most_probable(y: NDArray[np.floating[Any]], low: Array, high: Array, counts:
     return choices[0] if len(choices) == 1 else np.stack(choices, -1)
 
 
-def counts_of(spec: EnvironmentSpec) -> tuple[int, ...]:
-    """Return the number of choices of each entry of a policy's action; empty for a continuous action."""
-    match spec.action:
-        case BoxAction(bins=bins):
-            return bins or ()
-        case DiscreteAction(n=n):
-            return (n,)
-        case MultiDiscreteAction(nvec=nvec):
-            return nvec
-
-
 def bounds_of(spec: EnvironmentSpec) -> tuple[Array, Array]:
     """Return the lower and the upper bounds (F,) of a continuous action of F entries; both empty for a discrete one."""
     if isinstance(spec.action, BoxAction):
@@ -202,7 +191,7 @@ def bounds_of(spec: EnvironmentSpec) -> tuple[Array, Array]:
 def _sizes(spec: EnvironmentSpec, units: int | Sequence[int]) -> list[int]:
     """Return the numbers of inputs, hidden units and outputs of a policy. Without hidden units it is linear."""
     hidden = ([units] if units else []) if isinstance(units, int) else units
-    return [len(spec.observation), *hidden, sum(counts_of(spec)) or spec.action.size]
+    return [len(spec.observation), *hidden, sum(spec.action.policy_counts) or spec.action.size]
 
 
 def _read_head(content: bytes) -> _Head:

@@ -13,6 +13,7 @@ from support.real_steps import random_steps
 from support.steps_in_c import check_in_c
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_server.environment.distributions import quantiles
 from surrogym_server.testing.cases import model_cases
 
 CASES = {f"case: {case}": case for case in model_cases("gaussian_process")}
@@ -23,11 +24,11 @@ def points(definition: EnvironmentDefinition) -> tuple[torch.Tensor, torch.Tenso
     """States of the sampling range, and actions."""
     generator = torch.Generator().manual_seed(0)
     p = torch.rand(POINTS, len(definition.coordinates), generator=generator, dtype=torch.float64)
-    q = torch.stack([c.sampling.quantile(p[:, i]) for i, c in enumerate(definition.coordinates)], -1)
+    q = quantiles([c.sampling for c in definition.coordinates], p)
     share = torch.rand(POINTS, definition.action.size, generator=generator, dtype=torch.float64)
     if definition.action.nvec:
         return q, (share * torch.tensor(definition.action.nvec)).floor()
-    low, high = (torch.tensor(limit, dtype=torch.float64) for limit in (definition.action.low, definition.action.high))
+    low, high = map(torch.from_numpy, definition.action_limits)
     return q, low + share * (high - low)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from surrogym_client.environments.lanes import Lanes
 from surrogym_shared.acting import Acted, ActingPolicy, Actor, NoiseKey
-from surrogym_shared.network import bounds_of, counts_of
+from surrogym_shared.network import bounds_of
 from surrogym_shared.policy_sizes import MAX_ACTIVATIONS, MAX_LANE_STEPS
 from surrogym_shared.port import Bools, Floats, PolicyRollout, StepResult
 
@@ -95,7 +95,7 @@ class ActingLanes:
     def _actor(self, policy: ActingPolicy, noise: NoiseKey | None) -> Actor:
         spec = self.lanes.port.spec()
         size = len(spec.observation)
-        return Actor(policy, size, *bounds_of(spec), counts_of(spec), noisy=noise is not None)
+        return Actor(policy, size, *bounds_of(spec), spec.action.policy_counts, noisy=noise is not None)
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from surrogym_sampler.original.errors import UnknownEnvironment
 from surrogym_sampler.original.protocol import Array
-from surrogym_shared.spec import BoxAction, DiscreteAction, EnvironmentSpec, MultiDiscreteAction
+from surrogym_shared.spec import BoxAction, EnvironmentSpec
 from surrogym_shared.spec.actions import Action
 
 
@@ -31,7 +31,7 @@ def decode_actions(spec: EnvironmentSpec, raw: NDArray[Any], num_envs: int) -> A
         if not np.isfinite(rows).all():
             raise ValueError(f"expected finite actions, got {rows.tolist()}: correct the policy that gave them")
         return np.clip(rows, spec.action.low, spec.action.high)
-    counts = np.array(_counts(spec.action))
+    counts = np.array(spec.action.policy_counts)
     if not ((rows >= 0) & (rows < counts) & (rows == np.round(rows))).all():
         raise ValueError(
             f"expected actions that are whole numbers from 0 to below {counts.tolist()}, got {rows.tolist()}: correct "
@@ -54,7 +54,7 @@ def explored(spec: EnvironmentSpec, action: Array, share: float, rng: np.random.
         low, high = np.array(spec.action.low), np.array(spec.action.high)
         if spec.action.bins is None:
             return np.clip(action + rng.normal(0, share * (high - low) / 2, size), low, high)
-    counts = np.array(_counts(spec.action))
+    counts = np.array(spec.action.policy_counts)
     drawn = decode_actions(spec, rng.integers(counts, size=size), 1)[0]
     return np.where(rng.random(size) < share, drawn, action)
 
@@ -63,7 +63,7 @@ def random_action(spec: EnvironmentSpec, rng: np.random.Generator) -> Array:
     """Draw an action (F,) uniformly from the action space."""
     if isinstance(spec.action, BoxAction):
         return rng.uniform(spec.action.low, spec.action.high)
-    return rng.integers(0, _counts(spec.action)).astype(np.float64)
+    return rng.integers(0, spec.action.nvec).astype(np.float64)
 
 
 def middle_action(spec: EnvironmentSpec) -> Array:
@@ -87,7 +87,7 @@ def require_same_action(name: str, declared: Action, own: Action) -> None:
     """
     fits = declared.kind == own.kind and declared.size == own.size
     if fits and not isinstance(own, BoxAction):
-        fits = all(asked <= there for asked, there in zip(_counts(declared), _counts(own), strict=True))
+        fits = all(asked <= there for asked, there in zip(declared.policy_counts, own.policy_counts, strict=True))
     if not fits:
         raise UnknownEnvironment(
             f"the specification declares {_words_of(declared)}, but {name} takes {_words_of(own)}: declare the latter "
@@ -98,16 +98,5 @@ def require_same_action(name: str, declared: Action, own: Action) -> None:
 def _words_of(action: Action) -> str:
     if isinstance(action, BoxAction):
         return f"a continuous action of {action.size} entr{'y' if action.size == 1 else 'ies'}"
-    values = " and ".join(map(str, _counts(action)))
+    values = " and ".join(map(str, action.policy_counts))
     return f"a discrete action of {values} values"
-
-
-def _counts(action: BoxAction | DiscreteAction | MultiDiscreteAction) -> tuple[int, ...]:
-    """Return the number of values of each entry of a policy's action; empty if the entries are continuous."""
-    match action:
-        case BoxAction(bins=bins):
-            return bins or ()
-        case DiscreteAction(n=n):
-            return (n,)
-        case MultiDiscreteAction(nvec=nvec):
-            return nvec

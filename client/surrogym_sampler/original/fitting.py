@@ -8,7 +8,7 @@ from typing import TypeAlias
 from surrogym_sampler.original.errors import PolicyMisfit
 from surrogym_sampler.original.executables import is_executable
 from surrogym_sampler.original.periods import is_other
-from surrogym_shared.spec import BoxAction, DiscreteAction, EnvironmentSpec
+from surrogym_shared.spec import BoxAction, EnvironmentSpec
 
 ROUNDING = 1e-6  # an end of a range may be exceeded by this share of the end, because float32 rounds
 
@@ -47,7 +47,7 @@ def check_policy(trained: EnvironmentSpec, own: EnvironmentSpec) -> None:
     """
     misfit = _misfit(trained, "the environment")
     check_shape(trained, own, "the environment")
-    asked, allowed = action_ranges(trained), action_ranges(own)
+    asked, allowed = trained.action.ranges, own.action.ranges
     both = zip(asked, allowed, strict=True)
     if not all(is_within(a, b) and (_bins(own) is None or is_within(b, a)) for a, b in both):
         raise PolicyMisfit(f"{misfit}: expected actions from {range_in_words(asked)}, got {range_in_words(allowed)}")
@@ -71,15 +71,6 @@ def check_policy(trained: EnvironmentSpec, own: EnvironmentSpec) -> None:
                 f"{misfit}: expected observation ({expected}), got ({got}), in which {b.name!r} is another "
                 f"term than {a.name!r}"
             )
-
-
-def action_ranges(spec: EnvironmentSpec) -> list[Range]:
-    """Return the limits of each entry of an action; the first and last value of a discrete entry."""
-    action = spec.action
-    if isinstance(action, BoxAction):
-        return list(zip(action.low, action.high, strict=True))
-    counts = (action.n,) if isinstance(action, DiscreteAction) else action.nvec
-    return [(0, n - 1) for n in counts]
 
 
 def is_within(asked: Range, allowed: Range) -> bool:

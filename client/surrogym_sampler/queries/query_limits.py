@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from surrogym_sampler.original.errors import QueryRefused, UnknownEnvironment
-from surrogym_sampler.original.fitting import Range, action_ranges, is_within, range_in_words
+from surrogym_sampler.original.fitting import Range, is_within, range_in_words
 from surrogym_sampler.original.periods import is_other
 from surrogym_shared.spec import MAX_ROLLOUT_QUERY, Access, BoxAction, EnvironmentSpec
 from surrogym_shared.spec import limits as sampled
@@ -43,7 +43,7 @@ def check_environment(surrogate: str, asked: EnvironmentSpec, own: EnvironmentSp
             "limits, which the sampler keeps at the machine, got other limits or none; declare them in the "
             "environment's specification, or give a specification that has them with --spec FILE"
         )
-    _check_ranges("actions", action_ranges(asked), action_ranges(own))
+    _check_ranges("actions", asked.action.ranges, own.action.ranges)
     _check_ranges("coordinates", [sampled(c.sampling) for c in asked.coordinates], _coordinate_ranges(own))
 
 
@@ -81,7 +81,7 @@ def check_query(own: EnvironmentSpec, query: Query) -> None:
 
 
 def _check_action(own: EnvironmentSpec, action: Sequence[float]) -> None:
-    _check_values("action", [f"action {i}" for i in range(own.action.size)], action, action_ranges(own))
+    _check_values("action", [f"action {i}" for i in range(own.action.size)], action, own.action.ranges)
     if not isinstance(own.action, BoxAction) and not all(float(value).is_integer() for value in action):
         raise QueryRefused(
             f"expected whole numbers for the query's discrete actions, got {list(action)}: register the environment "

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from surrogym_sampler.original.fitting import action_ranges
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import Query, QueryView
 
@@ -16,7 +15,7 @@ def words_of_query(spec: EnvironmentSpec, query: Query | QueryView) -> list[str]
     actions = query.actions if isinstance(query, QueryView) or query.kind == "rollout" else [query.action]
     steps = f"{len(actions)} step{'s' * (len(actions) > 1)}"
     lines = [f"query {query.id} ({query.purpose}): {steps} from {_start(spec, query)}"]
-    for entry, (low, high) in enumerate(action_ranges(spec)):
+    for entry, (low, high) in enumerate(spec.action.ranges):
         values = [action[entry] for action in actions]
         bars = "".join(BARS[min(int((v - low) / (high - low) * len(BARS)), len(BARS) - 1)] for v in values)
         lines.append(f"  action {entry} {bars} {_ends(values)} of {low:g} to {high:g}")

@@ -259,10 +259,10 @@ def controller_from(
         NotDeployable: network and specification don't fit, a setting does not, or a number is too large for a C float.
     """
     _require_small(decision)
-    low, high = _limits(spec.action)
-    outputs = sum(_counts(spec.action)) or len(low)
+    low, high = np.array(spec.action.ranges, dtype=np.float64).T.copy()
+    outputs = sum(spec.action.policy_counts) or len(low)
     shape, expected = (len(decision.mean), len(decision.layers[-1].bias)), (len(spec.observation), outputs)
-    if shape != expected or decision.counts != _counts(spec.action):
+    if shape != expected or decision.counts != spec.action.policy_counts:
         raise NotDeployable(
             f"expected a network of {expected[0]} inputs and {expected[1]} outputs for this specification, got "
             f"{shape[0]} and {shape[1]}: give the specification that the policy was trained for, with --spec"
@@ -453,19 +453,6 @@ def _unit(spec: EnvironmentSpec, term: Term) -> str:
         return ""
     (name,) = term.parts[0].weights
     return spec.coordinates[spec.coordinate_names.index(name)].unit
-
-
-def _limits(action: Action) -> tuple[Array, Array]:
-    if isinstance(action, BoxAction):
-        return np.array(action.low, dtype=np.float64), np.array(action.high, dtype=np.float64)
-    counts = np.array(_counts(action), dtype=np.float64)
-    return np.zeros(len(counts)), counts - 1
-
-
-def _counts(action: Action) -> tuple[int, ...]:
-    if isinstance(action, BoxAction):
-        return action.bins or ()
-    return (action.n,) if action.kind == "discrete" else action.nvec
 
 
 def _fallback(action: Action, low: Array, high: Array, chosen: tuple[float, ...] | None) -> Array:

@@ -15,7 +15,7 @@ from surrogym_client.transport.http_surrogate import HttpSurrogate
 from surrogym_sampler.original.episode import Episode, Moment
 from surrogym_sampler.original.errors import NotPerturbable, NotSettable
 from surrogym_sampler.original.protocol import Array
-from surrogym_shared.network import bounds_of, counts_of
+from surrogym_shared.network import bounds_of
 from surrogym_shared.spec import EnvironmentSpec
 
 
@@ -66,7 +66,7 @@ class VirtualEpisode(Episode):
 def _as_sent(spec: EnvironmentSpec, action: Array) -> NDArray[Any]:
     """Return an action (F,) of the environment in the form that a session takes: the numbers of the choices, if there
     are choices."""
-    counts = np.array(counts_of(spec))
+    counts = np.array(spec.action.policy_counts)
     if not counts.size:
         return action
     low, high = bounds_of(spec)

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surrogym_sampler.original.factories import load_factory
-from surrogym_shared.network import counts_of
 from surrogym_shared.spec import BoxAction, EnvironmentSpec
 from surrogym_shared.wire import Controller
 from surrogym_trainer.policies.predict import PerEpisode, Predict
@@ -56,7 +55,7 @@ def baseline(spec: EnvironmentSpec, controller: Controller, seed: int = 0) -> Pr
 
 
 def _random(spec: EnvironmentSpec, rng: np.random.Generator) -> Predict:
-    counts = counts_of(spec)
+    counts = spec.action.policy_counts
 
     def choose(observations: NDArray[np.float32]) -> NDArray[Any]:
         return rng.integers(counts, size=(len(observations), len(counts)))

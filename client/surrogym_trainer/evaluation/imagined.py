@@ -13,7 +13,7 @@ from surrogym_client.environments.acting import ActingLanes
 from surrogym_client.environments.lanes import Lanes, session_request
 from surrogym_sampler.original.protocol import LONGEST_EPISODE
 from surrogym_shared.acting import ActingPolicy
-from surrogym_shared.network import Network, bounds_of, counts_of
+from surrogym_shared.network import Network, bounds_of
 from surrogym_shared.port import PolicyPort, PolicyRollout, StepResult, SurrogatePort
 
 # session options with which every episode begins where the specification declares
@@ -161,7 +161,7 @@ def _as_arrays(predict: Callable[[NDArray[Any]], NDArray[Any]], port: SurrogateP
         return None
     spec = port.spec()
     same = all(map(np.array_equal, (predict.low, predict.high), bounds_of(spec)))
-    if predict.counts != counts_of(spec) or not (same or predict.counts):
+    if predict.counts != spec.action.policy_counts or not (same or predict.counts):
         return None
     try:
         return ActingPolicy.of(predict)

@@ -61,7 +61,7 @@ def coverage_of(spec: EnvironmentSpec, q: Array, u: Array) -> Coverage:
     if isinstance(action, BoxAction):
         acting = list(zip(action.low, action.high, strict=True))
     else:
-        acting = [(-0.5, n - 0.5) for n in ([action.n] if action.kind == "discrete" else action.nvec)]
+        acting = [(-0.5, n - 0.5) for n in action.nvec]
     ends = np.array([*(limits(c.sampling) for c in spec.coordinates), *acting])
     values = np.concatenate([q, u], axis=1)
     shown = range(len(names))

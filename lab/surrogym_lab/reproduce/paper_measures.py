@@ -16,7 +16,7 @@ from surrogym_sampler.original.episode import Moment
 from surrogym_sampler.original.episodes import GymnasiumEpisode, draw
 from surrogym_sampler.original.protocol import RealStep
 from surrogym_sampler.original.simulator import SMALLEST_FACTOR
-from surrogym_shared.spec import BoxAction, DiscreteAction, EnvironmentSpec
+from surrogym_shared.spec import BoxAction, EnvironmentSpec
 from surrogym_shared.terms import observe
 from surrogym_shared.wire import ModelView
 from surrogym_trainer.evaluation.evaluator import EvaluationSettings, Trace, evaluate
@@ -160,8 +160,7 @@ def some(models: Sequence[ModelView], count: int) -> list[ModelView]:
 def _random_action(spec: EnvironmentSpec, rng: np.random.Generator) -> Array:
     if isinstance(spec.action, BoxAction):
         return rng.uniform(spec.action.low, spec.action.high)
-    counts = (spec.action.n,) if isinstance(spec.action, DiscreteAction) else spec.action.nvec
-    return rng.integers(0, counts).astype(np.float64)
+    return rng.integers(0, spec.action.nvec).astype(np.float64)
 
 
 def _rows(values: Sequence[Any]) -> list[list[float]]:

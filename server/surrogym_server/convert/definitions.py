@@ -37,7 +37,7 @@ def stored_definition(spec: wire.EnvironmentSpec) -> core.EnvironmentDefinition:
         coordinates=spec.coordinates,
         start=tuple(spec.start[name] for name in spec.coordinate_names),
         observation=spec.observation,
-        action=_action(spec.action),
+        action=spec.action,
         termination_groups=spec.termination_groups,
         time_limit=spec.time_limit,
         reward=spec.reward,
@@ -51,7 +51,7 @@ def stored_definition(spec: wire.EnvironmentSpec) -> core.EnvironmentDefinition:
         starts=spec.starts,
         outside_reward=spec.outside_reward,
         limits=spec.limits,
-        rates=tuple(core.RateDefinition(rate.entry, rate.last, rate.change) for rate in rates(spec)),
+        rates=rates(spec),
     )
     if definition.moves_observation:
         ObservationInverse.of(definition)
@@ -117,16 +117,6 @@ def _penalty(spec: wire.EnvironmentSpec) -> float:
     if isinstance(spec.reward, wire.DeclaredReward):
         return 0.0
     return _or(spec.reward.penalty, spec.preset.penalty)
-
-
-def _action(action: wire.BoxAction | wire.DiscreteAction | wire.MultiDiscreteAction) -> core.ActionDefinition:
-    match action:
-        case wire.BoxAction():
-            return core.ActionDefinition("box", low=action.low, high=action.high, bins=action.bins)
-        case wire.DiscreteAction():
-            return core.ActionDefinition("discrete", nvec=(action.n,))
-        case wire.MultiDiscreteAction():
-            return core.ActionDefinition("multi_discrete", nvec=action.nvec)
 
 
 def _or(value: float | None, default: float) -> float:

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from surrogym_server.engine.requests import Array, Opening, Reply, SessionInfo
 from surrogym_server.engine.tallies import SessionActivity
-from surrogym_server.environment import definition as core
 from surrogym_server.errors import InvalidInput
 from surrogym_server.virtual import Residual, VirtualSettings
 from surrogym_shared import frames
@@ -20,6 +19,7 @@ from surrogym_shared import wire as replies
 from surrogym_shared.acting import ActingPolicy, NoiseKey, PolicyRun
 from surrogym_shared.network import Layer
 from surrogym_shared.port import PolicyRollout, ResetResult, StepResult
+from surrogym_shared.spec import Action
 
 
 def numbers(what: str, rows: Sequence[Any]) -> NDArray[np.float64]:
@@ -114,10 +114,10 @@ def _box(ranges: Iterable[tuple[float | None, float | None]]) -> replies.BoxSpac
     return replies.BoxSpace(low=list(low), high=list(high))
 
 
-def _action_space(action: core.ActionDefinition) -> replies.ActionSpace:
+def _action_space(action: Action) -> replies.ActionSpace:
     match action.policy_counts:
         case ():
-            return _box(zip(action.low, action.high, strict=True))
+            return _box(action.ranges)
         case (n,) if action.kind != "multi_discrete":
             return replies.DiscreteSpace(n=n)
         case counts:

@@ -125,7 +125,7 @@ def _variables(definition: EnvironmentDefinition) -> Iterator[Variable]:
         if action.nvec:
             yield Variable(name, "Int32", "input", 0, 0, action.nvec[entry] - 1)
         else:
-            low, high = action.low[entry], action.high[entry]
+            low, high = action.ranges[entry]
             yield Variable(name, "Float64", "input", min(max(0.0, low), high), low, high)
     for index, coordinate in enumerate(definition.coordinates):
         yield _coordinate(coordinate, free(coordinate.name, "state"), _start(definition, index))
@@ -157,7 +157,7 @@ def _start(definition: EnvironmentDefinition, index: int) -> float:
 
 def _header(definition: EnvironmentDefinition, model: DynamicsModel, rewards: tuple[float, float]) -> Iterator[str]:
     action, coordinates = definition.action, definition.coordinates
-    low, high = (action.low, action.high) if action.low else ([0.0] * len(action.nvec), [n - 1 for n in action.nvec])
+    low, high = zip(*action.ranges, strict=True)
     yield "/* Sizes and limits of a surrogate. */"
     yield f"enum {{ COORDINATES = {len(coordinates)}, ACTIONS = {action.size} }};"
     yield f"enum {{ OBSERVATIONS = {len(definition.observation_names)}, OUTPUTS = {len(definition.outputs)} }};"

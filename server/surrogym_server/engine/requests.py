@@ -32,7 +32,7 @@ from surrogym_server.engine.session import (
     step_session,
 )
 from surrogym_server.environment.actions import policy_actions
-from surrogym_server.environment.definition import ActionDefinition, EnvironmentDefinition
+from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import InvalidInput, NotReset, SurrogymError, TooLarge
 from surrogym_server.models.guard import failure_of
 from surrogym_server.models.port import DynamicsModel
@@ -370,7 +370,7 @@ def carried_out(
         PluginFailed: the code of the model's family raised an error.
     """
     if isinstance(request, Step):  # handled first, without pattern matching, because most requests are steps
-        u = policy_actions(session.definition.action, request.action, session.settings.num_envs)
+        u = policy_actions(session.definition, request.action, session.settings.num_envs)
         after, result = _step(session, u, request.mask, request.stds, models, interrupts)
         return after, (result,)
     match request:
@@ -458,7 +458,7 @@ def roll(session: Session, actions: Array, step: OneStep) -> tuple[Session, tupl
     """
     lanes, results = session.settings.num_envs, []
     _check_steps(len(actions), lanes)
-    for u in [policy_actions(session.definition.action, row, lanes) for row in actions]:
+    for u in [policy_actions(session.definition, row, lanes) for row in actions]:
         session, result = step(session, u)
         results.append(result)
     return session, tuple(results)
@@ -480,14 +480,14 @@ def roll_policy(session: Session, run: PolicyRun, step: OneStep) -> tuple[Sessio
             f"expected units of the policy's widest layer times lanes to be at most {MAX_ACTIVATIONS}, got "
             f"{max(run.policy.units)} x {lanes}: open fewer lanes, or take a smaller policy"
         )
-    actor = _actor(len(definition.observation_names), definition.action, run)
+    actor = _actor(definition, run)
     waiting = _lanes_without_an_end(run, lanes)
     sensed_states = sensed(definition, session.settings.sensor_noise, session.lanes)
     observation = definition.observe(sensed_states).to(torch.float32).cpu().numpy()
     results, actions, logs = [], [], []
     for number in range(run.steps):
         acted = _act(actor, observation, None if run.noise is None else run.noise.later(number))
-        session, result = step(session, policy_actions(definition.action, acted.sent, lanes))
+        session, result = step(session, policy_actions(definition, acted.sent, lanes))
         results.append(result)
         actions.append(acted.action)
         logs.append(acted.log_probability)
@@ -506,10 +506,10 @@ def _check_steps(steps: int, lanes: int) -> None:
         )
 
 
-def _actor(observation: int, action: ActionDefinition, run: PolicyRun) -> Actor:
-    low, high = action.limits
+def _actor(definition: EnvironmentDefinition, run: PolicyRun) -> Actor:
+    (low, high), counts = definition.action_limits, definition.action.policy_counts
     try:
-        return Actor(run.policy, observation, low, high, action.policy_counts, noisy=run.noise is not None)
+        return Actor(run.policy, len(definition.observation), low, high, counts, noisy=run.noise is not None)
     except ValueError as error:
         raise InvalidInput(str(error)) from error
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from surrogym_server.environment.definition import ActionDefinition
+from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import InvalidInput
 
 Array = NDArray[np.float64]
@@ -15,11 +15,11 @@ Array = NDArray[np.float64]
 FLOAT32_SLACK = 1e-6
 
 
-def policy_actions(action: ActionDefinition, raw: NDArray[Any], num_envs: int) -> Array:
+def policy_actions(definition: EnvironmentDefinition, raw: NDArray[Any], num_envs: int) -> Array:
     """Check the actions that a policy chose, and convert them to the form in which the model takes actions.
 
     Args:
-        action: definition of the action.
+        definition: the environment.
         raw: actions of the policy, (N, F), or (N,) if F = 1.
         num_envs: number of environments, N.
 
@@ -29,31 +29,31 @@ def policy_actions(action: ActionDefinition, raw: NDArray[Any], num_envs: int) -
     Raises:
         InvalidInput: the array has a wrong shape, or an entry is not finite, not a whole number or out of bounds.
     """
-    rows = _rows(raw, (num_envs, action.size))
-    if counts := action.policy_counts:
+    rows = _rows(raw, (num_envs, definition.action.size))
+    if counts := definition.action.policy_counts:
         _require_counts(rows, counts)
-        return decode_bins(action, rows) if action.bins else rows
-    return _in_box(action, rows)
+        return rows if definition.action.nvec else decode_bins(definition, rows)
+    return _in_box(definition, rows)
 
 
-def model_actions(action: ActionDefinition, raw: NDArray[Any]) -> Array:
+def model_actions(definition: EnvironmentDefinition, raw: NDArray[Any]) -> Array:
     """Check actions of queries and samples, and return them as float64, (n, F): continuous values, or the numbers of
     discrete actions.
 
     Raises:
         InvalidInput: the array has a wrong shape, or an entry is not finite, not a whole number or out of bounds.
     """
-    rows = _rows(raw, (len(raw), action.size))
-    if action.nvec:
-        _require_counts(rows, action.nvec)
+    rows = _rows(raw, (len(raw), definition.action.size))
+    if counts := definition.action.nvec:
+        _require_counts(rows, counts)
         return rows
-    return _in_box(action, rows)
+    return _in_box(definition, rows)
 
 
-def decode_bins(action: ActionDefinition, rows: Array) -> Array:
+def decode_bins(definition: EnvironmentDefinition, rows: Array) -> Array:
     """Convert n actions (n, F), whose entries are numbers of equally spaced values, to these values (n, F)."""
-    low, high = action.limits
-    values: Array = low + rows * (high - low) / (np.array(action.bins) - 1)
+    low, high = definition.action_limits
+    values: Array = low + rows * (high - low) / (np.array(definition.action.policy_counts) - 1)
     return values
 
 
@@ -84,8 +84,8 @@ def _require_counts(rows: Array, counts: tuple[int, ...]) -> None:
         )
 
 
-def _in_box(action: ActionDefinition, rows: Array) -> Array:
-    low, high = action.limits
+def _in_box(definition: EnvironmentDefinition, rows: Array) -> Array:
+    low, high = definition.action_limits
     if ((rows >= low) & (rows <= high)).all():  # no entry is NaN or infinite then, because both limits are finite
         return rows
     _require_finite(rows)

@@ -1,9 +1,9 @@
 """EnvironmentDefinition: one environment in the form with which the core computes.
 
 A specification (``surrogym_shared.spec``) is what a person writes: it leaves defaults open, and is checked when it is
-made. A definition is derived from it, only in ``convert.definitions``: it has every default. Both have the same
-coordinates, distributions, terms, inequalities, rewards and limits, of the frozen types in ``surrogym_shared.spec``,
-which the core makes nowhere. What a step needs is compiled when it is first used, with an index in place of each name.
+made. A definition is derived from it, only in ``convert.definitions``: it has every default. Its coordinates,
+distributions, terms, actions, rewards and limits are those of the specification, which name coordinates. What a step
+needs is compiled from them when it is first used, with an index in place of each name.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
 
 import numpy as np
 import torch
@@ -27,38 +26,22 @@ from surrogym_server.plugins import Choice
 from surrogym_server.tensors import CPU, cached, to_device
 from surrogym_shared.kinds import RewardTiming
 from surrogym_shared.presets import InputProbability, Moves, Stopping, Tolerance
-from surrogym_shared.spec import Coordinate, DeclaredReward, Inequality, Limits, ObservationEntry, Reward, limits
+from surrogym_shared.rates import Rate
+from surrogym_shared.spec import (
+    Action,
+    Coordinate,
+    DeclaredReward,
+    Inequality,
+    Limits,
+    ObservationEntry,
+    Reward,
+    limits,
+)
 
 REWARD = "reward"
 REACH = 1e6  # a prediction without a bound is clipped at this many widths of the sampling range beyond that range
 SCALING_POINTS = 4_096  # mean and standard deviation of the observation are computed from this many sampled states
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class ActionDefinition:
-    """Action of an environment: either a box from ``low`` to ``high``, or discrete, with ``nvec[i]`` values of entry i.
-    If ``bins`` are given, a policy chooses entry i of the box among ``bins[i]`` equally spaced values."""
-
-    kind: Literal["box", "discrete", "multi_discrete"]
-    low: tuple[float, ...] = ()
-    high: tuple[float, ...] = ()
-    bins: tuple[int, ...] | None = None
-    nvec: tuple[int, ...] = ()
-
-    @cached_property
-    def limits(self) -> tuple[Array, Array]:
-        """``low`` and ``high`` as arrays, (F,) each; cached, because every action of a policy is compared with them."""
-        return np.array(self.low), np.array(self.high)
-
-    @property
-    def size(self) -> int:
-        return len(self.low) or len(self.nvec)
-
-    @property
-    def policy_counts(self) -> tuple[int, ...]:
-        """Number of values of each entry of a policy's action; empty if its actions are continuous."""
-        return self.nvec or self.bins or ()
 
 
 @dataclass(frozen=True)
@@ -110,22 +93,13 @@ class DesignDefinition:
 
 
 @dataclass(frozen=True)
-class RateDefinition:
-    """Largest change of one entry of the action in one step; ``surrogym_shared.rates`` explains it."""
-
-    entry: int  # index, in the action, of the entry whose change is limited
-    last: int  # index of the coordinate that repeats the value of this action entry in the last step
-    change: float  # largest change of the action entry from one step to the next
-
-
-@dataclass(frozen=True)
 class EnvironmentDefinition:
     """One environment, with C coordinates, D observation entries and F action entries."""
 
     coordinates: tuple[Coordinate, ...]
     start: tuple[Distribution, ...]  # (C,) distribution of each coordinate in the first state of an episode
     observation: tuple[ObservationEntry, ...]
-    action: ActionDefinition
+    action: Action
     termination_groups: tuple[tuple[Inequality, ...], ...]
     time_limit: int | None
     reward: Reward | DeclaredReward
@@ -146,7 +120,7 @@ class EnvironmentDefinition:
     # None: leaving the range does not end an episode.
     outside_reward: float | None = None
     limits: Limits | None = None  # declared limits within which the original environment has to stay
-    rates: tuple[RateDefinition, ...] = ()  # largest changes of action entries per step; empty: no limits
+    rates: tuple[Rate, ...] = ()  # largest changes of action entries per step; empty: no limits
     device: torch.device = CPU  # device of the definition's tensors, and of states and actions that are passed to it
 
     def on(self, device: torch.device) -> EnvironmentDefinition:
@@ -171,6 +145,13 @@ class EnvironmentDefinition:
     @cached_property
     def coordinate_names(self) -> tuple[str, ...]:
         return tuple(c.name for c in self.coordinates)
+
+    @cached_property
+    def action_limits(self) -> tuple[Array, Array]:
+        """Lowest and highest value of each action entry, (F,) each; cached, because each action of a policy is compared
+        with them."""
+        low, high = np.array(self.action.ranges).T
+        return low, high
 
     @cached_property
     def observation_names(self) -> tuple[str, ...]:
@@ -213,13 +194,13 @@ class EnvironmentDefinition:
     def sources(self) -> tuple[int, ...]:
         """Index, in [coordinates, action], of the value from which each coordinate that is a lag follows, (C,). A
         counter of steps follows from itself. Coordinates that are no lags have their own index."""
-        names, sources = self.coordinate_names, list(range(len(self.coordinates)))
-        for index in self.lags:
-            lag = self.coordinates[index].lag
-            if lag is not None and lag.of is not None:
-                sources[index] = names.index(lag.of)
-            elif lag is not None and lag.entry is not None:
-                sources[index] = len(names) + lag.entry
+        names = self.coordinate_names
+        sources: list[int] = []
+        for index, c in enumerate(self.coordinates):
+            if c.lag is None or c.lag.kind == "steps":
+                sources.append(index)
+            else:
+                sources.append(names.index(c.lag.of) if c.lag.entry is None else len(names) + c.lag.entry)
         return tuple(sources)
 
     @cached_property

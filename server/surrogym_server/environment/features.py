@@ -261,8 +261,8 @@ def _of_coordinate(definition: EnvironmentDefinition, feature_map: FeatureMap, i
 
 def _of_action(definition: EnvironmentDefinition, feature_map: FeatureMap, entry: int) -> list[Feature]:
     action, place = definition.action, len(definition.coordinates) + entry
-    if action.kind == "box":
-        low, high = action.low[entry], action.high[entry]
+    if not action.nvec:
+        low, high = action.ranges[entry]
         return [Feature("affine", place, (low + high) / 2, (high - low) / math.sqrt(12))]
     count = action.nvec[entry]
     if feature_map.action == "one_hot" and count > 2:

@@ -53,6 +53,6 @@ def _places(definition: EnvironmentDefinition, q: Array, u: Array) -> Array:
     for entry, count in enumerate(definition.action.nvec):
         columns += [np.where(u[:, entry] == value, np.sqrt(0.5), 0.0) for value in range(count)]
     if not definition.action.nvec:
-        least, most = definition.action.limits
+        least, most = definition.action_limits
         columns += list(((u - least) / (most - least)).T)
     return np.stack(columns, 1)

@@ -64,7 +64,7 @@ def from_unit(definition: EnvironmentDefinition, p: Tensor) -> tuple[Tensor, Ten
     action, u = definition.action, p[:, size:]
     if action.nvec:
         return q, torch.floor(u * torch.tensor(action.nvec, dtype=p.dtype))
-    low, high = (torch.tensor(limit, dtype=p.dtype) for limit in (action.low, action.high))
+    low, high = torch.tensor(action.ranges, dtype=p.dtype).T
     return q, low + (high - low) * u
 
 

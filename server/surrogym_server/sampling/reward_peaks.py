@@ -119,9 +119,7 @@ def _in_space(definition: EnvironmentDefinition, points: Tensor) -> Tensor:
 
 def _limits(definition: EnvironmentDefinition) -> tuple[Tensor, Tensor]:
     """Return the lower and upper ends of the ranges of all coordinates and action entries, (C + F,) each."""
-    action = definition.action
-    ranges = [limits(c.sampling) for c in definition.coordinates]
-    ranges += [(0.0, n - 1.0) for n in action.nvec] or list(zip(action.low, action.high, strict=True))
+    ranges = [*(limits(c.sampling) for c in definition.coordinates), *definition.action.ranges]
     low, high = torch.tensor(ranges, dtype=torch.float64).T
     return low, high
 

@@ -317,7 +317,7 @@ def _random_actions(definition: EnvironmentDefinition, count: int, rng: np.rando
     action = definition.action
     if action.nvec:
         return rng.integers(action.nvec, size=(count, action.size)).astype(np.float64)
-    low, high = action.limits
+    low, high = definition.action_limits
     p = rng.random((count, action.size))
     extreme = rng.random((count, action.size)) < 0.5
     return np.asarray(low + (high - low) * np.where(extreme, p.round(), p))

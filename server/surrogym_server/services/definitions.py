@@ -119,7 +119,7 @@ def check_points(definition: EnvironmentDefinition, q: Array, u: Array) -> tuple
         raise InvalidInput(
             f"expected one action for each row of coordinates, got {len(u)} actions and {len(q)} rows of coordinates"
         )
-    return q, model_actions(definition.action, u)
+    return q, model_actions(definition, u)
 
 
 def check_steps(definition: EnvironmentDefinition, queries: Sequence[Query]) -> list[Query]:
@@ -130,7 +130,7 @@ def check_steps(definition: EnvironmentDefinition, queries: Sequence[Query]) -> 
             an action is out of bounds.
     """
     q = check_settable(definition, np.array([query.coordinates for query in queries]))
-    u = model_actions(definition.action, np.array([query.action for query in queries]))
+    u = model_actions(definition, np.array([query.action for query in queries]))
     return [Query.step(*step) for step in zip(q.tolist(), u.tolist(), strict=True)]
 
 
@@ -147,7 +147,7 @@ def check_rollouts(definition: EnvironmentDefinition, queries: Sequence[Query]) 
             raise InvalidInput(
                 f"rollouts: expected at most {longest} actions in a rollout, got {query.steps}: split the rollout"
             )
-    actions = (model_actions(definition.action, np.array(query.actions)) for query in queries)
+    actions = (model_actions(definition, np.array(query.actions)) for query in queries)
     return [Query.rollout(u.tolist(), query.snapshot) for u, query in zip(actions, queries, strict=True)]
 
 

@@ -164,7 +164,7 @@ class ModelService:
         """
         version, model = self._model(name, version)
         start = check_coordinates(model.definition, "coordinates", q[None])[0]
-        actions = model_actions(model.definition.action, u)
+        actions = model_actions(model.definition, u)
         with plugin_calls(model.definition, interrupts=True):
             return Said(version, model.definition.outputs, imagine(model, start, actions, draws=draws, seed=seed))
 

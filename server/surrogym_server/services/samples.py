@@ -183,7 +183,7 @@ def _checked(definition: EnvironmentDefinition, index: int, sample: NewSample) -
     for what in ("observation", "next_observation"):
         _check_observation(definition, f"{where}.{what}", getattr(sample, what))
     try:
-        action = model_actions(definition.action, np.array([sample.action]))
+        action = model_actions(definition, np.array([sample.action]))
     except InvalidInput as error:
         raise InvalidInput(f"{where}: {str(error).removesuffix(' in row 0')}") from error
     return replace(sample, action=tuple(action[0].tolist()))

@@ -59,7 +59,7 @@ class EngineCase:
 
     def action(self, number: int = 0) -> NDArray[np.float64]:
         """Return random actions (N, 1) within their bounds; ``number`` is the seed."""
-        low, high = self.definition.action.limits
+        low, high = self.definition.action_limits
         share: NDArray[np.float64] = np.random.default_rng(number).uniform(0.1, 0.9, (LANES, 1))
         return low + share * (high - low)
 

@@ -19,7 +19,7 @@ from surrogym_shared.logs.rows import require_units, rows_of, unit_notes
 from surrogym_shared.logs.table import Bools, Floats, Table, UnusableLog
 from surrogym_shared.logs.transitions import Transitions, require_steps, transitions_of
 from surrogym_shared.logs.writing import spreadsheet_cell
-from surrogym_shared.spec import BoxAction, DiscreteAction, EnvironmentSpec
+from surrogym_shared.spec import BoxAction, EnvironmentSpec
 from surrogym_shared.terms import terminates
 
 SHOWN = 8  # an error message shows at most this many different values of a column
@@ -167,8 +167,7 @@ def _require_choices(spec: EnvironmentSpec, roles: Roles, values: Floats) -> Non
     """
     if isinstance(spec.action, BoxAction):
         return
-    counts = (spec.action.n,) if isinstance(spec.action, DiscreteAction) else spec.action.nvec
-    for name, count, column in zip(roles.action, counts, values.T, strict=True):
+    for name, count, column in zip(roles.action, spec.action.nvec, values.T, strict=True):
         if (declared := roles.choices.get(name)) is not None:
             if len(declared) != count:
                 raise UnusableLog(

@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from surrogym_shared.lazy import on_first_use
-from surrogym_shared.spec.actions import BoxAction, DiscreteAction, MultiDiscreteAction
+from surrogym_shared.spec.actions import Action, BoxAction, DiscreteAction, MultiDiscreteAction
 from surrogym_shared.spec.base import MAX_DIMENSIONS, MAX_ROLLOUT_QUERY, ends_of
 from surrogym_shared.spec.coordinates import Bounds, Coordinate, Fixed, Lag, Normal, Uniform, limits
 from surrogym_shared.spec.environment import Access, AcquisitionChoice, Choice, Design, EnvironmentSpec, ModelChoice
@@ -26,6 +26,7 @@ __all__ = [
     "MAX_ROLLOUT_QUERY",
     "Access",
     "AcquisitionChoice",
+    "Action",
     "AllOf",
     "Bounds",
     "BoxAction",

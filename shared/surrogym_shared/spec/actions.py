@@ -53,6 +53,21 @@ class BoxAction(Frozen):
     def size(self) -> int:
         return len(self.low)
 
+    @property
+    def nvec(self) -> tuple[int, ...]:
+        """Number of values of each discrete entry: there is none."""
+        return ()
+
+    @property
+    def policy_counts(self) -> tuple[int, ...]:
+        """Number of values of each entry of a policy's action; empty if its actions are continuous."""
+        return self.bins or ()
+
+    @property
+    def ranges(self) -> tuple[tuple[float, float], ...]:
+        """Lowest and highest value of each entry."""
+        return tuple(zip(self.low, self.high, strict=True))
+
 
 class DiscreteAction(Frozen):
     """Discrete action: one of n, numbered 0 to n - 1."""
@@ -63,6 +78,21 @@ class DiscreteAction(Frozen):
     @property
     def size(self) -> int:
         return 1
+
+    @property
+    def nvec(self) -> tuple[int, ...]:
+        """Number of values of each entry."""
+        return (self.n,)
+
+    @property
+    def policy_counts(self) -> tuple[int, ...]:
+        """Number of values of each entry of a policy's action."""
+        return self.nvec
+
+    @property
+    def ranges(self) -> tuple[tuple[float, float], ...]:
+        """Lowest and highest value of each entry."""
+        return ((0.0, self.n - 1.0),)
 
 
 class MultiDiscreteAction(Frozen):
@@ -76,6 +106,16 @@ class MultiDiscreteAction(Frozen):
     @property
     def size(self) -> int:
         return len(self.nvec)
+
+    @property
+    def policy_counts(self) -> tuple[int, ...]:
+        """Number of values of each entry of a policy's action."""
+        return self.nvec
+
+    @property
+    def ranges(self) -> tuple[tuple[float, float], ...]:
+        """Lowest and highest value of each entry."""
+        return tuple((0.0, n - 1.0) for n in self.nvec)
 
 
 Action = Annotated[BoxAction | DiscreteAction | MultiDiscreteAction, Field(discriminator="kind")]

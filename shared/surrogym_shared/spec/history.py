@@ -95,12 +95,7 @@ def _of_changes(coordinate: Coordinate, count: int, largest: float) -> Iterable[
 
 def _of_actions(spec: EnvironmentSpec, entry: int, count: int) -> Iterable[Coordinate]:
     """Yield coordinates that repeat the last ``count`` values of an entry of the action, the latest value first."""
-    action = spec.action
-    if isinstance(action, BoxAction):
-        low, high = action.low[entry], action.high[entry]
-    else:
-        numbers = (action.n,) if action.kind == "discrete" else action.nvec
-        low, high = 0.0, float(numbers[entry] - 1)
+    low, high = spec.action.ranges[entry]
     for age in range(1, count + 1):
         name = f"action{entry}.lag"
         lag = Lag(kind="action", entry=entry) if age == 1 else Lag(kind="value", of=f"{name}{age - 1}")

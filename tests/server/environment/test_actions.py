@@ -1,17 +1,21 @@
 """The door for actions: what a policy may send, what the model gets, and every refusal."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from surrogym_sampler.original.classic import pendulum
+from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.actions import model_actions, policy_actions
-from surrogym_server.environment.definition import ActionDefinition
 from surrogym_server.errors import InvalidInput
+from surrogym_shared.spec import BoxAction, DiscreteAction, MultiDiscreteAction
 
-BOX = ActionDefinition("box", low=(-2.0, 0.0), high=(2.0, 1.0))
-TORQUE = ActionDefinition("box", low=(-2.0,), high=(2.0,))
-BINS = ActionDefinition("box", low=(-2.0, 0.0), high=(2.0, 1.0), bins=(5, 3))
-DISCRETE = ActionDefinition("discrete", nvec=(3,))
-SEVERAL = ActionDefinition("multi_discrete", nvec=(3, 2))
+PENDULUM = definition_from_spec(pendulum())
+BOX = replace(PENDULUM, action=BoxAction(low=(-2.0, 0.0), high=(2.0, 1.0)))
+BINS = replace(PENDULUM, action=BoxAction(low=(-2.0, 0.0), high=(2.0, 1.0), bins=(5, 3)))
+DISCRETE = replace(PENDULUM, action=DiscreteAction(n=3))
+SEVERAL = replace(PENDULUM, action=MultiDiscreteAction(nvec=(3, 2)))
 
 
 def test_discretised_actions_are_equally_spaced_between_the_action_bounds():
@@ -24,7 +28,7 @@ def test_real_queries_and_samples_may_use_actions_between_the_bins():
 
 
 def test_one_dimensional_actions_may_be_given_as_a_flat_array():
-    np.testing.assert_array_equal(policy_actions(TORQUE, np.array([1.0, -1.0]), 2), [[1.0], [-1.0]])
+    np.testing.assert_array_equal(policy_actions(PENDULUM, np.array([1.0, -1.0]), 2), [[1.0], [-1.0]])
     np.testing.assert_array_equal(policy_actions(DISCRETE, np.array([2, 0]), 2), [[2.0], [0.0]])
 
 
@@ -34,7 +38,7 @@ def test_valid_discrete_actions_of_policies_and_samples_are_not_changed():
 
 
 def test_an_action_outside_its_bound_by_float32_rounding_is_clipped():
-    tenth = ActionDefinition("box", low=(-0.1,), high=(0.1,))
+    tenth = replace(PENDULUM, action=BoxAction(low=(-0.1,), high=(0.1,)))
     rounded = np.array([[np.float32(0.1)]], dtype=np.float64)
     assert rounded[0, 0] > 0.1
     assert policy_actions(tenth, rounded, 1)[0, 0] == 0.1
@@ -49,7 +53,7 @@ def test_a_discrete_action_out_of_range_is_refused_with_its_entry_and_row(count)
 
 
 @pytest.mark.parametrize(
-    ("action", "raw", "complaint"),
+    ("definition", "raw", "complaint"),
     [
         (BOX, np.zeros((2, 3)), r"expected shape \(2, 2\), got \(2, 3\)"),
         (BOX, np.zeros((3, 2)), r"expected shape \(2, 2\), got \(3, 2\)"),
@@ -62,12 +66,12 @@ def test_a_discrete_action_out_of_range_is_refused_with_its_entry_and_row(count)
         (SEVERAL, np.array([[0, 0], [0, 2]]), r"entry 1 to be from 0 to 1, got 2 in row 1"),
     ],
 )
-def test_invalid_policy_actions_are_refused(action, raw, complaint):
+def test_invalid_policy_actions_are_refused(definition, raw, complaint):
     with pytest.raises(InvalidInput, match=complaint):
-        policy_actions(action, raw, 2)
+        policy_actions(definition, raw, 2)
 
 
 def test_invalid_actions_in_samples_are_refused():
-    for action, raw in ((BINS, [[2.5, 0]]), (DISCRETE, [[1.5]]), (DISCRETE, [[3]]), (BOX, [[np.nan, 0]])):
+    for definition, raw in ((BINS, [[2.5, 0]]), (DISCRETE, [[1.5]]), (DISCRETE, [[3]]), (BOX, [[np.nan, 0]])):
         with pytest.raises(InvalidInput):
-            model_actions(action, np.array(raw))
+            model_actions(definition, np.array(raw))

@@ -10,10 +10,10 @@ import torch
 from surrogym_sampler.original.classic import acrobot, mountain_car_continuous, pendulum
 from surrogym_sampler.original.mujoco_tasks import reacher
 from surrogym_server.convert import definition_from_spec
-from surrogym_server.environment.definition import ActionDefinition
+from surrogym_server.environment.distributions import quantiles
 from surrogym_server.environment.features import Encoder, FeatureMap, encode, leading
 from surrogym_server.models.gaussian_process.feature_maps import candidates
-from surrogym_shared.spec import Design
+from surrogym_shared.spec import Design, DiscreteAction, MultiDiscreteAction
 
 
 def row(*values: float) -> torch.Tensor:
@@ -54,7 +54,7 @@ def test_turning_an_angle_by_a_full_turn_changes_no_feature(pendulum_definition)
 
 @pytest.mark.parametrize("count", [2, 3, 7])
 def test_discrete_actions_as_values_have_mean_zero_and_deviation_one(pendulum_definition, count):
-    definition = replace(pendulum_definition, action=ActionDefinition("discrete", nvec=(count,)))
+    definition = replace(pendulum_definition, action=DiscreteAction(n=count))
     u = torch.arange(count, dtype=torch.float64)[:, None]
     column = encode(definition, FeatureMap(), torch.zeros(count, 2, dtype=torch.float64), u)[:, -1]
     assert float(column.mean()) == pytest.approx(0, abs=1e-12)
@@ -62,7 +62,7 @@ def test_discrete_actions_as_values_have_mean_zero_and_deviation_one(pendulum_de
 
 
 def test_discrete_actions_can_be_encoded_one_hot(pendulum_definition):
-    definition = replace(pendulum_definition, action=ActionDefinition("multi_discrete", nvec=(3, 2)))
+    definition = replace(pendulum_definition, action=MultiDiscreteAction(nvec=(3, 2)))
     made = encode(definition, FeatureMap("wrapped", "one_hot"), row(0, 0), row(2, 1))
     assert_features(made, 0, 0, 0, 0, 1, 1)
 
@@ -94,7 +94,7 @@ def test_encoding_several_feature_maps_at_once_equals_encoding_each_alone(task):
 def test_an_observation_is_standardised_over_the_sampling_range():
     definition = definition_from_spec(reacher())
     p = torch.from_numpy(np.random.default_rng(1).uniform(size=(2_000, 6)))
-    q = torch.stack([c.sampling.quantile(p[:, i]) for i, c in enumerate(definition.coordinates)], -1)
+    q = quantiles([c.sampling for c in definition.coordinates], p)
     made = encode(definition, FeatureMap("observation"), q, torch.zeros(2_000, 2, dtype=torch.float64))[:, :10]
     torch.testing.assert_close(made.mean(0), torch.zeros(10, dtype=torch.float64), atol=0.1, rtol=0)
     torch.testing.assert_close(made.std(0), torch.ones(10, dtype=torch.float64), atol=0.1, rtol=0)

@@ -31,7 +31,7 @@ def drawn(definition: EnvironmentDefinition, count: int, share: float) -> tuple[
     rng = np.random.default_rng(0)
     low = np.array([c.sampling.low for c in definition.coordinates])
     high = np.array([c.sampling.high for c in definition.coordinates])
-    least, most = definition.action.limits
+    least, most = definition.action_limits
     q = low + share * (high - low) * rng.random((count, len(low)))
     return q, least + (most - least) * rng.random((count, len(least)))
 

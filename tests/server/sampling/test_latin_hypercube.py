@@ -12,10 +12,9 @@ from scipy.stats import truncnorm
 
 from surrogym_sampler.original.classic import acrobot, pendulum
 from surrogym_server.convert import definition_from_spec
-from surrogym_server.environment.definition import ActionDefinition
 from surrogym_server.environment.distributions import Distribution
 from surrogym_server.sampling.latin_hypercube import going_on, latin_hypercube, random_points
-from surrogym_shared.spec import Coordinate, Normal, Uniform, limits
+from surrogym_shared.spec import BoxAction, Coordinate, MultiDiscreteAction, Normal, Uniform, limits
 
 PENDULUM = definition_from_spec(pendulum())
 
@@ -28,10 +27,8 @@ normal = st.builds(
     st.floats(0.5, 4),
 )
 actions = st.one_of(
-    st.just(ActionDefinition("box", low=(-1.0, 0.0), high=(1.0, 5.0))),
-    st.builds(
-        lambda n: ActionDefinition("multi_discrete", nvec=tuple(n)), st.lists(st.integers(2, 5), max_size=2, min_size=1)
-    ),
+    st.just(BoxAction(low=(-1.0, 0.0), high=(1.0, 5.0))),
+    st.builds(lambda n: MultiDiscreteAction(nvec=tuple(n)), st.lists(st.integers(2, 5), max_size=2, min_size=1)),
 )
 
 
@@ -70,8 +67,8 @@ def test_a_latin_hypercube_has_one_point_per_stratum_of_each_dimension(distribut
     assert u.shape == (count, action.size)
     for i, distribution in enumerate(distributions):
         assert_stratified(probability(distribution, q[:, i].numpy()))
-    for entry in range(len(action.low)):
-        assert_stratified(probability(Uniform(low=action.low[entry], high=action.high[entry]), u[:, entry].numpy()))
+    for entry, (low, high) in enumerate(() if action.nvec else action.ranges):
+        assert_stratified(probability(Uniform(low=low, high=high), u[:, entry].numpy()))
     for entry, n in enumerate(action.nvec):
         counts = np.bincount(u[:, entry].long().numpy(), minlength=n)
         assert len(counts) == n

@@ -70,7 +70,7 @@ def actions(model: GaussianProcessModel, rng: np.random.Generator) -> np.ndarray
     action = model.definition.action
     if action.nvec:
         return rng.integers(action.nvec, size=(LANES, action.size)).astype(float)
-    return rng.uniform(*action.limits, (LANES, action.size))
+    return rng.uniform(*model.definition.action_limits, (LANES, action.size))
 
 
 def require_agreement(one: tuple[LaneState, LaneTransition], other: tuple[LaneState, LaneTransition]) -> None:

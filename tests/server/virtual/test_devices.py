@@ -41,7 +41,7 @@ def model(request: pytest.FixtureRequest) -> GaussianProcessModel:
 def run(model: GaussianProcessModel, settings: VirtualSettings) -> tuple[LaneState, list[LaneTransition]]:
     """Some steps from a seeded reset, some lanes of which are reset again."""
     definition, rng = model.definition, np.random.default_rng(0)
-    low, high = definition.action.limits if definition.action.low else (0, np.array(definition.action.nvec) - 1)
+    low, high = definition.action_limits
     lanes, _ = reset(definition, settings, create(definition, settings, 0), list(range(LANES)))
     made = []
     for _ in range(STEPS):

@@ -154,7 +154,7 @@ def _require_fit(predict: Predict, spec: EnvironmentSpec, misfit: str) -> None:
     """Raise ``CommandError`` if a policy network has other observations or actions than the surrogate. The message
     begins with ``misfit``."""
     from surrogym.cli.errors import CommandError
-    from surrogym_shared.network import Network, counts_of
+    from surrogym_shared.network import Network
 
     if not isinstance(predict, Network):
         return
@@ -163,7 +163,7 @@ def _require_fit(predict: Predict, spec: EnvironmentSpec, misfit: str) -> None:
         raise CommandError(
             f"{misfit}: expected a policy that reads {own} numbers of the observation, got one that reads {seen}"
         )
-    choices = counts_of(spec)
+    choices = spec.action.policy_counts
     wanted, got = choices or spec.action.size, predict.counts or len(predict.low)
     if wanted != got:
         raise CommandError(f"{misfit}: expected a policy with {_actions(wanted)}, got one with {_actions(got)}")

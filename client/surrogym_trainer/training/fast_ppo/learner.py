@@ -30,7 +30,7 @@ from surrogym_shared.archives import Header, read_arrays, read_entries
 from surrogym_shared.compiled import available
 from surrogym_shared.distributions import Sampled, log_softmax, middle_and_reach
 from surrogym_shared.kinds import Activation
-from surrogym_shared.network import MAX_BYTES, Layer, Network, bounds_of, counts_of
+from surrogym_shared.network import MAX_BYTES, Layer, Network, bounds_of
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_trainer.policies.card import UnusablePolicy
 from surrogym_trainer.policies.defaults import CRITIC, EXPLORATION
@@ -270,7 +270,7 @@ class Learner:
         """
         self._spec = spec
         self.mean, self.deviation = mean.astype(np.float32), deviation.astype(np.float32)
-        self.distribution = distribution_of(counts_of(spec), *bounds_of(spec))
+        self.distribution = distribution_of(spec.action.policy_counts, *bounds_of(spec))
         inputs, further = len(spec.observation), self.distribution.further()
         actor, critic = (inputs, *units, self.distribution.outputs), (inputs, *CRITIC, 1)
         ends = np.cumsum([Mlp.count(actor), Mlp.count(critic), len(further)])
@@ -381,7 +381,7 @@ class Learner:
             self.deviation.astype(np.float64),
             tuple(Layer(weights.astype(np.float64), bias.astype(np.float64)) for weights, bias in layers),
             *bounds_of(self._spec),
-            counts_of(self._spec),
+            self._spec.action.policy_counts,
             self.distribution.activation,
         )
 

@@ -15,7 +15,7 @@ from threadpoolctl import threadpool_limits
 
 from surrogym_client.environments.lanes import Lanes, session_request
 from surrogym_sampler.original.protocol import LONGEST_EPISODE
-from surrogym_shared.network import Network, counts_of
+from surrogym_shared.network import Network
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_trainer.evaluation.imagined import DECLARED, observation_statistics
 from surrogym_trainer.policies.defaults import HIDDEN, LANES, LEARNING_RATE, WIDER, decaying
@@ -250,7 +250,7 @@ class _Training:
                 yield self._saved, 1
             elif not anew:
                 yield self._new, 1
-        continuous = not counts_of(self._spec) and self._spec.preset.adapts_training
+        continuous = not self._spec.action.policy_counts and self._spec.preset.adapts_training
         for number in itertools.count():
             yield self._made(), HELD if continuous and number % 2 == 0 else 1
 
