@@ -23,9 +23,9 @@ class SurrogateVecEnv(VecEnv):
 
     Infos have ``TimeLimit.truncated``, ``model_version`` and ``reward_mean``, and at the end of an episode
     ``terminal_observation``. In a session with a penalty, the last info of an episode has ``penalty``: the amount it
-    subtracted from the episode's return. In a session with a trust region, ``untrusted`` says whether leaving it
-    truncated the episode. An episode that ends because the server lost the session is truncated, with the reason in
-    ``surrogym_session_lost``.
+    subtracted from the episode's return. In a session with the option ``trust``, ``untrusted`` says whether the episode
+    was truncated because the model is too uncertain in its state. An episode that ends because the server lost the
+    session is truncated, with the reason in ``surrogym_session_lost``.
 
     Args:
         url: the server's address; None takes ``SURROGYM_URL``, then http://127.0.0.1:8000.
@@ -63,7 +63,8 @@ class SurrogateVecEnv(VecEnv):
 
     @classmethod
     def from_port(cls, port: SurrogatePort, num_envs: int = 16, **options: Any) -> Self:
-        """Make the vector environment from an existing port, such as one in this process."""
+        """Make the vector environment from an interface of a surrogate (port), such as that of a surrogate in this
+        process."""
         env = cls.__new__(cls)
         env._open(port, num_envs, options)
         return env

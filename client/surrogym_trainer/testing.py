@@ -127,7 +127,8 @@ class _Failure(Exception):
 
 
 class _Watched:
-    """A port that forwards all calls to another port, and records which sessions are open."""
+    """An interface of a surrogate (port) that forwards all calls to another one, and records which sessions are
+    open."""
 
     def __init__(self, port: SurrogatePort) -> None:
         self._port = port

@@ -196,13 +196,15 @@ def _sizes(spec: EnvironmentSpec, units: int | Sequence[int]) -> list[int]:
 
 def _read_head(content: bytes) -> _Head:
     if len(content) > MAX_HEAD_BYTES:
-        raise ValueError(f"expected {HEAD} of at most {MAX_HEAD_BYTES} bytes, got {len(content)}")
+        raise ValueError(
+            f"expected the entry {HEAD} of a policy's file to have at most {MAX_HEAD_BYTES} bytes, got {len(content)}"
+        )
     try:
         return _Head.model_validate_json(content)
     except ValidationError as error:
         from surrogym_shared.faults import first_fault  # imported here, because only an error needs it
 
-        raise ValueError(f"its entry {HEAD} is invalid: {first_fault(error)}") from error
+        raise ValueError(f"the entry {HEAD} of the policy's file is invalid: {first_fault(error)}") from error
 
 
 def _require_chain(head: _Head, headers: Mapping[str, Header]) -> None:

@@ -52,8 +52,8 @@ class Preset:
             coordinates: number of the state's coordinates.
             observations: number of the observation's entries.
             actions: number of the action's entries.
-            by_steps: True if each query is a single step, from a state to which the environment is set or from a saved
-                state; False if queries are rollouts from a reset.
+            by_steps: True if queries are single steps from states to which the environment is set, or may begin at
+                saved states; False if all queries are rollouts from a reset.
         """
         if self.name == "paper":
             return 10 * (observations + actions)  # the paper's number of initial real steps, in section 3.1

@@ -214,7 +214,9 @@ def _array(entry: Any, body: bytes) -> NDArray[Any]:
     that ``UNREADABLE`` lists."""
     dtype, shape, (start, stop) = DTYPES[entry["dtype"]], [int(n) for n in entry["shape"]], entry["data_offsets"]
     if min(shape, default=0) < 0 or not 0 <= start <= stop <= len(body):
-        raise ValueError(f"expected an array within {len(body)} bytes, got one from byte {start} to {stop}")
+        raise ValueError(
+            f"expected an array within the file's {len(body)} bytes of arrays, got one from byte {start} to {stop}"
+        )
     if math.prod(shape) * dtype.itemsize != stop - start:
         raise ValueError(f"expected an array of shape {shape} to fill its bytes, got {stop - start} bytes")
     raw = np.frombuffer(body[start:stop], dtype=np.uint8 if dtype == np.bool_ else dtype).reshape(shape)

@@ -215,7 +215,10 @@ def test_network_arrays_that_would_broadcast_to_a_huge_size_are_refused(tmp_path
         ({"counts": [], "version": 3}, "version: expected 1 or 2"),
         ({"counts": [], "version": 2}, "expected the arrays bias0, bias1, .*, got deviation, hidden"),
         ({"counts": [], "version": 2, "layers": 9}, "layers: expected a number less than or equal to 8"),
-        ({"counts": [1] * 50_000}, "expected surrogym-network.json of at most 65536 bytes, got "),
+        (
+            {"counts": [1] * 50_000},
+            "expected the entry surrogym-network.json of a policy's file to have at most 65536 bytes, got ",
+        ),
     ],
     ids=["too many", "negative", "text", "version", "names", "layers", "long"],
 )

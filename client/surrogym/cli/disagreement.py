@@ -176,7 +176,8 @@ class Imagining:
 
     def changes(self, api: Api, view: SurrogateView, shifted: Systematic, weights: Any) -> Any:
         """Return the changes (K,) of the mean return of virtual episodes that K errors of the surrogate's model cause.
-        ``shifted`` and ``weights`` describe the errors, as in ``changes_of``."""
+        ``shifted`` names the outputs and standardises the inputs; ``weights`` (K, O, 1 + P) has for each error and
+        output a constant and a factor for each of P inputs."""
         from surrogym_client.transport import HttpSurrogate
         from surrogym_trainer.evaluation.comparing import EFFECT_STARTS, changes_of
         from surrogym_trainer.training.cards import session_of

@@ -68,7 +68,7 @@ class DemoSettings:
     @property
     def prolong(self) -> bool:
         """Whether the training is prolonged while the return still rises. This requires that the policy search supports
-        it, and that no number of virtual steps is given (see ``prolongs``)."""
+        it, that no number of virtual steps is given, and that the preset is not ``paper``."""
         return SEARCHES.get(self.search).prolongable and prolongs(TrainSettings(total_steps=self.steps), self.spec())
 
     @property

@@ -1,4 +1,5 @@
-"""Run a policy in the lanes of a session: one request for a whole rollout if the port supports it, else step by step.
+"""Run a policy in the lanes of a session: by one request for a whole rollout if the interface of the surrogate (port)
+supports this, else step by step.
 
 Shapes: N lanes, D observation entries, F action entries, T steps.
 """

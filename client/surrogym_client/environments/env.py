@@ -26,14 +26,15 @@ class RemoteEnv(gymnasium.Env[Observation, Any]):
 
     ``reset(seed=s)`` starts episode 0 of seed s, and ``reset()`` starts the next episode. The server applies the time
     limit, after which an episode is ``truncated``. ``info`` has ``model_version`` and, after a step, ``reward_mean``
-    (the reward before the penalty) and, if requested, ``deviation`` (O,) of the O model outputs. In a session with a
-    trust region, ``untrusted`` is whether leaving it truncated the episode. With declared limits or an outside reward,
-    ``left`` is whether the episode ended at a limit or outside of the sampling range. If the server loses the
-    session, the episode is truncated with the reason in ``info["surrogym_session_lost"]``, and the next reset begins in
-    a new session.
+    (the reward before the penalty) and, if requested, ``deviation`` (O,) of the O model outputs. In a session with the
+    option ``trust``, ``untrusted`` is whether the episode was truncated because the model is too uncertain in its
+    state. If the specification declares limits, or a reward outside of the sampling range, ``left`` is whether the
+    episode ended where the fallback of the limits acts, or outside of the range. If the server loses the session, the
+    episode is truncated with the reason in ``info["surrogym_session_lost"]``, and the next reset begins in a new
+    session.
 
     Args:
-        port: the surrogate.
+        port: the interface of the surrogate.
         deviations: whether steps return the predicted standard deviation of each model output.
         render_mode: None, or rgb_array: the state is drawn by the original environment's renderer, if it is installed.
         original: ``package.module:factory`` of your own environment, for rendering.

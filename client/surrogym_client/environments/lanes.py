@@ -78,7 +78,7 @@ class Lanes:
     """The N lanes (environments that step together) of a session of a surrogate. Making the object opens the session.
 
     Args:
-        port: the surrogate.
+        port: the interface of the surrogate.
         request: options of the session.
         deviations: whether each step returns the predicted standard deviation of each output.
     """
@@ -157,7 +157,8 @@ class Lanes:
 
     @property
     def rolls_policies(self) -> bool:
-        """Whether ``rollout`` can be used: the port supports it, and the autoreset mode is ``same_step``."""
+        """Whether ``rollout`` can be used: the interface of the surrogate (port) supports it, and the autoreset mode is
+        ``same_step``."""
         return self._rolls
 
     def rollout(

@@ -35,7 +35,7 @@ class RemoteVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
     int seed s seeds lane i with the pair (s, i); a list has one seed for each lane. Infos are as in ``RemoteEnv``.
 
     Args:
-        port: the surrogate.
+        port: the interface of the surrogate.
         num_envs: number of lanes, N.
         autoreset_mode: Gymnasium's enum, or its value or name.
         deviations: whether steps return the predicted standard deviation of each model output.
@@ -167,7 +167,9 @@ def _with_time_limit(options: dict[str, Any], max_episode_steps: int | None) -> 
     if max_episode_steps is None:
         return options
     if options.get("time_limit") is not None:
-        raise ValueError("expected either time_limit or max_episode_steps, which mean the same, got both")
+        raise ValueError(
+            "expected either time_limit or max_episode_steps, which mean the same, got both: leave one out"
+        )
     return options | {"time_limit": max_episode_steps}
 
 

@@ -134,7 +134,8 @@ def _of_limit(limit: ReachedLimit) -> str:
 
 
 def _widen(view: SurrogateView, output: OutputFidelity) -> str:
-    """Return the command that declares the tolerance with which the output would reach its target."""
+    """Return the command that declares a tolerance so large that the output would no longer keep the design from being
+    ready."""
     return f"surrogym change {view.name} --tolerance {output.name}={_within_reach(view, output):.2g}"
 
 
@@ -188,9 +189,12 @@ def _end(value: float | None) -> str | None:
 
 
 def _steps_to_go(view: SurrogateView, worst: OutputFidelity, models: Sequence[ModelView]) -> int | None:
-    """Forecast the real steps until the output reaches its target; None if it does not improve, or far too slowly.
+    """Forecast the real steps until the output no longer keeps the design from being ready: its confidence index
+    reaches the design's target, and its leave-one-out error the largest that is allowed. None if it does not improve,
+    or far too slowly.
 
-    The gap to the target is assumed to shrink as it did over the last half of the fits.
+    The error, and the distance of the index from 1, are assumed to shrink exponentially, as over the last half of the
+    fits.
     """
     late = models[len(models) // 2 :]
     seen = [(model.samples, output) for model in late for output in model.fidelity.outputs if output.name == worst.name]
@@ -239,7 +243,8 @@ def _forecast(samples: Sequence[float], values: Sequence[float], limit: float) -
 
 
 def _within_reach(view: SurrogateView, output: OutputFidelity) -> float:
-    """Return the tolerance with which the output would reach its target, if its standard deviation is even everywhere.
+    """Return the tolerance with which the output would no longer keep the design from being ready, if its standard
+    deviation is the same everywhere.
 
     The server adds the noise to a tolerance, but does not count noise that is much smaller than the tolerance.
     """

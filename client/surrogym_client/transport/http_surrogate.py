@@ -311,7 +311,9 @@ class HttpSurrogate:
             answer, _ = self._sent(live, sent)
             if digest_of(answer) != sent.digest:
                 raise self._given_up(
-                    live, f"the process that took it over answers the repeated request {sent.seq} differently"
+                    live,
+                    f"the process that took the session over answers the repeated request {sent.seq} differently than "
+                    "the process before",
                 )
 
     def _given_up(self, live: _Live, what: str) -> SurrogymClientError:

@@ -18,7 +18,8 @@ from surrogym_shared.spec.actions import Action
 
 
 def task_for(environment: str, preset: str) -> Task:
-    """Return the task with this Gymnasium id, in the version of the preset.
+    """Return the task with this Gymnasium id. With the preset ``paper``, it has the specification used in the paper, if
+    that differs from the usual one.
 
     Raises:
         KeyError: there is no classic control task with this id.

@@ -173,8 +173,8 @@ class Simulator(ABC):
         return np.atleast_1d(np.asarray(native_action(self.action, action), dtype=np.float64))
 
     def place(self, columns: list[int], coordinates: Array) -> None:
-        """Set the variables at the indices ``columns`` to coordinates (C,), and all other variables to their values in
-        ``rest``."""
+        """Set the variables at the indices ``columns`` to coordinates (C,), and all other variables to their fixed
+        values in the attribute ``rest``."""
         state = self.rest.copy()
         state[columns] = coordinates
         self.write(state)

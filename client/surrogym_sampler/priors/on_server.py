@@ -30,7 +30,7 @@ class ServerPrior(SimulatorPrior):
     Args:
         api: the connection to the server; the token needs the role admin.
         name: name of the surrogate that gets the prior.
-        simulator, spec, parameters, steps: as for ``SimulatorPrior``, with its errors.
+        simulator, spec, parameters, steps: as for ``SimulatorPrior``. Wrong values raise the same errors as there.
     """
 
     def __init__(

@@ -57,7 +57,10 @@ class Careful:
         except Exception as error:  # a user's code may raise anything
             raise StepRefused(f"the simulator failed: {type(error).__name__}: {error}") from error
         if not np.isfinite(numbers).all():
-            raise StepRefused("expected finite numbers from the simulator, got infinite numbers or NaN")
+            raise StepRefused(
+                "expected finite numbers from the simulator, got infinite numbers or NaN: correct the simulator, or "
+                "narrow the sampling ranges"
+            )
         return step
 
     def close(self) -> None:

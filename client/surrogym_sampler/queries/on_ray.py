@@ -39,7 +39,8 @@ class SamplerPlan:
         url: the server's address.
         token: the server's access token.
         surrogate: name of the surrogate.
-        environment: a name that ``isolated`` can open; its modules must be importable on the machines.
+        environment: name of the environment, such as a Gymnasium id or ``package.module:factory``; its modules must be
+            importable on the machines.
         spec: a specification that replaces the environment's own; None keeps the own one.
         step_limit: seconds that one real step may take.
         settings: settings of the sampler.

@@ -115,7 +115,8 @@ class Comparison:
         return total
 
     def _decided(self, moment: Moment, expected: Array) -> Array:
-        """Return the controller's action (F,), and record its difference from the policy's."""
+        """Return the deployed controller's action (F,) for the coordinates of this moment, and record its difference
+        from the policy's action, ``expected`` (F,)."""
         status, action = self._running.step(moment.coordinates[self._places])
         self._faults += status not in (0, LIMITED)
         self._differences.append(float((np.abs(action - expected) / self._width).max()) if status == 0 else 0.0)

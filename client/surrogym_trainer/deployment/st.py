@@ -185,7 +185,8 @@ END_IF
 
 
 def _rates(controller: Controller, real: str) -> Iterable[dict[str, str]]:
-    """Yield the values of the template ``RATED`` for each entry of the action with a largest change per step (rate)."""
+    """Yield the values of the template ``RATED`` for each entry of the action with a largest change per step (rate), as
+    numbers of the type ``real``."""
     for rate in controller.rates:
         yield {"entry": str(rate.entry), "last": str(rate.last), "change": _number(rate.change, real)}
 

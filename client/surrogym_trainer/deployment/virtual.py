@@ -50,7 +50,10 @@ class VirtualEpisode(Episode):
         )
 
     def place(self, coordinates: Array) -> Moment:
-        raise NotSettable(f"a session of a surrogate can't be set to {coordinates.tolist()}: it can only be reset")
+        raise NotSettable(
+            f"a session of a surrogate can't be set to the state {coordinates.tolist()}: it can only be reset, so "
+            "begin its episodes at the declared starts"
+        )
 
     def perturb(self, rng: np.random.Generator, sigma: float) -> None:
         del rng, sigma

@@ -166,7 +166,7 @@ class Consequence:
         """Return the promise of a model that has learned from the audit's steps, widened to the returns that the shared
         errors make likely.
 
-        The promise is unchanged if these errors hardly matter for the return.
+        If these errors hardly matter for the return, ``promise`` itself is returned.
         """
         if float(self.beyond.mean()) <= UNDECIDED:
             return promise
@@ -308,7 +308,8 @@ def earned(promise: Promise, floor: float | None) -> float:
 
 
 def chi_squared(degrees: int, above: float) -> float:
-    """Return the value that a chi-squared variable exceeds with probability ``above`` (Wilson and Hilferty 1931)."""
+    """Return the value that a chi-squared variable with this number of degrees of freedom exceeds with probability
+    ``above`` (Wilson and Hilferty 1931)."""
     z, c = NormalDist().inv_cdf(1 - above), 2 / (9 * degrees)
     return float(degrees * (1 - c + z * sqrt(c)) ** 3)
 
@@ -351,8 +352,9 @@ def gaps(spec: EnvironmentSpec, q: Array, u: Array, samples: tuple[Array, Array]
     ranges[ranges == 0] = np.inf
 
     def away(states: Array, actions: Array) -> Array:
-        """Return the distance (m, C + F) of each coordinate and action entry of the m states q and actions u from the
-        nearest value of the same entry in ``states`` (n, C) and ``actions`` (n, F)."""
+        """Return how far the m states and actions among which ``gaps`` chooses are from n others, ``states`` (n, C) and
+        ``actions`` (n, F): the distance (m, C + F) of each coordinate and action entry from the nearest value of the
+        same entry among the others."""
         off = differences(spec, q[:, None], states[None]), u[:, None] - actions[None]
         nearest: Array = np.abs(np.concatenate(off, 2)).min(1)
         return nearest
@@ -367,8 +369,8 @@ def gaps(spec: EnvironmentSpec, q: Array, u: Array, samples: tuple[Array, Array]
 
 
 def differences(spec: EnvironmentSpec, real: Array, predicted: Array) -> Array:
-    """Return real minus predicted coordinates (..., C). The difference of angles is taken by the shorter way around the
-    circle."""
+    """Return the coordinates ``real`` minus ``predicted``, (..., C) each. The difference of angles is taken by the
+    shorter way around the circle."""
     difference = real - predicted
     for index, coordinate in enumerate(spec.coordinates):
         if coordinate.kind == "angle":

@@ -263,7 +263,7 @@ def changes_of(
     The episodes with and without the errors have the same starts and the same noise, and follow the model's mean.
 
     Args:
-        port: the surrogate.
+        port: the interface of the surrogate.
         predict: the policy.
         seed: seed of the starts and the noise.
         session: fields of ``OpenSession`` that the policy was trained with.

@@ -43,9 +43,13 @@ class EvaluationSettings:
         episodes: number of episodes.
         first_seed: reset seed of the first episode; each further one adds 1.
         wide: whether to start anywhere in the sampling range.
-        start_scale: factor that widens the declared starts about their middle.
-        perturb: standard deviation of random factors on physical attributes.
-        explore: size of random changes of the actions, see ``explored``.
+        start_scale: factor by which declared starts are moved away from the middle of their range; 1 leaves them as
+            they are.
+        perturb: standard deviation of the random factors, of mean 1, by which physical attributes such as masses are
+            multiplied in each episode; 0 leaves them as they are.
+        explore: size of random changes of the actions, from 0 (none) to 1: the standard deviation of noise on a
+            continuous action, as a share of half its range; the probability that a discrete action becomes a random
+            one.
         parallel: number of instances of the environment that are open at once. None takes one for each episode if the
             environment declares that it runs in parallel, and a single one otherwise.
     """

@@ -69,7 +69,7 @@ def imagine(
     costs. A ``Network`` acts on the surrogate's side if that is supported, with the same returns.
 
     Args:
-        port: the surrogate.
+        port: the interface of the surrogate.
         predict: function from observations (N, D) to actions.
         episodes: number of episodes.
         seed: seed of their starts, or one for each episode; the same seed compares policies on the same starts.

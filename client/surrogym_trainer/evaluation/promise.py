@@ -40,7 +40,7 @@ def promise_of(
     Episodes follow each function from several starts, without any penalty.
 
     Args:
-        port: the surrogate.
+        port: the interface of the surrogate.
         predict: the policy; function from observations (N, D) to actions.
         seed: seed of functions and starts.
         session: fields of ``OpenSession`` that the policy was trained with. The fields ``variant`` and
@@ -62,8 +62,9 @@ def promise_of(
 def fallback_share(fallen: NDArray[np.bool_]) -> FallbackShare:
     """Predict the share of 100 real episodes in which the fallback of declared limits will act.
 
-    The share is predicted as ``interval`` predicts a return, from the share along each function.
-    If no virtual episode has a fallback, or all have one, the interval ends at the exact one-sided 95 % bound.
+    The function ``interval`` computes the prediction, with 1 as the return of a virtual episode in which the fallback
+    acts, and 0 as that of any other. If no virtual episode has a fallback, or all have one, the interval ends at the
+    exact one-sided 95 % bound.
 
     Args:
         fallen: mask (starts, functions) of the virtual episodes in which the fallback acts.

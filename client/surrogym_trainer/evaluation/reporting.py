@@ -65,8 +65,8 @@ def as_reported(
 
 
 def is_promised(settings: EvaluationSettings, result: Evaluation, trained_for: EnvironmentSpec | None) -> bool:
-    """Return whether episodes are of the kind to which a promise applies: declared starts, unchanged constants, and the
-    time limit of the policy's specification."""
+    """Return whether episodes are of the kind to which a promise applies: they start as declared, no constant
+    coordinate changed within an episode, and their time limit is that of the specification ``trained_for``."""
     return settings.declared and not result.varied and not has_other_limit(result, trained_for)
 
 

@@ -108,8 +108,8 @@ def read_card(policy: Path) -> PolicyCard:
         content = file.read(MAX_CARD_BYTES + 1)
     if len(content) > MAX_CARD_BYTES:
         raise UnusablePolicy(
-            f"{card_path(policy)} is not the card of a policy: expected at most {MAX_CARD_BYTES} bytes; download it "
-            "again"
+            f"{card_path(policy)} is not the card of a policy: expected at most {MAX_CARD_BYTES} bytes, got more; "
+            "download it again"
         )
     try:
         return PolicyCard.model_validate_json(content)

@@ -72,7 +72,8 @@ def read_check(folder: Path, policy: str) -> StoredCheck:
         content = file.read(MOST_BYTES + 1)
     if len(content) > MOST_BYTES:
         raise UnusableCheck(
-            f"{path} is not the check of a controller: expected at most {MOST_BYTES} bytes; run surrogym deploy --check"
+            f"{path} is not the check of a controller: expected at most {MOST_BYTES} bytes, got more; run "
+            "surrogym deploy --check"
         )
     try:
         check = StoredCheck.model_validate_json(content)

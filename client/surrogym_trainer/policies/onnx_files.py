@@ -71,7 +71,7 @@ def _check(content: bytes) -> None:
     import onnx
 
     if len(content) > MAX_BYTES:
-        raise ValueError(f"expected at most {MAX_BYTES} bytes: export a smaller network")
+        raise ValueError(f"expected a file of at most {MAX_BYTES} bytes, got more: export a smaller network")
     model = onnx.load_model_from_string(content)
     _check_self_contained(model)
     _for_lanes(model.graph)

@@ -125,7 +125,7 @@ def _read(policy: Path) -> list[wire.AddEvaluation]:
         content = file.read(MAX_WAITING_BYTES + 1)
     try:
         if len(content) > MAX_WAITING_BYTES:
-            raise ValueError(f"expected at most {MAX_WAITING_BYTES} bytes")
+            raise ValueError(f"expected a file of at most {MAX_WAITING_BYTES} bytes, got a larger one")
         return _WAITING.validate_json(content)
     except (ValidationError, ValueError) as error:
         said = first_fault(error) if isinstance(error, ValidationError) else str(error)

@@ -297,7 +297,10 @@ def _settings(data: Mapping[str, Any], replaced: set[str]) -> PolicySettings:
     try:
         return PolicySettings.model_validate({name: value for name, value in data.items() if name not in replaced})
     except ValidationError as error:
-        raise ValueError(f"in the file's entry data: {first_fault(error, got=True)}") from error
+        raise ValueError(
+            f"expected valid settings in the entry data of the policy's file, got this fault: "
+            f"{first_fault(error, got=True)}; save the policy again"
+        ) from error
 
 
 def _entry(entries: Mapping[str, bytes], name: str) -> bytes:

@@ -90,8 +90,10 @@ SIDE = 33
 
 @dataclass(frozen=True)
 class Cut:
-    """Maps of the model over two coordinates, whose indices are ``across`` and ``up``. Each value of ``uncertainty``
-    and of ``log_index`` is the largest over the outputs."""
+    """Maps of the model over two coordinates, whose indices are ``across`` and ``up``. ``uncertainty`` has standard
+    deviations as multiples of the tolerance, ``occupancy`` how often policies visit a state, and ``log_index`` the
+    logarithm of the paper's uncertainty index. Each value of ``uncertainty`` and ``log_index`` is the largest over the
+    outputs."""
 
     across: int
     up: int

@@ -32,7 +32,7 @@ def successes(evaluation: EvaluationView) -> str:
 
 
 def share(value: float) -> str:
-    """Return a share as a percentage. It is never rounded up to 100."""
+    """Return a share as a percentage in words. A share below 1 is never shown as 100 %."""
     if value >= 1:
         return "100 %"
     percent = 100 * value

@@ -45,7 +45,7 @@ class AuditedTraining:
     Attributes:
         api: the connection to the server.
         name: name of the surrogate.
-        port: the surrogate.
+        port: the interface of the surrogate.
         out: file to write the policy to.
         settings: settings of each training.
         rounds: settings of the closed loop; None trains without one.
@@ -135,7 +135,8 @@ class AuditedTraining:
 
         If ``needed`` is false, the steps are only taken if the model is not certain in these states. An unused round
         may raise the budget, which needs a token of the role admin. Returns whether more than ``taken`` real steps have
-        been counted by now.
+        been counted by now. ``number`` counts the audits; it is a part of the name under which the visited states are
+        submitted.
         """
         view = self.api.surrogate(self.name)
         if not needed and view.phase == "ready" and (view.confidence_index or 0.0) >= view.target:

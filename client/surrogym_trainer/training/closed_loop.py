@@ -111,13 +111,14 @@ class ClosedLoop:
     training shares. So the queries of a round depend on this training alone, and the same seeds choose the same
     queries. The rounds end once the confidence index over these states reaches the target that the design has for the
     whole range. In the rounds, virtual states follow the model's mean, so that a policy goes where the model predicts
-    the highest return. The settings of the last training depend on the phase that the design has then, see
-    ``chosen_for``. Only the last training may be prolonged, because a later round makes up for a short earlier one.
+    the highest return. The settings of the last training depend on whether the design is ready then, and on the noise
+    that it has confirmed. Only the last training may be prolonged, because a later round makes up for a short earlier
+    one.
 
     Attributes:
         api: the connection to the server.
         name: name of the surrogate.
-        port: the surrogate.
+        port: the interface of the surrogate.
         out: file to write the policy to, after every round.
         settings: settings of each training.
         rounds: number of rounds, and of queries in each.
@@ -250,8 +251,9 @@ def shares(settings: TrainSettings, rounds: int) -> tuple[int, int]:
     """Return the virtual steps of the whole training, including all rounds, and of each round.
 
     Steps that collect visited states are not included. If the user requested a number of steps, it limits the whole
-    training. Otherwise the last training has the suggested number; the rounds add to it, up to the paper's maximum. In
-    both cases each round takes ``ROUND_SHARE`` of the steps of the last training, or less if there are many rounds.
+    training. Otherwise the last training has the number of steps that is planned for a training without rounds. The
+    rounds add to it, but the sum is at most the paper's largest number of steps. In both cases each round takes
+    ``ROUND_SHARE`` of the steps of the last training, or less if there are many rounds.
     """
     planned, share = planned_steps(settings), min(ROUND_SHARE, 1 / (rounds + 1))
     if settings.total_steps is not None:
@@ -266,7 +268,7 @@ def visit(
     """Run the policy of a round from the declared starts, and submit the visited states to the surrogate.
 
     Args:
-        port: the surrogate.
+        port: the interface of the surrogate.
         learned: result of the round's training.
         settings: settings of the training.
         checkpoint: name under which the states are submitted.

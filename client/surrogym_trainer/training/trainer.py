@@ -28,10 +28,10 @@ def train(
     settings: TrainSettings | None = None,
     progress: Progress | None = None,
 ) -> TrainResult:
-    """Train a policy in the surrogate behind a port, and save it.
+    """Train a policy in a surrogate, and save it.
 
     Args:
-        port: the surrogate.
+        port: the interface of the surrogate.
         out: file to write the policy to; its settings are written beside it, to a file with the suffix .json.
         settings: settings of the training, which name the search.
         progress: called after every rollout, generation or other unit of the search.

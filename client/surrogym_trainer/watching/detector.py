@@ -140,7 +140,14 @@ class Detector:
 
     def _learn(self, known: NDArray[np.bool_], mean: Array, beyond: Array, noise: Array) -> None:
         """Update the estimated mean and noise of the errors by one step. Large errors are limited first, so that a
-        change or an outlier does not count as noise."""
+        change or an outlier does not count as noise.
+
+        Args:
+            known: mask (O,) of the outputs that the step tests.
+            mean: estimated mean (O,) of the errors before the step.
+            beyond: errors (O,) of the step, minus this mean.
+            noise: estimated standard deviation (O,) of the noise before the step.
+        """
         limited = beyond.clip(-OUTLYING * noise, OUTLYING * noise)
         self._sum += np.where(known, mean + limited, 0.0)
         self._squares += np.where(known, limited**2, 0.0)

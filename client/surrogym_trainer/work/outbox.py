@@ -149,7 +149,9 @@ def _read(path: Path) -> Waiting:
         content = file.read(MAX_BYTES + 1)
     try:
         if len(content) > MAX_BYTES:
-            raise UnusablePolicy(f"{path} has more than {MAX_BYTES} bytes: train smaller networks")
+            raise UnusablePolicy(
+                f"the result of a job in {path} has more than {MAX_BYTES} bytes: train smaller networks"
+            )
         return Waiting.model_validate_json(content)
     except ValidationError as error:
         raise UnusablePolicy(f"{path} is not the result of a job: {first_fault(error)}; delete the file") from error

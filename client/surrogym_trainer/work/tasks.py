@@ -79,7 +79,7 @@ def train(
 
     Args:
         api: the connection to the server.
-        port: the surrogate.
+        port: the interface of the surrogate.
         task: the training task.
         out: file to write the policy to.
         reporter: reports the progress.

@@ -148,8 +148,8 @@ def _of_spec(roles: Roles, spec: EnvironmentSpec) -> Roles:
         )
     if roles.reward is None and spec.reward.kind == "learned":
         raise UnusableLog(
-            "expected a column of the reward, which the specification has learned, got none: name it in a "
-            "mapping file (--map)"
+            "expected a column of the reward, because the specification says that the reward is learned from real "
+            "steps, got none: name it in a mapping file (--map)"
         )
     return replace(
         roles,

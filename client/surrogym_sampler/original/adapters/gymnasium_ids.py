@@ -54,7 +54,8 @@ def open_simulator(name: str) -> Simulator:
 
 
 def settable(name: str, env: Any, limit: int | None = None) -> GymnasiumSimulator | None:
-    """Return a simulator of an unwrapped environment that can be set to a state; None if its state can't be read."""
+    """Return a simulator of an unwrapped environment that can be set to a state; None if its state can't be read.
+    ``limit`` is the largest number of steps in an episode, None for no limit."""
     if hasattr(env, "model") and hasattr(env, "data"):
         return GymnasiumSimulator(name, env, _mujoco(env), env.model, env.data, limit=limit)
     if holds_numbers(env, "state"):

@@ -51,8 +51,8 @@ class Counted:
             self.simulator.write(state)
 
     def place(self, columns: list[int], coordinates: Array) -> None:
-        """Set the variables at the indices ``columns`` to coordinates (C,), and all other variables to their values in
-        the simulator's ``rest``."""
+        """Set the variables at the indices ``columns`` to coordinates (C,), and all other variables to the fixed values
+        that the simulator has for them (its attribute ``rest``)."""
         with self._failures(self.steps):
             self.simulator.place(columns, coordinates)
 

@@ -360,7 +360,8 @@ class _Draft:
 
     def _observed(self, frame: EnvironmentSpec, rng: np.random.Generator) -> tuple[Array, Array]:
         """Return states (n, C), and the simulator's observations in these states (n, D). They are random states of the
-        sampling ranges if the simulator's state can be set, else the states of the explored steps."""
+        sampling ranges, which ``frame`` has, if the simulator's state can be set, else the states of the explored
+        steps."""
         counted = self._counted
         if not (self._simulator.shows and self._probed.settable):
             return self._seen.next_states[:, self._kept], self._seen.observations

@@ -69,8 +69,8 @@ def _basis(frame: EnvironmentSpec, turning: Sequence[str]) -> list[Term]:
 
 
 def _weights(design: Array, entry: Array, tolerance: float) -> Array | None:
-    """Return weights (b,) with which b basis terms, whose values at n states are ``design`` (n, b), explain an
-    observation entry (n,); None if no weights do.
+    """Return weights (b,) with which b basis terms, whose values at n states are ``design`` (n, b), give an observation
+    entry (n,) with an error of at most ``tolerance``; None if no weights do.
 
     An observation in single precision has rounding errors, which many terms together would explain too. So a single
     term is tried first, then rounded weights of all terms, then exact ones.
@@ -91,7 +91,8 @@ def _sum(basis: Sequence[Term], weights: Array) -> Term | None:
 
 def _clip_of(frame: EnvironmentSpec, coordinates: Array, entry: Array) -> Term | None:
     """Return the term of an observation entry that is one coordinate, clipped to the entry's smallest and largest
-    value; None if the entry is not of this kind."""
+    value; None if the entry is not of this kind. ``entry`` (n,) has its values in n states with ``coordinates`` (n, C),
+    whose names ``frame`` has."""
     low, high = float(entry.min()), float(entry.max())
     for index, name in enumerate(frame.coordinate_names):
         if np.allclose(np.clip(coordinates[:, index], low, high), entry, atol=TOLERANCE):

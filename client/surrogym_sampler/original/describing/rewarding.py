@@ -146,8 +146,8 @@ def _fitted(spec: EnvironmentSpec, steps: Paid, timing: Timing, size: float) -> 
 
 
 def _fewest(columns: Array, reward: Array, tolerance: float) -> Array | None:
-    """Return weights (k,) of the k columns (n, k) that explain the reward (n,), as many of them 0 as possible; None if
-    all columns together don't explain it.
+    """Return weights (k,) of the k columns (n, k) that give the reward (n,) with an error of at most ``tolerance``, as
+    many of them 0 as possible; None if all columns together don't.
 
     Columns are left out one by one, beginning with the one that contributes least. This removes rounding errors and
     terms that cancel, such as squares of a cosine and a sine.

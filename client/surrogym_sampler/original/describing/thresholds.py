@@ -46,8 +46,8 @@ class _Face:
 
 
 def has_face(spec: EnvironmentSpec, terms: Sequence[Term], bounds: Array, states: Array) -> bool:
-    """Return whether at least three points of the boundary have the same value (level) of some quantity, as the points
-    of a face of a box have.
+    """Return whether at least three points of the boundary between two values of a reward have the same value (level)
+    of some quantity, as the points of a face of a box have.
 
     Args:
         spec: the environment.
@@ -59,7 +59,8 @@ def has_face(spec: EnvironmentSpec, terms: Sequence[Term], bounds: Array, states
 
 
 def alone(spec: EnvironmentSpec, terms: Sequence[Term], bounds: Array, states: Array) -> NDArray[np.bool_]:
-    """Return a mask (K,) of those of K boundary points that share the value (level) of no quantity with another point.
+    """Return a mask (K,) of those of K points of the boundary between two values of a reward that share the value
+    (level) of no quantity with another point.
 
     Args:
         spec: the environment.
@@ -76,8 +77,9 @@ def alone(spec: EnvironmentSpec, terms: Sequence[Term], bounds: Array, states: A
 def box(
     spec: EnvironmentSpec, terms: Sequence[Term], bounds: Array, states: Array, inside: NDArray[np.bool_]
 ) -> tuple[Inequality, ...]:
-    """Return inequalities that describe a region, such as a box; empty if there are none. All of them hold inside. At
-    most points of the boundary, a quantity has the limiting value of one of them, so the point lies on a face.
+    """Return inequalities that describe the region in which a reward has one of its two values, such as a box; empty if
+    there are none. All of them hold inside. At most points of the boundary, a quantity has the limiting value of one of
+    them, so the point lies on a face.
 
     A face of two points is left out if the other faces already exclude all states outside the region.
 
@@ -251,7 +253,8 @@ class _Boundary:
         self._pairs = ((few[n % len(few)], others[(n + n // len(few)) % len(others)]) for n in itertools.count())
 
     def more(self) -> Paid:
-        """Add at most ``POINTS`` points of the boundary, by at most twice as many bisections, and return all points."""
+        """Add at most ``POINTS`` points of the boundary between the two reward values, by at most twice as many
+        bisections, and return all points."""
         enough = len(self.points) + POINTS
         for one, other in itertools.islice(self._pairs, 2 * POINTS):
             self.between(one, other)
@@ -342,8 +345,9 @@ def _differences(shown: Sequence[Term]) -> list[Term]:
 
 
 def regions(spec: EnvironmentSpec, group: Sequence[Term], bounds: Array, states: Array) -> Iterator[RewardTerm]:
-    """Yield a reward term that is 1 on one side of a boundary and 0 on the other. Nothing is yielded unless the term of
-    the group has the same value (level) at all boundary points, or all of them lie on one ellipsoid in its terms.
+    """Yield a reward term that is 1 on one side of the boundary between two values of a reward, and 0 on the other.
+    Nothing is yielded unless the term of the group has the same value (level) at all boundary points, or all of them
+    lie on one ellipsoid in its terms.
 
     Args:
         spec: the environment.
@@ -392,7 +396,7 @@ def _ellipsoid(group: Sequence[Term], x: Array, elsewhere: Array) -> tuple[Quant
 
 def _paying(timing: Timing, inside: RewardTerm, within: float, elsewhere: float) -> DeclaredReward:
     """Return a declared reward with two values: ``within`` where the term ``inside`` is 1, and ``elsewhere`` where it
-    is 0."""
+    is 0. ``timing`` says whether this is the state before or after the step."""
     bonus = inside.model_copy(update={"weight": within - elsewhere})
     terms = (bonus, RewardTerm(weight=elsewhere, shape="one")) if elsewhere else (bonus,)
     return DeclaredReward(kind="declared", timing=timing, terms=terms)

@@ -204,7 +204,7 @@ def short(value: object) -> str:
 
 
 def one_line(text: str, most: int) -> str:
-    """Return the printable characters of a text in one line, shortened to at most ``most``."""
+    """Return the printable characters of a text in one line, shortened to at most ``most`` characters."""
     printable = "".join(c if c.isprintable() else " " for c in text[: 2 * most])
     line = " ".join(printable.split())
     return line if len(line) <= most and len(text) <= 2 * most else f"{line[:most]}…"

@@ -141,7 +141,8 @@ def _answered(controller: Controller, memory: Memory, first: bool, read: Array, 
 
 
 def _is_steady(controller: Controller, memory: Memory, read: Array) -> bool:
-    """Return whether rounding the measurements leaves the action unchanged."""
+    """Return whether the controller's action for the measurements ``read`` (R,) stays the same, but for a small share
+    of its range, if the measurements change by as much as rounding to float32 may change them."""
     both = np.stack([read, read * (1 + ROUNDING), read * (1 - ROUNDING)]).clip(*sensors_of(controller))
     repeated = Memory(*(np.repeat(part, 3, axis=0) for part in vars(memory).values()))
     action = decide(controller, repeated, both).action
@@ -160,7 +161,7 @@ def prefix_of(controller: Controller) -> str:
 
 
 def write(controller: Controller, folder: Path) -> None:
-    """Write header, source, and the program that runs test vectors into a folder."""
+    """Write into a folder: the header and the source in C, and the source of the program that runs test vectors."""
     write_sources(controller, folder)
     prefix = prefix_of(controller)
     (folder / f"{prefix}_main.c").write_text(main_of(controller, vectors_of(controller)), encoding="utf-8")

@@ -164,8 +164,9 @@ def add(total: Floats, more: Floats) -> None:
 
 @inlined
 def slope_of(log: np.float32, before: np.float32, advantage: np.float32, clip: np.float32) -> np.float32:
-    """Return the derivative of a row's loss with respect to its log probability ``log``; 0 if the ratio to the
-    probability before, whose logarithm is ``before``, is clipped to 1 - ``clip`` to 1 + ``clip``."""
+    """Return the derivative of a row's loss with respect to the log probability ``log`` of its action. ``before`` is
+    the log probability when the action was taken. The derivative is 0 if the ratio of the two probabilities is beyond 1
+    + ``clip`` and the ``advantage`` is positive, or below 1 - ``clip`` and the advantage is not."""
     ratio = np.float32(math.exp(log - before))
     free = ratio <= ONE + clip if advantage > NONE else ratio >= ONE - clip
     return -advantage * ratio if free else NONE

@@ -93,8 +93,9 @@ class Mlp:
                 slope = self._through(before, x, number)
 
     def _through(self, slope: Array, y: Array, number: int) -> Array:
-        """Return the derivative of a loss with respect to the input of a layer's activation. ``slope`` is its
-        derivative with respect to the activation's output y."""
+        """Return the derivative (B, units) of a loss with respect to the input of a hidden layer's activation.
+        ``slope`` (B, units), which is overwritten, is the derivative with respect to the activation's output y (B,
+        units). ``number`` is the number of the layer."""
         if self.activation == "relu":
             slope *= y > 0
             return slope
@@ -105,8 +106,8 @@ class Mlp:
         return slope
 
     def _array(self, place: int, rows: int, columns: int) -> Array:
-        """Return the array with the number ``place``, which every batch of this size reuses. Allocating memory for each
-        batch would take as long as the matrix products."""
+        """Return the work array (rows, columns) with the number ``place``, which every batch with this number of rows
+        reuses. Allocating memory for each batch would take as long as the matrix products."""
         key = (place, rows)
         if key not in self._made:
             self._made[key] = np.empty((rows, columns), dtype=np.float32)
@@ -406,7 +407,8 @@ class Learner:
         found = {name: header.shape for name, header in headers.items()}
         if found != shapes:
             raise ValueError(
-                f"expected the state of a training of {self.parameters.size} parameters, got arrays of {found}"
+                f"expected the state of a training of {self.parameters.size} parameters, got arrays of {found}: give a "
+                "policy with the same network, or start a new training"
             )
 
 
