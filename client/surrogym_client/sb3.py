@@ -84,7 +84,8 @@ class SurrogateVecEnv(VecEnv):
         return self._lanes.view.id
 
     def submit_occupancy(self, checkpoint: str) -> SubmittedOccupancy:
-        """Submit the states that were visited since the session was opened, under any name for the policy's checkpoint.
+        """Submit the states that were visited since the session was opened, under the name ``checkpoint``, which may be
+        any name.
 
         The design can then choose queries near these states. Returns the number of states, and the confidence index of
         the model at them.

@@ -154,9 +154,9 @@ def check_limits(spec: EnvironmentSpec) -> None:
     """Check that the limits of a specification fit its other entries and each other.
 
     Raises:
-        ValueError: a limit names an unknown coordinate, other units, or an angle that jumps; limits contradict each
-            other; an episode may start within a margin; the fallback is no action; or a period or a time limit is
-            missing.
+        ValueError: a limit has an unknown coordinate, another unit than its coordinate, or a term that jumps where an
+            angle is wrapped; limits contradict each other; an episode may start within a margin; the fallback is no
+            action; or a period or a time limit is missing.
     """
     declared = limits_of(spec)
     require_unique("limit", (limit.name for limit in declared.keep))

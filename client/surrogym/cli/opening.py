@@ -21,7 +21,7 @@ def opener_for_policy(
         env: name of the original environment; None takes the one that the policy was trained for.
         given: specification of the environment from --spec; None takes the environment's own specification.
         card: card of the policy.
-        fallback: program of the limits' fallback, as NAME=package.module:function.
+        fallback: program of the fallback that the specification's limits name, as NAME=package.module:function.
         quiet: whether remarks are hidden.
 
     Raises:

@@ -107,9 +107,9 @@ class HttpSurrogate:
         token: bearer token; default ``SURROGYM_TOKEN``, then the one in the file ``SURROGYM_TOKEN_FILE``.
         timeouts: seconds for each kind of request.
         retries: how long to retry after lost connections, lost replies and status 503.
-        transport: how reset, step and rollout travel. ``stream`` is the fastest: frames over a WebSocket. ``binary``
-            sends frames over HTTP, ``json`` text that a person can read. ``auto`` uses the stream, and frames over HTTP
-            if the stream is refused or never answers.
+        transport: how reset, step and rollout travel. ``stream`` is the fastest: binary frames over a WebSocket.
+            ``binary`` sends the same frames over HTTP, ``json`` text that a person can read. ``auto`` uses the stream,
+            and frames over HTTP if the stream is refused or never answers.
 
     Raises:
         ValueError: an unknown transport.

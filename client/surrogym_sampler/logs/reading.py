@@ -88,7 +88,8 @@ def read_csv(path: Path) -> Table:
 
 
 def read_npz(path: Path) -> Table:
-    """Read the arrays of an NPZ file; ``table_of_arrays`` knows the names that they may have. Nothing is unpickled."""
+    """Read the arrays of an NPZ file. Their names, such as ``states``, ``actions`` and ``rewards``, say what they
+    contain. Nothing is unpickled."""
     _require_npz(path)
     try:
         arrays = read_arrays(path, MOST_BYTES, lambda headers: require_shapes(path, _shapes(headers)))

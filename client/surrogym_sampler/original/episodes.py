@@ -215,7 +215,7 @@ def open_episode(name: str, spec: EnvironmentSpec | None, factory: Factory, fall
         name: the environment's name.
         spec: a specification that replaces the environment's own; None keeps the own one.
         factory: makes the environment, unless the name is that of a built-in Gymnasium task.
-        fallback: program of the limits' fallback, as NAME=package.module:function.
+        fallback: program of the fallback that the specification's limits name, as NAME=package.module:function.
 
     Raises:
         UnknownEnvironment: the limits name a fallback, and ``fallback`` does not give its program; or the reverse.

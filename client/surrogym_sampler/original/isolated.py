@@ -42,7 +42,8 @@ class IsolatedEnvironment:
     Args:
         factory: makes the environment in the child process; it must be picklable (a module's function, a ``partial``).
         step_limit: seconds that one step may take.
-        fallback: program of the limits' fallback, as NAME=package.module:function. The child process imports it.
+        fallback: program of the fallback that the specification's limits name, as NAME=package.module:function. The
+            child process imports it.
 
     Raises (from any method):
         UnknownEnvironment: the factory failed.
@@ -64,7 +65,8 @@ class IsolatedEnvironment:
 
     @property
     def fallback_steps(self) -> int:
-        """Number of real steps of the limits' fallback that are part of no query, up to the last request."""
+        """Number of real steps that the fallback controller of the declared limits has taken while no query ran, up to
+        the last request."""
         return self._earlier_steps + self._fallback_steps
 
     def spec(self) -> EnvironmentSpec:

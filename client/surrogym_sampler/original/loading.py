@@ -64,8 +64,8 @@ def make(
         access: where a query may begin: at ``any`` state, at a ``snapshot`` or a reset, or at a ``reset`` only. None
             keeps the specification's.
         max_rollout: largest number of actions in a query that begins at a reset or snapshot.
-        step_limit: seconds that one step of ``exec:COMMAND`` or ``fmu:PLANT.fmu`` may take; ``isolated`` limits the
-            others.
+        step_limit: seconds that one step of ``exec:COMMAND`` or ``fmu:PLANT.fmu`` may take; the function ``isolated``
+            limits the steps of other environments.
 
     Raises:
         UnknownEnvironment: no adapter knows the name, or its module or factory can't be found.
@@ -90,7 +90,8 @@ def isolated(
 ) -> IsolatedEnvironment | Executable | Simulated:
     """Make an original environment in a process of its own, in which a step may take ``step_limit`` seconds.
 
-    ``fallback`` gives the program of the limits' fallback, as NAME=package.module:function.
+    ``fallback`` gives the program of the fallback that the specification's limits name, as
+    NAME=package.module:function.
     """
     if is_executable(name):
         return open_executable(name, spec, step_limit=step_limit)

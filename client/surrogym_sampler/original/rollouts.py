@@ -202,7 +202,7 @@ def keeping_limits(environment: Environment, fallback: str | None = None) -> Env
 
     Args:
         environment: the environment. It is closed if this raises an error.
-        fallback: program of the limits' fallback, as NAME=package.module:function.
+        fallback: program of the fallback that the specification's limits name, as NAME=package.module:function.
 
     Raises:
         UnknownEnvironment: the limits name a fallback, and ``fallback`` does not give its program; or the reverse.

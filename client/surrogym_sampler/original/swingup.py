@@ -56,7 +56,8 @@ class Canvas:
         self._y = (height / 2 - np.arange(height) - 0.5)[:, None] / scale
 
     def stroke(self, start: Point, end: Point, thickness: float, colour: Colour) -> None:
-        """Draw a line with round ends; if both ends are the same point, a disc."""
+        """Draw a line with round ends; if both ends are the same point, a disc. Points and thickness are in units of
+        the world."""
         (ax, ay), (bx, by) = start, end
         dx, dy = bx - ax, by - ay
         along = ((self._x - ax) * dx + (self._y - ay) * dy) / max(dx**2 + dy**2, 1e-12)

@@ -1,4 +1,4 @@
-"""A simulator as the prior of a surrogate on a server, which also learns a model of the simulator."""
+"""A simulator as the prior of a surrogate on a server. The server also learns the model of the simulator."""
 
 from __future__ import annotations
 

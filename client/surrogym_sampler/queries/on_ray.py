@@ -44,7 +44,7 @@ class SamplerPlan:
         spec: a specification that replaces the environment's own; None keeps the own one.
         step_limit: seconds that one real step may take.
         settings: settings of the sampler.
-        fallback: program of the limits' fallback, as NAME=package.module:function.
+        fallback: program of the fallback that the specification's limits name, as NAME=package.module:function.
         version: version of surrogym, which must be the same on all machines.
     """
 

@@ -61,7 +61,8 @@ class SamplerReport:
         steps: number of real steps that were sent.
         seconds: duration of the run.
         phase: the design's last known phase; None if unknown.
-        fallback_steps: number of real steps of the limits' fallback while no query ran; they are not in the ledger.
+        fallback_steps: number of real steps that the fallback controller of the declared limits took while no query
+            ran; the ledger does not count them.
     """
 
     answered: int

@@ -76,8 +76,8 @@ def has_other_limit(result: Evaluation, trained_for: EnvironmentSpec | None) -> 
 
 
 def paired_start(result: Evaluation, among: int) -> int:
-    """Return the index of the start to compare: of the first ``among`` episodes, the one in which the policy had its
-    median return."""
+    """Return the index of the episode whose start is used to compare controllers step by step: of the first ``among``
+    episodes, the one in which the policy had its median return."""
     order = np.argsort(result.returns[:among], kind="stable")
     return int(order[(len(order) - 1) // 2])
 
