@@ -55,7 +55,8 @@ class Beside:
     def controllers(
         self, policy: Path, card: PolicyCard, reading: PolicyReading, opener: Callable[[], Episode]
     ) -> dict[Controller, Callable[[], Acting]]:
-        """Return a function that loads each controller, by its kind: the policy first, then those to compare with it.
+        """Return, by the kind of controller, functions that load the controllers to run: the policy first, then those
+        to compare with it.
 
         Args:
             policy: file of the policy.

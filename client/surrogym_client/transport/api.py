@@ -174,7 +174,7 @@ class PolicyCalls:
 
         Raises:
             SpecConflict: the policy was made for other observations or actions.
-            InvalidInput: the file is not of this form.
+            InvalidInput: the file is not of the form ``form``.
         """
         notice = wire.FileNotice(form=form, bytes=len(file), digest=_digest(file))
         body = wire.AddPolicy(card=card, curve=[*curve], file=notice)
@@ -499,10 +499,10 @@ class Api:
         """Send real steps, and return once the server has stored them.
 
         Steps of purpose ``logged`` were recorded before: they don't count towards the budget, and storing a log twice
-        changes nothing. A log may be sent in several calls: ``after`` is the ``digest`` of the reply to the
-        previous part, and ``complete`` is true for the last part, which starts a fit. If a reply has a ``restart``, no
-        part of the log is stored: send the log again from its beginning, with this ``restart`` as ``after``. A call
-        without ``after`` does this by itself.
+        changes nothing. A log may be sent in several calls: ``after`` is the ``digest`` of the reply to the previous
+        part, and ``complete`` is true for the last part, which starts a fit. If the field ``restart`` of a reply is not
+        None, no part of the log is stored: send the log again from its beginning, with the value of ``restart`` as
+        ``after``. A call without ``after`` does this by itself.
 
         A batch of up to about 300 samples is stored whole or not at all. A larger one is sent in several requests, so
         an error may leave its first part stored; the same call with the same key then adds the rest. ``stored`` is

@@ -36,8 +36,8 @@ CLOSE_LIMIT = 2.0  # seconds for closing the environment, in addition to the sec
 class IsolatedEnvironment:
     """An environment whose steps and resets run in a child process, each within a time limit.
 
-    After a step that hung, or a process that died, the next step starts a new environment. In all other cases,
-    including the end of this process, the running step is finished and the environment is closed.
+    After a step that hung, or a process that died, the next step starts a new environment. If this process ends, the
+    child process finishes the running step, and closes the environment.
 
     Args:
         factory: makes the environment in the child process; it must be picklable (a module's function, a ``partial``).

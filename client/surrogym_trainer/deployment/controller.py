@@ -195,7 +195,8 @@ class Controller:
         period: seconds between decisions; None if it is not declared.
         digests: SHA-256 of policy and specification and, if the card has it, the hash of the model's samples.
         guard: the limits that it keeps; None without limits.
-        rates: largest changes of entries of the action in one step. A larger change is cut off, also of a fallback.
+        rates: largest changes of entries of the action in one step. A larger change is cut off, also that of a fallback
+            action.
     """
 
     name: str

@@ -281,9 +281,9 @@ def unanswered(count: int, of: int) -> str:
 def disappointed(audit: Audit, floor: float | None, imagined: float | None = None) -> bool:
     """Return whether the model promises clearly less after it has learned from an audit than it did before.
 
-    The policy was chosen by its imagined return, the mean return in the model. If this depends on what the model does
-    not know, the promise before the audit is already lower. So the promise after the audit is compared with the larger
-    one of the imagined return and the promise before.
+    The policy was chosen by its imagined return, the mean return in the model. If this return depends on what the model
+    does not know, the promise before the audit is already lower. So the promise after the audit is compared with the
+    larger one of the imagined return and the promise before.
 
     Args:
         audit: the audit.

@@ -149,8 +149,8 @@ def load_learner(
 
     Args:
         path: file from ``save_policy``; or, with ``trust``, from ``save`` of the algorithm.
-        algorithm: name of the algorithm's class. trust: whether to unpickle its objects, which runs any code that is in
-            them.
+        algorithm: name of the algorithm's class.
+        trust: whether to unpickle the objects in the file, which runs any code that is in them.
         changes: environment, seed and hyperparameters that replace the saved ones; the algorithm can only learn with an
             environment.
 

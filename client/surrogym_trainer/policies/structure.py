@@ -3,8 +3,8 @@
 Stable-Baselines3 pickles what JSON can't represent: spaces, classes, schedules. The file of a policy gets an entry that
 describes these objects, and reading rebuilds them from it. Weights are read as plain numbers. Nothing is unpickled.
 
-Stable-Baselines3 makes every entry of a file an attribute of the algorithm, even a method. Only the entries of the
-settings below are accepted, each of its type. All others are ignored, and the algorithm's defaults apply.
+Stable-Baselines3 makes every entry of a file an attribute of the algorithm, even a method. Only the entries that
+``PolicySettings`` lists are accepted, each of its type. All others are ignored, and the algorithm's defaults apply.
 """
 
 from __future__ import annotations
@@ -111,10 +111,11 @@ class PolicySettings(BaseModel):
     def require_memory(
         self, num_envs: int, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]
     ) -> None:
-        """Check that the experience for learning fits in ``MAX_EXPERIENCE_BYTES``.
+        """Check that the transitions that the algorithm stores for learning (its experience) fit in
+        ``MAX_EXPERIENCE_BYTES`` bytes.
 
         Raises:
-            ValueError: the experience needs more memory.
+            ValueError: they need more memory.
         """
         # 4 further numbers in each step: the reward, the end, the value and the like
         numbers = 2 * _size(observation_space) + _size(action_space) + 4

@@ -30,7 +30,8 @@ Tracker = Literal["tensorboard", "wandb", "mlflow"]
 
 @dataclass(frozen=True)
 class TrainSettings:
-    """Settings of a training. None takes the specification's suggestion.
+    """Settings of a training. A setting that is None has a default, which the specification or the policy search
+    determines.
 
     ``session`` has further fields of ``OpenSession`` (variant, particles, model, penalty, ...). ``hyperparameters`` are
     passed to the algorithm's constructor and replace its defaults.
@@ -92,7 +93,7 @@ def chosen_for(view: SurrogateView, settings: TrainSettings) -> TrainSettings:
       compared along drawn functions of the posterior: independent draws would shake a lane out of a state in which the
       policy would remain.
     - If the specification penalises leaving the states of a log, no episode starts outside of them.
-    - A variant in ``settings`` is kept. With preset ``paper`` the settings are returned unchanged.
+    - A variant in ``settings`` is kept. With preset ``paper``, ``settings`` itself is returned.
 
     Args:
         view: the surrogate.
@@ -121,8 +122,8 @@ def noise_of(view: SurrogateView) -> dict[str, Any]:
 def prolongs(settings: TrainSettings, spec: EnvironmentSpec) -> bool:
     """Return whether a training takes more cycles while its return rises, and refines its policy.
 
-    The setting decides; without it, the training does so if the user chose no number of steps and the preset is not
-    ``paper``.
+    The setting ``prolong`` decides. If it is None, the training does so if the user chose no number of steps and the
+    preset is not ``paper``.
     """
     if settings.prolong is not None:
         return settings.prolong

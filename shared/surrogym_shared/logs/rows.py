@@ -222,8 +222,8 @@ def require_reward_unit(paid: Floats, known: Floats, name: str) -> None:
         name: name of the surrogate.
 
     Raises:
-        UnusableLog: the middle half of ``paid`` lies beyond 20 times the largest absolute value of ``known``, or is
-            wider than that.
+        UnusableLog: the middle half of ``paid`` lies beyond 20 times the largest absolute value of ``known``, or its
+            width exceeds this value.
     """
     largest = float(np.abs(known).max(initial=0.0))
     if len(known) < FEWEST or largest == 0:

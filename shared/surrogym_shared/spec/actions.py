@@ -16,9 +16,9 @@ class BoxAction(Frozen):
     ``bins`` is the number of equally spaced values in each dimension from which a policy chooses (the paper's
     discretised control); None for a continuous policy. The model and the sampler always get the continuous value.
 
-    ``rate`` is the largest change of each entry per second, or None for an entry that may change at once. If more is
-    asked for, the nearest action that keeps the rate is taken. A rate needs a ``sampling_period``, and the last action
-    among the coordinates: ``with_history(spec, actions=1, rate=...)`` declares both.
+    ``rate`` is the largest change of each entry per second, or None for an entry that may change at once. If a larger
+    change is requested, the nearest action that keeps the rate is taken. A rate needs a ``sampling_period``, and the
+    last action among the coordinates: ``with_history(spec, actions=1, rate=...)`` declares both.
     """
 
     kind: Literal["box"] = "box"

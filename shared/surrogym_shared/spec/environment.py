@@ -50,7 +50,7 @@ class ModelChoice(Choice):
 class Design(Frozen):
     """Settings of the adaptive design of queries. A field of None takes the preset's value.
 
-    ``preset``: ``default``, or ``paper``, the method as published, changed only where it can't work.
+    ``preset``: ``default``, or ``paper``, the method as the paper has it, changed only where it can't work.
 
     ``budget``: number of real steps of the design, with the initial ones. With 0 the design takes no real steps, and
     the model is learned from a log.
@@ -69,8 +69,8 @@ class Design(Frozen):
     the server may add others.
 
     ``tolerance``: error of an output that does not matter (numerator of eq. 9), for outputs without a declared
-    tolerance. ``relative`` is 5 % of the output's
-    standard deviation over the initial design, ``raw`` is 1 in the output's own unit, as published.
+    tolerance. ``relative`` is 5 % of the output's standard deviation over the initial design, ``raw`` is 1 in the
+    output's own unit, as in the paper.
 
     ``symmetry``: ``auto`` tests whether the environment is its own mirror image: whether all changes have the opposite
     sign if all coordinates and the action have. ``none``, and the preset ``paper``, don't test this.

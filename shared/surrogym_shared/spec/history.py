@@ -29,7 +29,7 @@ def with_history(
         spec: specification whose coordinates can all be measured in the environment, with queries of kind ``rollout``.
         changes: number of earlier changes of each moving coordinate to add, such as 1 for a hidden speed.
         actions: number of earlier actions to add. An action that takes effect after a dead time of three steps needs
-            three, and one more if the plant is sampled with a zero-order hold and has a lag of its own.
+            three, and one more if the plant is sampled with a zero-order hold and itself reacts with a delay.
         largest: largest change of each moving coordinate in one step, in its unit; needed for ``changes``.
         at_start: largest change of a coordinate in the step before a reset, if the environment may move at a reset.
             This change is unknown, so a model does not learn from the first steps of each episode.

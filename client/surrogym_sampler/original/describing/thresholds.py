@@ -127,7 +127,8 @@ def _faces(spec: EnvironmentSpec, terms: Sequence[Term], bounds: Array, states: 
 
 def _side(spec: EnvironmentSpec, face: _Face, inside: Array) -> str:
     """Return the relation, ">=" or "<=", that holds between the face's quantity and its level in all states ``inside``
-    (n, C) of the region; an empty string if these states lie on both sides of the face."""
+    (n, C) of the region in which a reward has one of its two values; an empty string if these states lie on both sides
+    of the face."""
     x = evaluate(spec, face.term, inside)
     if (x >= face.level).all():
         return ">="
@@ -202,8 +203,8 @@ def _boxes(spec: EnvironmentSpec, boundary: _Boundary, steps: Paid) -> Iterator[
 
     If at least three points have the same level, there may be faces, and further points are added. A point that shares
     no level with another gets a neighbouring point, because the level that both share shows their face. If the region
-    found so far contains a step with the outside reward, a face is missing. A bisection towards this step finds a point
-    of the missing face.
+    found so far contains a step with the reward that holds outside of it, a face is missing. A bisection towards this
+    step finds a point of the missing face.
     """
     terms, values = _single(spec), np.unique(steps.reward)
     timings = [time for time, reads in READS.items() if has_face(spec, terms, reads(boundary.points), reads(steps))]

@@ -67,7 +67,8 @@ class FastPpo(PolicySearch):
     """Policy search by PPO in NumPy, with updates that take a sixth of the time of Stable-Baselines3's.
 
     Networks, loss, Adam, scaled rewards and advantages are those of the search ``PPO``. A training has two stages, each
-    with cycles in which the learning rate falls. The module ``stages`` describes their episodes, and the reasons.
+    with cycles in which the learning rate falls. The functions ``learn`` and ``refine`` describe the episodes of the
+    two stages, and the reasons.
 
     1. *learn*: short episodes with a small discount horizon. Another cycle follows if the second half of the previous
        one gained. A network that has learned nothing in its first cycle is replaced. The noise of every second network
