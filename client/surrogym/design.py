@@ -70,7 +70,7 @@ class Design:
     """Choose real steps until the model is ready, or the budget is spent.
 
     Args:
-        spec: what is known of the real environment.
+        spec: the specification of the original environment.
         budget: maximum number of real steps, 2 or more; None takes that of the specification.
         target: confidence index to reach for each output, above 0.5 and below 1; None takes that of the specification.
         threads: number of threads of a fit.

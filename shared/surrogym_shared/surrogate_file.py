@@ -120,7 +120,7 @@ class SurrogateFile:
         The arrays of the model are not checked: the code that reads models checks them against the specification.
 
         Raises:
-            NotASurrogateFile: the bytes are too many, or have another form.
+            NotASurrogateFile: there are too many bytes, or they are not the content of a surrogate's file.
         """
         header, body = _split(data)
         try:

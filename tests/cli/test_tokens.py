@@ -79,7 +79,10 @@ def test_a_token_file_readable_by_others_works_with_a_warning(surrogym, server, 
 def test_a_missing_token_file_gives_a_one_sentence_error(surrogym, server):
     said = surrogym("status", "--server", server.url, "--token-file", "missing")
     assert (said.code, server.received) == (1, [])
-    assert said.err == "error: the token file 'missing' can't be read: No such file or directory\n"
+    assert (
+        said.err
+        == "error: the token file 'missing' can't be read: No such file or directory; check its path and permissions\n"
+    )
 
 
 def test_the_help_warns_that_a_token_on_the_command_line_is_visible(surrogym):

@@ -1,7 +1,7 @@
 """Wait for other processes: for a surrogate to be registered, for queries to be answered, for a design to end.
 
-The phases in which a design has ended are here, surrogates whose design waits for a log, and the check that the
-budget is large enough for the rounds of a training.
+This module also has the phases in which a design has ended, a test for surrogates whose design waits for a log, and the
+check that the budget is large enough for the rounds of a training.
 """
 
 from __future__ import annotations

@@ -254,11 +254,15 @@ def token_in(path: Path) -> str:
     try:
         tokens = tokens_in(path)
     except OSError as error:
-        raise UnusableToken(f"the token file {str(path)!r} can't be read: {error.strerror}") from error
+        raise UnusableToken(
+            f"the token file {str(path)!r} can't be read: {error.strerror}; check its path and permissions"
+        ) from error
     except ValueError as error:
         raise UnusableToken(f"the token file {str(path)!r} can't be used: {error}") from None
     if len(tokens) != 1:
-        raise UnusableToken(f"the token file {str(path)!r}: expected one token, got {len(tokens)}")
+        raise UnusableToken(
+            f"the token file {str(path)!r}: expected one token, got {len(tokens)}: write a single line with one"
+        )
     return next(iter(tokens))
 
 

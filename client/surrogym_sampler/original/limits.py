@@ -2,7 +2,8 @@
 no action comes.
 
 The guard applies the requested action or the fallback controller's, and a watchdog notices missing actions. Queries and
-episodes of a policy keep limits alike. A program as a fallback is a function that only a person at the machine gives.
+episodes of a policy keep limits alike. A fallback that is a program is a Python function, which only a person at the
+machine can give.
 
 Shapes: C coordinates, F action entries.
 """

@@ -55,7 +55,9 @@ class Careful:
             step = self._simulator.step_from(coordinates, action)
             numbers = [*np.ravel(step.coordinates), *np.ravel(step.next_coordinates), step.reward]
         except Exception as error:  # a user's code may raise anything
-            raise StepRefused(f"the simulator failed: {type(error).__name__}: {error}") from error
+            raise StepRefused(
+                f"the simulator failed: {type(error).__name__}: {error}; correct the simulator"
+            ) from error
         if not np.isfinite(numbers).all():
             raise StepRefused(
                 "expected finite numbers from the simulator, got infinite numbers or NaN: correct the simulator, or "

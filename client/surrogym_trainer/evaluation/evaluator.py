@@ -407,7 +407,7 @@ def _start(episode: Episode, settings: EvaluationSettings, index: int) -> Moment
 
 def _reset(episode: Episode, settings: EvaluationSettings) -> Array | None:
     """Reset the environment with the seed of the first episode, and return the start (C,). If the first episode then
-    starts elsewhere, the environment ignores seeds. None if a reset does not choose the starts."""
+    starts elsewhere, the environment ignores seeds. None if the settings choose the starts in place of a reset."""
     if settings.wide or settings.start_scale != 1:
         return None
     return episode.reset(settings.first_seed).coordinates

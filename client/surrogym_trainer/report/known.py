@@ -40,7 +40,7 @@ class Known:
         samples: all real steps.
         server: the server's address and version.
         policy: the policy of the report; None if there is none.
-        real: its newest real episodes in the surrogate's own environment from the declared starts.
+        real: the policy's newest real episodes in the surrogate's own environment from the declared starts.
         without: real episodes without the policy, from the same starts.
         reference: real episodes of a reference controller, from the same starts.
         video: media type and content of the policy's video; None if there is none.

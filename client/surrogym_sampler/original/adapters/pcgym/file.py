@@ -34,7 +34,7 @@ def read_parameters(path: Path) -> dict[str, Any]:
         if key in given:
             _check_range(path, key, given[key])
     if not _numbers(given["x0"]):
-        raise _expected(path, "expected x0 to be a list of finite numbers", given["x0"])
+        raise _expected(path, "expected the parameter x0 to be a list of finite numbers", given["x0"])
     _check_schedule(path, "SP", given["SP"], given["N"])
     if given.get("disturbances") is not None:
         _check_schedule(path, "disturbances", given["disturbances"], given["N"])
@@ -75,12 +75,12 @@ def check_model(where: str, given: Mapping[str, Any], info: Mapping[str, Any]) -
 
 def _check_times(path: Path, given: Mapping[str, Any]) -> None:
     if not isinstance(given["model"], str):
-        raise _expected(path, "expected model to be the name of a model, such as cstr", given["model"])
+        raise _expected(path, "expected the parameter model to be the name of a model, such as cstr", given["model"])
     count = given["N"]
     if not isinstance(count, int) or isinstance(count, bool) or not FEWEST <= count <= MOST:
-        raise _expected(path, f"expected N to be a whole number from {FEWEST} to {MOST:,}", count)
+        raise _expected(path, f"expected the parameter N to be a whole number from {FEWEST} to {MOST:,}", count)
     if not _number(given["tsim"]) or given["tsim"] <= 0:
-        raise _expected(path, "expected tsim to be a positive number", given["tsim"])
+        raise _expected(path, "expected the parameter tsim to be a positive number", given["tsim"])
 
 
 def _check_range(path: Path, key: str, given: Any) -> None:
