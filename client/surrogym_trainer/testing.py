@@ -55,7 +55,7 @@ def steps_are_bounded_and_reported(port: SurrogatePort, settings: TrainSettings,
 
 
 def interruption_keeps_the_policy(port: SurrogatePort, settings: TrainSettings, folder: Path) -> None:
-    """Check that Ctrl-C at the first progress leaves a readable policy or none, and no open session."""
+    """Check that Ctrl-C at the first report of progress leaves a readable policy or none, and no open session."""
     watched, out = _Watched(port), folder / "policy.zip"
     try:
         train(watched, out, settings, _interrupt)

@@ -209,7 +209,7 @@ def _opened(simulator: str | OriginalEnvironment, spec: EnvironmentSpec) -> Orig
 
 def _respecified(simulator: str | OriginalEnvironment, opened: Any, spec: EnvironmentSpec) -> Any:
     """Return the simulator with the plant's specification. A simulator that is given by an adapter's name is opened
-    here, because it has no specification of its own."""
+    here, because such a name comes without a specification."""
     if isinstance(simulator, str) and not is_own(simulator):
         return make(simulator, spec=spec.model_copy(update={"environment": simulator}))
     return Respecified(opened, spec)

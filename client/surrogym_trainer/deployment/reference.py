@@ -100,7 +100,8 @@ def _room(limit: KeptLimit, coordinates: Array) -> Array:
 
 
 def judged(controller: Controller, read: Array, age: Array) -> Ints:
-    """Return the faults (N,) of measurements (N, R) of an age (N,) as the sum of their bits; 0 if there are none."""
+    """Return the faults (N,) of measurements (N, R) of an age (N,). Each kind of fault has a bit, and the bits are
+    summed; 0 without faults."""
     lowest, highest = (np.array([getattr(m, n) for m in controller.measurements]) for n in ("lowest", "highest"))
     finite = np.isfinite(read)
     outside = finite & ((read < lowest) | (read > highest))

@@ -39,7 +39,8 @@ class Running(ABC):
 
     @abstractmethod
     def step(self, measurement: Array, age: float = 0.0) -> tuple[int, Array]:
-        """Return the status and the action (F,) for measurements (R,) of an age in seconds."""
+        """Return the status and the action (F,) for measurements (R,) of an age in seconds. Each kind of fault, and a
+        limit that would be left soon, has a bit of the status, which is 0 without these."""
 
 
 @dataclass(frozen=True, eq=False)
