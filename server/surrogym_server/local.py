@@ -1,4 +1,5 @@
-"""``LocalSurrogate``: a surrogate whose sessions run in this process, without a server. It needs the extra [server]."""
+"""``LocalSurrogate``: a surrogate whose sessions run in this process, without a server. Install it as
+surrogym[server]."""
 
 from __future__ import annotations
 
@@ -38,7 +39,8 @@ VERSION = 1
 
 
 class LocalSurrogate:
-    """A surrogate with one model, whose sessions run in this process. It implements ``SurrogatePort``.
+    """A surrogate with one model, whose sessions run in this process. It implements ``SurrogatePort``, the interface by
+    which trainers use a surrogate.
 
     Its methods raise the errors of ``surrogym_server.errors``.
 
@@ -155,7 +157,8 @@ class LocalSurrogate:
         return SubmittedOccupancy(checkpoint=checkpoint, states=len(self.visited(session)))
 
     def visited(self, session: str) -> NDArray[np.float64]:
-        """Return the states (v, C) that a session visited; it must have been opened with occupancy."""
+        """Return the states (v, C) that a session visited. It must have been opened with the option ``occupancy``,
+        which records them."""
         return visited_states(self._get(session))
 
     def close(self, session: str) -> None:

@@ -35,7 +35,10 @@ def _without_path(url: str) -> str:
 
 def _http(url: str) -> str:
     if not re.fullmatch(r"https?://[^/@?#\s]+(/\S*)?", url):
-        raise ValueError("expected an address that begins with http:// or https:// and a host, without a user name")
+        raise ValueError(
+            "expected an address such as https://hooks.example.org/drift, without a user name, got another form: "
+            "correct it"
+        )
     return url
 
 
@@ -145,7 +148,8 @@ class Settings(BaseModel):
             )
         if not (self.tokens or self.insecure or self.loopback):
             raise ValueError(
-                f"host {self.host} can be reached from other machines: expected a token (or --insecure), got none"
+                f"host {self.host} can be reached from other machines: expected a token, got none: set SURROGYM_TOKEN, "
+                "or allow everything to everybody by --insecure"
             )
         return self
 

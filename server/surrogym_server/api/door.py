@@ -319,7 +319,8 @@ DEFAULT_JSON_BYTES = 64 * KIBIBYTE
 
 
 def json_up_to(kibibytes: int) -> dict[str, Any]:
-    """Return ``openapi_extra`` for a route whose JSON bodies may be larger than the default of 64 KiB."""
+    """Return ``openapi_extra`` for a route whose JSON bodies may have up to ``kibibytes`` KiB. The default is 64
+    KiB."""
     return {JSON_LIMIT: kibibytes * KIBIBYTE}
 
 
@@ -357,7 +358,7 @@ class Door:
         announced = raw_header(scope, b"content-length")
         if announced.isdigit() and int(announced) > limit:
             larger = [name for name, size in self.bodies.items() if size is None and name != media_type]
-            instead = f"; send a larger body as {larger[0]}" if larger else ""
+            instead = f"; send a larger body as {larger[0]}" if larger else ": send less at a time"
             raise HTTPException(
                 413,
                 f"expected a body of at most {limit} bytes as {media_type}, got {announced.decode()} bytes{instead}",
@@ -378,7 +379,9 @@ def door_of(route: APIRoute) -> Door:
     declared = [depends.dependency for depends in route.dependencies]
     access = [one for one in declared if isinstance(one, Access)]
     if (count := len(access) + (everybody in declared)) != 1:
-        raise TypeError(f"route {route.path}: expected one declaration of who may call it, such as READ, got {count}")
+        raise TypeError(
+            f"route {route.path}: expected one declaration of who may call it, such as READ, got {count}: declare one"
+        )
     extra = route.openapi_extra or {}
     content = extra.get("requestBody", {}).get("content", {JSON: {}} if route.body_field else {})
     limits: dict[str, int | None] = dict.fromkeys(content)

@@ -42,7 +42,7 @@ POINT_ERRORS = documented(
     responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST),
 )
 def list_all(name: str, use: Use) -> ModelList:
-    """List all versions of a surrogate's model with their fidelity, oldest first."""
+    """List all versions of a surrogate's model with their fidelity (how well they predict), oldest first."""
     return ModelList(models=[resources.model_view(record) for record in use.models.list(name)])
 
 
@@ -57,7 +57,8 @@ def list_all(name: str, use: Use) -> ModelList:
     },
 )
 def get(name: str, version: int, use: Use, format: Literal["json", "safetensors"] = "json") -> ModelView | Response:
-    """Return a model's structure and fidelity, or with ``format=safetensors`` the complete model as a file."""
+    """Return a model's structure and its fidelity (how well it predicts), or with ``format=safetensors`` the complete
+    model as a file."""
     if format == "json":
         return resources.model_view(use.storage.models.get(name, version))
     return Response(use.models.export(name, version), media_type=SAFETENSORS)

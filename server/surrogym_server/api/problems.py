@@ -70,7 +70,7 @@ SHOWN_CHARACTERS = 120
 
 
 def install(app: FastAPI) -> None:
-    """Make every error reply of the app a problem body."""
+    """Make the app answer each error with a problem body, the JSON description of an error by RFC 9457."""
     for kind, answer in _ANSWERS.items():
         app.add_exception_handler(kind, answer)
     app.add_exception_handler(Exception, _unexpected)
@@ -91,7 +91,7 @@ def code_of(error: errors.SurrogymError) -> Code:
 
 
 def problem_of(error: Exception) -> Problem:
-    """Return the problem body of an exception; without details if the exception is unexpected."""
+    """Return the problem body (JSON by RFC 9457) of an exception; without details if the exception is unexpected."""
     match error:
         case errors.SeqConflict():
             return _problem(Code.SEQ_CONFLICT, str(error), expected_seq=error.expected)
@@ -106,7 +106,8 @@ def problem_of(error: Exception) -> Problem:
 
 
 def response_of(problem: Problem, headers: Mapping[str, str] | None = None) -> Response:
-    """Return the reply with a problem body. ``headers`` are added to those of the problem's code."""
+    """Return the HTTP reply with a problem body (JSON by RFC 9457). ``headers`` are added to those of the problem's
+    code."""
     return Response(
         problem.model_dump_json(exclude_none=True),
         status_code=problem.status,
@@ -123,7 +124,7 @@ def problem_response(
     headers: Mapping[str, str] | None = None,
     **members: Any,
 ) -> Response:
-    """Return the reply with a problem body, from an error code and a text for people.
+    """Return the HTTP reply with a problem body (JSON by RFC 9457), from an error code and a text for people.
 
     ``status`` defaults to that of the code; ``members`` are further fields of the problem.
     """

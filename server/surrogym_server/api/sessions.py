@@ -1,4 +1,4 @@
-"""Routes that open, describe and close sessions and submit their occupancy; ``api.stepping`` has reset and step."""
+"""Routes that open, describe and close sessions and submit visited states; ``api.stepping`` has reset and step."""
 
 from __future__ import annotations
 
@@ -75,7 +75,8 @@ async def get_session(id: str, use: Use) -> SessionView:
     responses=documented(*SESSION_ERRORS),
 )
 async def session_coordinates(id: str, use: Use) -> SessionCoordinates:
-    """Return the present coordinates of each lane. The original environment can be set to such coordinates."""
+    """Return the present coordinates of each lane. An original environment that can be set to any state can be set to
+    these."""
     return sessions.session_coordinates(await use.engine.coordinates(id))
 
 
@@ -102,7 +103,7 @@ async def submit_occupancy(
     id: str, body: Annotated[SubmitOccupancy, example(examples.OCCUPANCY)], use: Use
 ) -> SubmittedOccupancy:
     """Store the states that a session has visited, under the name ``checkpoint``. ``improve`` can then choose queries
-    near these states. The reply has the model's confidence index over them. The session must have been opened with
-    ``occupancy``."""
+    near these states. The reply has the model's confidence index over them. The session must have been opened with the
+    option ``occupancy``, which records visited states."""
     states, index = await use.sessions.submit_occupancy(id, body.checkpoint)
     return SubmittedOccupancy(checkpoint=body.checkpoint, states=states, confidence_index=index)

@@ -81,8 +81,8 @@ def list_all(
     responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST),
 )
 def get(name: str, use: Use) -> SurrogateView:
-    """Return a surrogate's phase, the fidelity of each output, the counts of real steps by purpose, and the counts of
-    queries by status."""
+    """Return a surrogate's phase, the fidelity of each output (how well the model predicts it), the counts of real
+    steps by purpose, and the counts of queries by status."""
     return resources.surrogate_view(use.surrogates.status(name))
 
 

@@ -1,4 +1,4 @@
-"""Export of a surrogate as an FMU (FMI 3.0), with the uncertainty of each step.
+"""Export of a surrogate as an FMU (functional mock-up unit, FMI 3.0), with the uncertainty of each step.
 
 The FMU steps like a session in the variant ``deterministic``, to the mean next state. Further outputs are the standard
 deviations of the model's predictions.

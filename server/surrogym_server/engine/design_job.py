@@ -152,7 +152,7 @@ def _decide(job: DesignJob) -> tuple[Decision, Samples]:
 
 def _new_predictions(job: DesignJob, samples: Samples) -> Predictions:
     """Predict the latest samples that came after the previous round, by that round's model, which has not learned from
-    them. Samples that were not chosen by a model (``UNCHOSEN``) are left out.
+    them. Samples that no model chose, those of the initial design and of logs, are left out.
 
     The result is empty without a previous model, or if it learned from other samples, as an imported model did.
     """
@@ -205,14 +205,15 @@ def fidelity_fields(
     target: float,
     limits: Sequence[Limit] = (),
 ) -> dict[str, Any]:
-    """Return the fields of ``wire.Fidelity`` for a model.
+    """Return how well a model knows each output (confidence index, tolerance, errors), as the fields of
+    ``wire.Fidelity``.
 
     Args:
         model: the model.
         confidences: (O,) confidence of each output.
         tolerances: (O,) tolerance of each output, in its unit.
         target: confidence index that the design aims at.
-        limits: ends of coordinates' ranges that samples have reached.
+        limits: declared limits of coordinates at which many samples end.
     """
     rows = [
         {"name": name, "structure": structure, "tolerance": tolerance, **asdict(output)}
@@ -231,7 +232,8 @@ def fidelity_fields(
 
 
 def fidelity_of(model: DynamicsModel, defaults: Sequence[float], target: float) -> dict[str, Any]:
-    """Compute the confidence of a model, and return the fields of ``wire.Fidelity``.
+    """Compute how well a model knows each output (confidence index, tolerance, errors), and return this as the fields
+    of ``wire.Fidelity``.
 
     Args:
         model: the model.

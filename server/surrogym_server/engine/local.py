@@ -216,8 +216,8 @@ class LocalEngine(SessionEngine):
         return None if request.within is None else self._live.clock() + request.within
 
     def _tally(self, request: Advance, answer: Answer, began: float) -> Reply:
-        """Count the duration since ``began`` and the steps of a request that is not a reset, and return the reply. The
-        counts of the session leave out a repeated request; the totals of the engine include it."""
+        """Return the reply to a request. If the request is not a reset, add its steps and the time since ``began`` to
+        the counts. The counts of the session leave out a repeated request; the totals of the engine include it."""
         reply = Reply(answer.seq, answer.outcome)
         tally = self._tallies.of(request.session)
         if isinstance(request, Reset):

@@ -83,10 +83,10 @@ class SessionEngine(ABC):
 
     @abstractmethod
     async def submit(self, session: str) -> Visited:
-        """Return the states that a session visited, with the model's confidence over them.
+        """Return the states that a session visited, with the model's confidence index over them.
 
         Raises:
-            InvalidInput: the session was opened without occupancy.
+            InvalidInput: the session was opened without the option ``occupancy``, which records visited states.
             NotReset: the session has visited no state yet.
         """
 

@@ -297,8 +297,8 @@ def limits_rewards(definition: EnvironmentDefinition) -> bool:
 def _limited(settings: VirtualSettings, rewards: SampledRewards | None, model: DynamicsModel) -> VirtualSettings:
     """Add limits of virtual rewards to the settings of a session, from the range of the samples' rewards.
 
-    There are no limits if the surrogate's rewards are not limited, or if the model has learned from more samples than
-    are stored, as an imported model may have.
+    No limits are added if there are no samples (``rewards`` is None), if the specification declares the reward or has
+    the preset ``paper``, or if the model has learned from more samples than are stored, as an imported model may have.
     """
     if rewards is None or not limits_rewards(model.definition) or model.samples > rewards.samples:
         return settings
@@ -389,7 +389,7 @@ def visited_states(session: Session) -> Array:
     """Return the states (v, C) that a session visited.
 
     Raises:
-        InvalidInput: the session was opened without occupancy.
+        InvalidInput: the session was opened without the option ``occupancy``, which records visited states.
         NotReset: the session has visited no state yet.
     """
     if session.visited is None:

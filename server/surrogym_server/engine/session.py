@@ -144,8 +144,8 @@ def answered(session: Session, request: Fingerprint, outcome: Outcome) -> tuple[
 
 
 def reset_session(session: Session, seed: Seeds, mask: Bools | None, latest: int) -> tuple[Session, ResetResult]:
-    """Start new episodes in the lanes of ``mask`` (None: in all lanes), under the model version ``latest``. ``seed`` is
-    explained at ``virtual.environment.reset``."""
+    """Start new episodes in the lanes of ``mask`` (None: in all lanes), under the model version ``latest``. With a
+    ``seed``, these are the episodes 0 of this seed; if it is None, each lane begins its next episode."""
     lanes, observation = reset(session.definition, session.settings, session.lanes, seed, mask)
     lanes_reset = np.ones(session.settings.num_envs, dtype=bool) if mask is None else mask
     versions = np.where(lanes_reset, latest, session.versions)

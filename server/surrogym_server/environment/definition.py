@@ -1,4 +1,4 @@
-"""EnvironmentDefinition: one environment in the form with which the core computes.
+"""EnvironmentDefinition: one environment in the form with which models and designs compute.
 
 A specification (``surrogym_shared.spec``) is what a person writes: it leaves defaults open, and is checked when it is
 made. A definition is derived from it, only in ``convert.definitions``: it has every default. Its coordinates,
@@ -309,7 +309,8 @@ class EnvironmentDefinition:
         return self._termination(q).any(-1)
 
     def within_rates(self, q: Tensor, u: Tensor) -> Tensor:
-        """Return the actions (n, F) that keep the rates at states q (n, C) and are nearest to actions u (n, F)."""
+        """Return the actions (n, F) that are nearest to actions u (n, F) and within the declared rates: the largest
+        changes of action entries from the step before. States q (n, C) contain the previous values of these entries."""
         if not self.rates:
             return u
         kept = u.to(q.dtype, copy=True)
@@ -326,8 +327,8 @@ class EnvironmentDefinition:
         return self._limits.falls_back(q, q_next)
 
     def room(self, q: Tensor) -> Tensor:
-        """Return the distances (..., L) of L limited terms from the nearer ends of their ranges in states q (..., C).
-        The distance is negative outside the range."""
+        """Return for L declared limits, each a range of a function of the state, how far states q (..., C) are from the
+        nearer end of the range, (..., L). The distance is negative outside the range."""
         return self._limits.room(q)
 
     @cached

@@ -1,4 +1,4 @@
-"""Inverse of the observation: coordinates read back from it, for models whose outputs move the observation.
+"""Inverse of the observation: computes coordinates from it, for models whose outputs are changes of the observation.
 
 An angle needs both its cosine and its sine among the entries. A predicted pair need not lie on the unit circle, but it
 still has an angle. A linear coordinate needs an entry that is the coordinate itself.

@@ -31,8 +31,8 @@ class LimitSet:
         return to_device(cls(terms, low, high, margin), device)
 
     def room(self, q: Tensor) -> Tensor:
-        """Return the distances (..., L) of L limited terms from the nearer ends of their ranges in states q (..., C).
-        The distance is negative outside the range."""
+        """Return for L declared limits, each a range of a function of the state, how far states q (..., C) are from the
+        nearer end of the range, (..., L). The distance is negative outside the range."""
         value = self.terms(q)
         return torch.minimum(value - self.low, self.high - value)
 

@@ -221,8 +221,8 @@ def _add_residuals(
     Args:
         head: scalars of the process, such as its scale: its matrix HEAD (1, 11).
         rows: coefficients of the polynomial parts of the process: its matrix POLYNOMIALS (5 + 2 n, d).
-        kept, turned: random Fourier frequencies of the process: its matrices KEPT and TURNED (d, S). KEPT is 0 for
-            inputs whose sign the mirror symmetry changes, TURNED for all others.
+        kept, turned: random Fourier frequencies of the process: its matrices KEPT and TURNED (d, S), with S
+            frequencies. KEPT is 0 for inputs whose sign the mirror symmetry changes, TURNED for all others.
         own: inputs of the process, (d, B).
         k: covariances of the inputs with the n points, (n, B).
         paths: weights of the posterior samples, one row for each input, (B, W); the first columns belong to this

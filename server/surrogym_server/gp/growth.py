@@ -81,8 +81,8 @@ def fit_growing(z: Tensor, t: Tensor, may: Tensor, options: FitOptions, starts: 
 
 
 class _GrowingObjective:
-    """Negative log evidence of F, priors included, as a function of theta = [theta of the process G, rates of the
-    inputs that may have one]; see the module."""
+    """Negative log evidence of F, a function that changes faster the larger an input is (see the module), priors
+    included. It depends on theta = [theta of the process G, rates of the inputs that may have one]."""
 
     def __init__(self, z: Tensor, t: Tensor, may: Tensor, options: FitOptions) -> None:
         if options.quadratic:

@@ -39,8 +39,8 @@ def hyperparameter_samples(
         count: number of samples.
         seed: seed of the chain.
         noise_floor: least noise variance, as in the fit: a share of the output's variance.
-        most_noise: greatest noise variance. If the process has more, the chain starts at the likeliest hyperparameters
-            within this bound.
+        most_noise: greatest noise variance, also as a share of the output's variance. If the process has more, the
+            chain starts at the likeliest hyperparameters within this bound.
     """
     hyper = posterior.hyper
     options = FitOptions(

@@ -59,7 +59,8 @@ class Parameters:
         self.default_start[-1] = math.log(1e-4)
 
     def theta(self, hyper: Hyperparameters) -> Array:
-        """Return the free parameters theta of hyperparameters, clipped to the bounds; the inverse of ``hyper``."""
+        """Return the free parameters theta of hyperparameters, clipped to the bounds. The method ``hyper`` converts
+        theta back to hyperparameters."""
         variances = [hyper.signal_variance]
         variances += [hyper.linear_variance] * self.options.linear
         variances += [hyper.quadratic_variance] * self.options.quadratic

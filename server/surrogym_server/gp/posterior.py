@@ -139,7 +139,8 @@ def condition(hyper: Hyperparameters, x: Tensor, y: Tensor) -> Posterior:
     """Condition a process on x (n, d) and y (n,).
 
     Raises:
-        NumericalFailure: the covariance can't be factored, even with a jitter of 1e-4 of the prior's variance.
+        NumericalFailure: the covariance matrix can't be factored, even with a jitter of 1e-4 of its mean diagonal
+            entry.
     """
     k = covariance(hyper, x, x)
     k.diagonal().add_(hyper.noise_variance)

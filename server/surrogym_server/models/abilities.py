@@ -35,7 +35,7 @@ class TakesPrior(ABC):
     """Ability of a ``Learner`` to use a prior: an earlier model of the same family and definition, such as a model of a
     simulator of the environment.
 
-    If a learner lacks this ability, ``services`` refuses a prior for it.
+    If a learner lacks this ability, the server refuses a prior for it (``features.priors``).
     """
 
     @abstractmethod

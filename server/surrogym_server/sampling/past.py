@@ -59,7 +59,8 @@ def owed_to_past(model: DynamicsModel, samples: Samples, limits: Sequence[float]
 
 
 def pairs_lacking(definition: EnvironmentDefinition, samples: Samples) -> int:
-    """Return how many more pairs of consecutive steps ``owed_to_past`` needs than the samples contain."""
+    """Return how many more pairs of consecutive steps than the samples contain are needed for the test whether earlier
+    steps explain errors of a model."""
     state, size, changes = _state(definition, samples.q[:1]).shape[1], samples.u.shape[1], len(definition.moving)
     enough = PAIRS * (state + size + changes + DEPTHS[0] * size + 1)
     return max(0, enough - int((preceding(definition, samples) >= 0).sum()))

@@ -362,7 +362,7 @@ class Designer:
 
     def _give_up(self, hopeless: Sequence[str]) -> None:
         """Set the designs of the surrogates named in ``hopeless`` to "failed". Samplers answered none of their initial
-        queries, and all are set aside or refused, so no sample will come."""
+        queries. All were refused by the environment, or set aside after repeated failures, so no sample will come."""
         for name in hopeless:
             with suppress(UnknownSurrogate):  # the surrogate may have been deleted since ``hopeless`` was read
                 set_aside = self._storage.queries.list(name, ("set_aside", "refused"))

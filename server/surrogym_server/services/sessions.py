@@ -64,7 +64,7 @@ class SessionService:
         Returns the number of states, and the confidence index of the session's model over them.
 
         Raises:
-            InvalidInput: the session was opened without occupancy.
+            InvalidInput: the session was opened without the option ``occupancy``, which records visited states.
             NotReset: the session has visited no state yet.
             UnknownSurrogate: another server deleted the surrogate.
         """

@@ -52,9 +52,9 @@ class Sweeper:
     async def sweep(self) -> None:
         """Do the periodic work once.
 
-        Queries of expired leases become open again or are set aside. Expired sessions end, and so do sessions whose
-        surrogate another server has deleted. Requests that wait for a changed surrogate are woken. Old events are
-        removed.
+        Queries of expired leases become open again, or are set aside (not leased again) after repeated failures.
+        Expired sessions end, and so do sessions whose surrogate another server has deleted. Requests that wait for a
+        changed surrogate are woken. Old events are removed.
         """
         await self._try(self._engine.sweep)
         for sweep in (self._sweep_leases, *self._others):

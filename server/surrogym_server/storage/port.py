@@ -178,8 +178,8 @@ class Designs(ABC):
     def hopeless(self) -> list[str]:
         """Return the names of surrogates whose design can't continue, oldest first.
 
-        Such a surrogate is in phase ``collecting`` and not paused. It has no samples, and all its queries were set
-        aside or refused.
+        Such a surrogate is in phase ``collecting`` and not paused. It has no samples, and all its queries were refused
+        by the environment, or set aside after repeated failures.
         """
 
     @abstractmethod
@@ -275,8 +275,8 @@ class Queries(ABC):
     def fail(
         self, name: str, query_id: int, token: str, error: str, *, begun: bool = True, refused: bool = False
     ) -> QueryRecord:
-        """End the lease of a query that could not be answered. The query becomes pending again, or is set aside after
-        its last attempt. A refused query is not leased again.
+        """End the lease of a query that could not be answered. The query becomes pending again. After its last attempt
+        it is set aside: it is kept, but not leased again. A refused query is not leased again either.
 
         A repeat changes nothing. If the query begins at a snapshot that was dropped during the lease, the query is
         removed, or set aside if a step may have been taken.
@@ -286,7 +286,8 @@ class Queries(ABC):
             query_id: id of the query.
             token: token of the lease.
             error: description of the failure.
-            begun: whether a real step may have been taken. If so, the steps of the query count as unresolved.
+            begun: whether a real step may have been taken. If so, the ledger counts the steps of the query as
+                unresolved.
             refused: whether the original environment refused the query before a real step; ``begun`` is then ignored.
 
         Raises:
@@ -381,8 +382,8 @@ class Snapshots(ABC):
     def drop(self, name: str, snapshots: Sequence[str]) -> int:
         """Remove snapshots, and return the number removed. Unknown names are skipped.
 
-        Pending queries that begin at a removed snapshot are removed too, or set aside if a real step may have been
-        taken. A fit becomes due, which chooses other queries.
+        Pending queries that begin at a removed snapshot are removed too. If a real step may have been taken, they are
+        set aside instead: they are kept, but not leased again. A fit becomes due, which chooses other queries.
         """
 
 

@@ -128,7 +128,7 @@ async def _gone(process: int) -> None:
 
 
 def _where(job: DesignJob) -> DesignResult:
-    """Return an empty result at once, with the number of the process that ran the job in place of a hash of samples."""
+    """Return an empty result at once, with the id of the process that ran the job in its field ``data_hash``."""
     del job
     return DesignResult(b"", {}, {"samples": 0}, str(os.getpid()), {}, "ready", 0.0)
 

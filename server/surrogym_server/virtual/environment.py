@@ -147,8 +147,8 @@ def step(
     stds: bool = False,
     particle_steps: ArraySteps | None = None,
 ) -> tuple[LaneState, LaneTransition]:
-    """Step lanes in torch. This is the reference implementation of ``virtual.step``, with the same arguments and
-    errors.
+    """Step all N lanes (parallel environments), or those that ``mask`` (N,) selects, under actions u (N, F), in torch.
+    This is the reference implementation of ``virtual.step``, with the same arguments and errors.
 
     If ``particle_steps`` are given, they predict the steps of particles in compiled code.
     """
@@ -269,9 +269,9 @@ def _untrusted(model: DynamicsModel, settings: VirtualSettings, moved: Moved) ->
 def _left(definition: EnvironmentDefinition, q: Tensor, moved: Moved, untrusted: Tensor | None) -> Tensor | None:
     """Return (N,) bool: which of N lanes end early after a step from q (N, C).
 
-    If an outside reward is declared, a lane ends early if its next state lies outside the sampling range or if it is in
-    ``untrusted`` (N,). If limits are declared, it ends early if their fallback action would take over. Return None if
-    neither is declared.
+    If the specification declares an outside reward (for each step that an episode then misses), a lane ends early if
+    its next state lies outside the sampling range or if it is in ``untrusted`` (N,). If limits are declared, it ends
+    early if their fallback action would take over. Return None if neither is declared.
     """
     if definition.outside_reward is None and definition.limits is None:
         return None

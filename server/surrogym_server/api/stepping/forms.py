@@ -36,7 +36,8 @@ PARAMETER: dict[str, Any] = {
 
 
 def seconds_left(headers: Mapping[str, str]) -> float | None:
-    """Return how long the caller of a request waits, in seconds; None if the header is missing.
+    """Return how long the caller of a request waits, in seconds, by the header ``x-deadline-ms``; None if the header is
+    missing.
 
     Raises:
         InvalidInput: the header is not a whole number of milliseconds.
@@ -94,8 +95,8 @@ def frame_of(operation: Operation, content: bytes) -> frames.Request:
     if not isinstance(request, FRAMES[operation]):
         expected = " or ".join(str(kind.__struct_config__.tag) for kind in FRAMES[operation])
         raise frames.FrameError(
-            f"expected a frame whose op is {expected}, got op {request.__struct_config__.tag}: "
-            "send it to the address of its op"
+            f"expected a frame of the operation {expected}, got one of {request.__struct_config__.tag}: send it to the "
+            "address of its operation"
         )
     return request
 

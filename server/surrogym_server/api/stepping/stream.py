@@ -3,8 +3,8 @@
 It is plain ASGI, which makes a step fast. Requests are carried out one at a time, and each is answered before the next
 is read. The connection may be dropped at any time: the client can continue the session, by its id, on another.
 
-A server that offers ``EXTENSION`` may pass on a message as it arrives, without waking a task. If the answer needs no
-waiting, the answer is sent at once. Other messages take the usual way of ASGI.
+A server that offers the ASGI extension ``EXTENSION`` may pass on a message to the app as it arrives, without waking a
+task. If the answer needs no waiting, the answer is sent at once. Other messages take the usual way of ASGI.
 """
 
 from __future__ import annotations
@@ -88,7 +88,9 @@ async def _reply(
     """Carry out the request in one message, and return the reply as a frame. An error becomes a reply too."""
     try:
         if content is None:
-            raise frames.FrameError("expected a binary message, got text")
+            raise frames.FrameError(
+                "expected a request as a binary message (a frame), got a text message: send a frame"
+            )
         frame = frames.read_request(content)
     except frames.FrameError as error:
         return _refusal(error, None)

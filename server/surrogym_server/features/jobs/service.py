@@ -110,7 +110,8 @@ class JobService:
         return claimed.job
 
     def report(self, name: str, id: int, token: str, lease_seconds: float, progress: JobProgress | None) -> bool:
-        """Renew the lease of a job, and store its progress (None: unchanged). Return whether the worker has to stop.
+        """Renew the lease of a job, and store its progress (None: keep the stored progress). Return whether the worker
+        has to stop.
 
         Raises:
             UnknownJob: the job does not exist.

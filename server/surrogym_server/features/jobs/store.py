@@ -150,7 +150,7 @@ class Jobs:
             return LeasedJob(row.id, row.task, row.attempts + 1, token)
 
     def report(self, name: str, id: int, token: str, seconds: float, progress: JobProgress | None) -> bool:
-        """Extend the lease of a job to ``seconds`` from now, and store its progress (None: unchanged).
+        """Extend the lease of a job to ``seconds`` from now, and store its progress (None: keep the stored progress).
 
         Returns whether the worker has to stop.
 

@@ -142,5 +142,8 @@ class RowBlobs(Blobs):
 
 def _checked(name: str) -> str:
     if not NAME.fullmatch(name.removesuffix(PART)):
-        raise damaged(f"expected the name of a stored file (blob), 32 hexadecimal digits, got {name!r}")
+        raise damaged(
+            f"expected the name of a stored file (blob), 32 hexadecimal digits, got {name!r}; restore a copy of the "
+            "database"
+        )
     return name

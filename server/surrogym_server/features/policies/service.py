@@ -136,7 +136,8 @@ class PolicyService:
         Args:
             name: name of the surrogate.
             version: version of the policy.
-            file: format, size and hash of the file. The main file must have the hash that ``add`` was called with.
+            file: format, size and hash of the file. The main file, which ``add`` announced, must have the hash that it
+                was announced with.
             content: the file.
             by: role and fingerprint of the token that sends the file; None for an admin.
 
@@ -178,7 +179,9 @@ class PolicyService:
         file = next((one for one in record.files if one.form == form and one.blob is not None), None)
         if file is None:
             there = ", ".join(one.form for one in record.files if one.blob is not None) or "none"
-            raise UnknownPolicy(f"expected the format of a stored file of {place} ({there}), got {form!r}")
+            raise UnknownPolicy(
+                f"expected the format of a stored file of {place} (stored: {there}), got {form!r}: choose a stored one"
+            )
         return record.version, self._content(file.blob, file.digest, f"the {form} file of {place}")
 
     def evaluate(self, name: str, version: int, episodes: AddEvaluation) -> tuple[PolicyRecord, EvaluationRecord]:
@@ -335,7 +338,9 @@ def _require_lengths(episodes: AddEvaluation, spec: JSON) -> None:
     for what in ("lengths", "success"):
         values = getattr(episodes, what)
         if values is not None and len(values) != count:
-            raise InvalidInput(f"{what}: expected {count} entries, one for each return, got {len(values)}")
+            raise InvalidInput(
+                f"{what}: expected {count} entries, one for each episode, as many as `returns` has, got {len(values)}"
+            )
     action = spec["action"]
     sizes = {"c": len(spec["coordinates"]), "f": len(action.get("low") or action.get("nvec") or (0,))}
     for number, trace in enumerate(episodes.traces):
@@ -386,7 +391,10 @@ def check_file(form: str, content: bytes, size: int, digest: str) -> None:
         raise InvalidInput(f"expected a file with SHA-256 {digest}, as announced, got {found}: send the file again")
     expected, looks_right = FORMS[form]
     if not looks_right(content):
-        raise InvalidInput(f"expected {expected} for the format {form!r}, got content that begins with {content[:8]!r}")
+        raise InvalidInput(
+            f"expected {expected} for the format {form!r}, got content that begins with {content[:8]!r}: send a file "
+            "of this format"
+        )
 
 
 def _names(content: bytes) -> set[str]:

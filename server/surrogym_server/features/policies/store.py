@@ -234,7 +234,8 @@ def _of_file(file: PolicyFile) -> dict[str, Any]:
 
 
 def _known(connection: Connection, surrogate: int, card: JSON, curve: list[JSON], digest: str) -> int | None:
-    """Return the newest policy version with this main file, card and curve; None if there is none.
+    """Return the newest policy version with this card, this learning curve, and a main file of the hash ``digest``;
+    None if there is none.
 
     An empty ``curve`` matches any curve, because a downloaded policy has none when it is stored again.
     """

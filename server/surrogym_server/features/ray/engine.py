@@ -143,7 +143,7 @@ class RayEngine(SessionEngine):
                 return await self._answer(session, host, operation, *arguments)
             except (UnknownSession, _Gone) as error:
                 host = await self._moved(session, host, error)
-        raise Unavailable(f"session {session!r} changes its host: try again later")
+        raise Unavailable(f"session {session!r} is moving to another session host: try again later")
 
     def _place(self, session: str) -> int:
         if (known := self._places.get(session)) is not None:

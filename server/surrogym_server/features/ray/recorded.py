@@ -162,7 +162,7 @@ class RecordedEngine(SessionEngine):
             await self._inner.close(id)
             if isinstance(error, IdempotencyConflict):
                 raise Unavailable(
-                    "another session host is opening a session under this key: try again later"
+                    "another session host is opening a session with this idempotency key: try again later"
                 ) from error
             raise
 

@@ -20,7 +20,8 @@ from surrogym_server.storage.sql.tables import AT_ONCE, checked, metadata, owner
 
 @dataclass(frozen=True)
 class SessionLease:
-    """Lease of a session, which allows its ``owner`` to carry out requests. ``fence`` increases with each new owner."""
+    """Lease of a session, which allows its ``owner`` to carry out requests. ``fence`` is a number that increases with
+    each new owner."""
 
     id: str
     owner: str

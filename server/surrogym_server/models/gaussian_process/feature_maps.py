@@ -1,6 +1,7 @@
 """Candidate feature maps (encodings of state and action as inputs of a process), and the symmetry of each.
 
-Learning chooses among the candidates by evidence. They are the same for all environments.
+Learning chooses among the candidates by evidence. Which ones there are depends on the environment's angles, discrete
+actions, limits, lags and mirror symmetry.
 """
 
 from __future__ import annotations

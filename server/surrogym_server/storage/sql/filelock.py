@@ -115,8 +115,8 @@ class FileLock:
                 )
 
     def is_as_noted(self) -> bool:
-        """Whether the file's header is the one that was remembered last. If so, no program has written to the file
-        since then."""
+        """Whether the file's header is the one that ``watch`` or ``require_own_content`` remembered last. If so, no
+        program has written to the file since then."""
         return self._noted is None or self.header() == self._noted
 
     def require_own_content(self) -> None:
@@ -252,9 +252,9 @@ def marks(header: bytes) -> tuple[str, ...]:
 def belongs(log: Path, header: bytes) -> bool:
     """Whether the write-ahead log ``log`` may belong to the database whose header is ``header``.
 
-    It does if the log contains nothing to merge, if the log has the mark of this database, or if the log contains this
-    header, because merging has begun. A log without a mark is from an older program, and may belong to a database
-    without a mark.
+    It does if the log contains nothing to merge, if the log has the mark of this database (see ``marks``), or if the
+    log contains this header, because merging has begun. A log without a mark is from an older program, and may belong
+    to a database without a mark.
     """
     try:
         file = log.open("rb")

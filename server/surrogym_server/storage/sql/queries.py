@@ -252,8 +252,8 @@ def insert_snapshots(connection: Connection, surrogate: Row[Any], new: dict[str,
 
 
 def give_up_lost(connection: Connection, surrogate: Row[Any], given_back: QueryRecord) -> None:
-    """Remove or set aside the query ``given_back``, whose lease has ended, if its snapshot was dropped during the
-    lease. Otherwise samplers would claim it repeatedly."""
+    """Give up the query ``given_back``, whose lease has ended, if its snapshot was dropped during the lease: remove the
+    query, or set it aside (keep it, but don't lease it again). Otherwise samplers would claim it repeatedly."""
     if given_back.snapshot is None or given_back.status != "pending":
         return
     own = (snapshots.c.surrogate_id == surrogate.id) & (snapshots.c.name == given_back.snapshot)

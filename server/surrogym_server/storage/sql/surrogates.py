@@ -227,7 +227,8 @@ def withdraw_unbegun(
 
 
 def spoken_for(connection: Connection, surrogate_id: int) -> int:
-    """Return the number of real steps that count towards the budget: samples, and steps of unanswered queries.
+    """Return the number of real steps that count towards the budget: samples, and steps of unanswered queries, except
+    those of logs and audits.
 
     Queries that were set aside count, because steps may have been taken; refused queries don't.
     """

@@ -71,8 +71,11 @@ def compiled_step(
     mask: Bools | None,
     stds: bool,
 ) -> tuple[LaneState, LaneTransition]:
-    """Step lanes (parallel environments) as ``virtual.environment.step`` does, in compiled code. ``move`` is the
-    model's compiled step."""
+    """Step all N lanes (parallel environments), or those that ``mask`` (N,) selects, under actions u (N, F), in
+    compiled code. Except for rounding errors, the results equal those of ``virtual.environment.step``.
+
+    ``move`` is the model's compiled step.
+    """
     definition, changed = model.definition, _Changed.of(lanes)
     running, moving, beginning = _divided(settings, lanes, changed.phase, mask)
     if settings.variant == "pathwise":
@@ -170,8 +173,8 @@ def _concluded(
     fallen: Bools,
 ) -> int:
     """Complete a step from the predictions ``moved``: write states, rewards and ends of episodes of the lanes that the
-    mask ``moving`` (N,) selects to ``changed``. Return the number of lanes whose episode ended. ``fallen`` is the
-    result of ``_fallen``."""
+    mask ``moving`` (N,) selects to ``changed``. Return the number of lanes whose episode ended. ``fallen`` has a flag
+    for each selected lane: whether the fallback action of the declared limits would take over."""
     trust, limit, outside = settings.trust, settings.time_limit, model.definition.outside_reward
     scales = model.scales.numpy() if settings.doubts else np.zeros(0)
     return conclude(

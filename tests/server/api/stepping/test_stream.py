@@ -159,14 +159,14 @@ def test_a_text_message_on_the_stream_is_refused(stream: ClientConnection):
     stream.send('{"op": "reset"}')
     problem = frames.read_reply(stream.recv(timeout=60))
     assert isinstance(problem, frames.ProblemReply)
-    assert problem.detail == "expected a binary message, got text"
+    assert problem.detail == "expected a request as a binary message (a frame), got a text message: send a frame"
 
 
 def test_a_reset_frame_sent_to_the_step_route_is_refused(client: httpx.Client, session: str):
     reply = post(client, session, frames.reset_request(1, None, None), what="step")
     assert (reply.status_code, reply.json()["detail"]) == (
         422,
-        "expected a frame whose op is step, got op reset: send it to the address of its op",
+        "expected a frame of the operation step, got one of reset: send it to the address of its operation",
     )
 
 

@@ -70,8 +70,8 @@ def _splits(
     learner: OutputLearner, samples: Samples, inputs: Mapping[FeatureMap, Tensor], going: Tensor, plain: OutputModel
 ) -> Iterator[Split]:
     """Yield candidates for a jump. Each splits the samples ``going`` (n,) by a level of the reward: the smaller part
-    lies inside a region, the rest outside. A candidate consists of its log odds against ``plain``, the region, the
-    output learned from the samples outside, and the mask of these samples (n,).
+    lies inside a region, the rest outside. A candidate consists of its log odds against ``plain``, the output that was
+    learned without jumps; the region; the output learned from the samples outside; and the mask of these samples (n,).
 
     A single sample inside counts as a jump only if the rewards of all others are equal. Otherwise it may also lie on a
     steep slope.

@@ -177,7 +177,8 @@ def _violated(posterior: Posterior, x: Tensor, y: Tensor, side: Tensor) -> list[
         posterior: the process.
         x: inputs (k, d) of the points.
         y: standardised limits (k,).
-        side: (k,) amplitude of the output at each point, negative for a lower limit.
+        side: (k,) 1 for an upper and -1 for a lower limit, multiplied by the amplitude with which the output's rates
+            scale the process at the point (1 without rates).
     """
     joint, mean = Joint.of(posterior, x), posterior.mean(x)
     points: list[int] = []

@@ -103,7 +103,8 @@ class OutputLearner:
 
     def _fit(self, name: str, feature_map: FeatureMap, x: Tensor, y: Tensor, also: str = "") -> Fitted:
         """Fit a process to x (n, d), y (n,). If there are many points, fit it to a subset, and scale its log evidence
-        up to the number of all points. ``also`` is appended to the key of the warm start."""
+        up to the number of all points. The hyperparameters are stored under a key, for the warm start of later fits;
+        ``also`` is appended to this key."""
         key, rows = f"{name}|{feature_map}{also}", spread(len(y), subsets.FEW)
         mirror = reflection(self.definition, feature_map)
         result = fit(x[rows], y[rows], self.options(name), self.warm.get(key), mirror)

@@ -155,7 +155,8 @@ def _better(
     ``plain``, which learned the rewards themselves.
 
     ``structure`` are the log odds of the process of ``account`` against targets that don't depend on the inputs. The
-    other arguments are those of ``with_peak``.
+    samples have the rewards ``reward`` (n,) and the features ``inputs``; ``going`` (n,) is true for those that are
+    compared.
     """
     if account.posterior is None:
         return False

@@ -71,10 +71,12 @@ def inputs_of(output: OutputModel, inputs: Mapping[FeatureMap, Tensor]) -> Tenso
 def _may_have_rates(
     learner: OutputLearner, output: OutputModel, inputs: Mapping[FeatureMap, Tensor], keep: Tensor
 ) -> Tensor:
-    """Return for each of the d inputs of an output whether it may have a rate, (d,) bool.
+    """Return for each of the d inputs of an output whether it may have a rate, with which the output changes faster the
+    larger the input is, (d,) bool.
 
     No input may have a rate if there are too few samples to determine rates, or if the process predicts well already.
-    ``inputs`` and ``keep`` are those of ``output_with_rates``.
+    ``inputs`` has the features (n, d) of the samples by feature map; ``keep`` (n,) is true for the samples to learn
+    from.
     """
     plain, posterior = output.feature_map, output.posterior
     kinds = torch.tensor([feature.function == "affine" for feature in features(learner.definition, plain)])

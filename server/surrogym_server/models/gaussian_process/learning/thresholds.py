@@ -94,7 +94,8 @@ def _cover(reached: Bools, share: Floats) -> list[int]:
 
 def _assign(reached: Bools, share: Floats, axes: list[int]) -> NDArray[np.int64]:
     """Return for each of i samples inside the position in ``axes`` of the axis whose threshold explains the sample,
-    (i,). ``reached`` and ``share`` are as in ``_cover``.
+    (i,). ``reached`` (i, A) says whether a sample exceeds all samples outside on an axis, and ``share`` (i, A) by which
+    share of the axis's range.
 
     If several axes are possible, it is the axis on which the sample lies farthest beyond the samples outside. On each
     axis this distance is divided by the smallest distance of the samples that only this axis explains.

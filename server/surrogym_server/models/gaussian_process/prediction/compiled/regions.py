@@ -147,7 +147,8 @@ def add_jumped(
 ) -> None:
     """Add the jumps of the reward, which have the index ``at`` in the tables, to ``reward`` (B,), the rewards at the
     states q (C, B). Add to ``variance`` (B,) the variance of the reward where it is uncertain whether a state lies
-    inside a jump's region. The other arguments are those of ``probability``."""
+    inside a jump's region. ``observe`` is the index, in the tables ``numbers`` and ``places``, of the terms that
+    compute the observation; ``actions`` is the number of action entries."""
     jumps = matrix(numbers, places, at)
     free = np.ones(q.shape[1], dtype=np.bool_)
     for j in range(len(jumps)):

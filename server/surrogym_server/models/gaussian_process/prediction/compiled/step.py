@@ -197,7 +197,8 @@ def _predict_stage(
         stage: FIRST for outputs that read only coordinates and action, LED for outputs that also read the next values
             of leading coordinates, AFTER for a reward that reads the next state.
         x: features (d, B).
-        noise, process, paths, known: as in ``step``, for these lanes.
+        noise, process, paths, known: random numbers, weights of sampled functions, and predictions of a prior model for
+            these lanes; see ``step``.
         stds, reward_std: whether standard deviations of transition outputs and of the reward are needed.
         mean: (columns, B) predicted values, with a row for each coordinate or observation entry and one for the reward.
             The rows of this stage's outputs are written.
