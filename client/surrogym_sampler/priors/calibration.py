@@ -388,7 +388,7 @@ def _with_intervals(
 
 
 def _moved(errors: _Errors, scaling: _Scaling, x: Array, index: int) -> Array:
-    """Return the errors after the parameter ``index`` was moved by ``NUDGE``."""
+    """Return the errors with the scaled parameter ``index`` of ``x`` increased by ``NUDGE``."""
     at = x.copy()
     at[index] += NUDGE
     return errors(scaling.values(at))
