@@ -342,7 +342,7 @@ class GuardedRollouts:
 
     @property
     def fallback_steps(self) -> int:
-        """Number of real steps that the fallback controller has taken because no action came, in no query."""
+        """Number of real steps, part of no query, that the fallback controller took because no action came."""
         return self._watchdog.taken
 
     def begin(self, seed: int | None = None) -> Array:
