@@ -5,10 +5,22 @@ from dataclasses import replace
 import pytest
 
 from support.terminal import on_terminal
+from surrogym.cli.columns import ENDLESS
+from surrogym_lab.reproduce.markdown import fitted
 from surrogym_lab.reproduce.page import NoSuchPlace, present_sections, section, update
 from surrogym_lab.reproduce.pictures import draw_tasks
 from surrogym_lab.reproduce.rows import Row, write_rows
 from surrogym_lab.reproduce.table import headline, report
+
+MARKDOWN = """\
+| task | what was asked | result |
+| --- | --- | --- |
+| pendulum | mean -160, all upright | reached |
+| cartpole | all 500 | - |
+
+A sentence that is broken
+where it was not.
+"""
 
 ROW = Row(
     *("pendulum", "default", 0, 14, 4, 5, 9),
@@ -149,3 +161,15 @@ def test_the_study_table_fits_a_terminal(tmp_path):
         assert "worst episode   -400.0" in terminal.shown
         assert max(map(len, terminal.shown.splitlines())) <= 80
     assert max(map(len, (tmp_path / "both" / "efficiency.md").read_text().splitlines())) > 80
+
+
+@pytest.mark.parametrize("width", [30, 40, 60, 80])
+def test_markdown_is_wrapped_to_the_terminal_width_without_losing_words(width):
+    shown = fitted(MARKDOWN, width)
+    assert max(map(len, shown.splitlines())) <= width
+    assert set(MARKDOWN.replace("|", " ").replace("---", "").split()) <= set(shown.split())
+    assert "\n\nA sentence that is broken where" in fitted(MARKDOWN, 80).replace("was\n", "was ")
+
+
+def test_markdown_written_to_a_file_is_not_wrapped():
+    assert fitted(MARKDOWN, ENDLESS) == MARKDOWN

@@ -2,20 +2,9 @@
 
 from __future__ import annotations
 
-import pytest
-
-from surrogym.cli.columns import ENDLESS, columns, fitted
+from surrogym.cli.columns import columns
 
 ROWS = [("name", "a long heading"), ("pendulum", 0.123456), ("x", None)]
-MARKDOWN = """\
-| task | what was asked | result |
-| --- | --- | --- |
-| pendulum | mean -160, all upright | reached |
-| cartpole | all 500 | - |
-
-A sentence that is broken
-where it was not.
-"""
 
 
 def test_a_table_wider_than_the_terminal_first_wraps_its_headings():
@@ -45,15 +34,3 @@ def test_a_table_too_wide_even_when_wrapped_is_printed_row_by_row():
         "name            x",
         "a long heading  -",
     ]
-
-
-@pytest.mark.parametrize("width", [30, 40, 60, 80])
-def test_markdown_is_wrapped_to_the_terminal_width_without_losing_words(width):
-    shown = fitted(MARKDOWN, width)
-    assert max(map(len, shown.splitlines())) <= width
-    assert set(MARKDOWN.replace("|", " ").replace("---", "").split()) <= set(shown.split())
-    assert "\n\nA sentence that is broken where" in fitted(MARKDOWN, 80).replace("was\n", "was ")
-
-
-def test_markdown_written_to_a_file_is_not_wrapped():
-    assert fitted(MARKDOWN, ENDLESS) == MARKDOWN

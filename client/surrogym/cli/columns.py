@@ -5,8 +5,7 @@ from __future__ import annotations
 import shutil
 import sys
 from collections.abc import Iterator, Sequence
-from itertools import groupby
-from textwrap import fill, wrap
+from textwrap import wrap
 
 ENDLESS = 10_000  # number of characters in a line if the output does not go to a terminal, so that no line is broken
 GAP = "  "
@@ -29,27 +28,6 @@ def columns(rows: Sequence[Sequence[object]], width: int | None = None) -> str:
         lines = [*_broken(heading, widths, bottom=True), *(line for row in body for line in _broken(row, widths))]
         return "\n".join(lines)
     return "\n\n".join("\n".join(_records(heading, row)) for row in body)
-
-
-def fitted(markdown: str, width: int | None = None) -> str:
-    """Format Markdown for a terminal: tables by ``columns``, prose in lines of ``width`` characters.
-
-    Without ``width``, lines have the width of the terminal. If standard output is not a terminal then, the text is
-    returned unchanged.
-    """
-    width = width or screen_width()
-    if width == ENDLESS:
-        return markdown
-    parts = []
-    for first, lines in groupby(markdown.splitlines(), key=lambda line: line[:1] if line[:1] in "|" else "prose"):
-        if first == "|":
-            heading, _, *body = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
-            parts.append(columns([heading, *body], width))
-        elif first == "prose":
-            parts.append(fill(" ".join(lines), width, break_on_hyphens=False))
-        else:
-            parts.extend(lines)
-    return "\n".join(parts)
 
 
 def screen_width() -> int:

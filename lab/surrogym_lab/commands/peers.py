@@ -216,10 +216,10 @@ def _ours(files: Sequence[Path], tasks: Sequence[str]) -> list[Point]:
 
 def _present(cells: Sequence[PeerCell], ours: Sequence[Point], out: Path, *, as_json: bool, quiet: bool) -> None:
     """Write points, table and pictures, and print the table."""
-    from surrogym.cli.columns import fitted
     from surrogym_lab.peers.pictures import draw_tasks
     from surrogym_lab.peers.points import Point
     from surrogym_lab.peers.table import NOTES, table, unfinished
+    from surrogym_lab.reproduce.markdown import fitted
     from surrogym_lab.reproduce.rows import write_records
     from surrogym_shared.terminal import give
 

@@ -62,7 +62,7 @@ def command(
 
 def present(rows: Sequence[Row], out: Path, *, as_json: bool, quiet: bool) -> None:
     """Write the table and the pictures of rows, and print the table."""
-    from surrogym.cli.columns import fitted
+    from surrogym_lab.reproduce.markdown import fitted
     from surrogym_lab.reproduce.table import report
     from surrogym_shared.terminal import give, progress
 
