@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from math import prod
 from pathlib import Path
@@ -13,7 +12,7 @@ import numpy as np
 from gymnasium.spaces import Box, Discrete
 
 from surrogym_sampler.logs.arrays import require_shapes, table_of_arrays
-from surrogym_shared.archives import Header, read_arrays
+from surrogym_shared.archives import read_arrays
 from surrogym_shared.logs.table import Cells, Table, UnusableLog
 from surrogym_shared.logs.text import LONGEST_CELL, MOST_COLUMNS, decoded, require_sizes, table_of_text
 from surrogym_shared.logs.writing import EVALUATED
@@ -92,7 +91,9 @@ def read_npz(path: Path) -> Table:
     contain. Nothing is unpickled."""
     _require_npz(path)
     try:
-        arrays = read_arrays(path, MOST_BYTES, lambda headers: require_shapes(path, _shapes(headers)))
+        arrays = read_arrays(
+            path, MOST_BYTES, lambda found: require_shapes(path, {name: one.shape for name, one in found.items()})
+        )
     except UnusableLog:
         raise
     except ValueError as error:
@@ -100,10 +101,6 @@ def read_npz(path: Path) -> Table:
     named = [str(name) for name in np.atleast_1d(arrays.pop("coordinate_names", ()))]
     evaluated = arrays.pop(EVALUATED, np.array(False))
     return replace(table_of_arrays(path, arrays, named), evaluated=evaluated.shape == () and bool(evaluated))
-
-
-def _shapes(headers: Mapping[str, Header]) -> dict[str, tuple[int, ...]]:
-    return {name: header.shape for name, header in headers.items()}
 
 
 def _require_npz(path: Path) -> None:

@@ -43,7 +43,7 @@ def renderer_of(spec: EnvironmentSpec, original: str | None = None) -> Renderer:
     Raises:
         NotRenderable: the environment has no renderer, or a package that the renderer needs is not installed.
     """
-    if original is not None and _is_class(original):
+    if original is not None and is_own(original) and not is_executable(original):
         return _Own(original)
     name = original or spec.environment
     if not is_drawn_by_gymnasium(name):
@@ -52,10 +52,6 @@ def renderer_of(spec: EnvironmentSpec, original: str | None = None) -> Renderer:
             "the class that draws it"
         )
     return _Native(name, spec)
-
-
-def _is_class(name: str) -> bool:
-    return is_own(name) and not is_executable(name)
 
 
 class _Own:

@@ -45,7 +45,7 @@ class StatePart(Protocol):
 class MujocoState(StatePart):
     """Positions, velocities, activations of actuators and mocap poses of a MuJoCo model.
 
-    ``rest_here`` records MuJoCo's full integration state. Each write first restores that record, and then sets the
+    MuJoCo's full integration state is recorded at the start. Each write first restores that record, and then sets the
     given values. So no time, warm start of the solver, applied force or active constraint of earlier steps remains.
     """
 
@@ -55,13 +55,11 @@ class MujocoState(StatePart):
         self._mujoco, self._model, self._data = mujoco, model, data
         self._kept = int(mujoco.mjtState.mjSTATE_INTEGRATION)
         self._rest = np.zeros(mujoco.mj_stateSize(model, self._kept))
-        self.rest_here()
-        self._joints = [_Joint(model, i) for i in range(model.njnt)]
-        self.variables = (*self._positions(), *self._velocities(), *self._activations(), *self._mocap())
-
-    def rest_here(self) -> None:
-        """Record the current state, which ``write`` restores before it sets values."""
-        self._mujoco.mj_getState(self._model, self._data, self._rest, self._kept)
+        mujoco.mj_getState(model, data, self._rest, self._kept)
+        joints = [_Joint(model, i) for i in range(model.njnt)]
+        positions = [variable for joint in joints for variable in joint.positions]
+        velocities = [Variable(name, "speed") for joint in joints for name in joint.velocities]
+        self.variables = (*positions, *velocities, *self._activations(), *self._mocap())
 
     def read(self) -> Array:
         data = self._data
@@ -89,12 +87,6 @@ class MujocoState(StatePart):
         self._mujoco.mj_forward(self._model, self._data)
         # mj_forward changed the solver's warm start, so restore once more
         self._mujoco.mj_setState(self._model, self._data, saved, self._kept)
-
-    def _positions(self) -> list[Variable]:
-        return [variable for joint in self._joints for variable in joint.positions]
-
-    def _velocities(self) -> list[Variable]:
-        return [Variable(name, "speed") for joint in self._joints for name in joint.velocities]
 
     def _activations(self) -> list[Variable]:
         by_entry: dict[int, str] = {}

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
-from typing import Any
+from typing import Any, get_args
 from uuid import uuid4
 
 from surrogym_client.errors import SurrogymClientError
@@ -28,7 +28,7 @@ NO_MODULE = "No module named "
 WITHOUT_CODE = (
     "; install it on each machine of the cluster, or bring it by --runtime-env FILE, a YAML file with working_dir: ."
 )
-NOTHING = SamplerReport(answered=0, failed=0, dropped=0, refused=0, impossible=0, steps=0, seconds=0.0, phase=None)
+OF_STEPS = ("steps", "fallback_steps")  # fields of a report that count steps; those that count queries are outcomes
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,7 @@ class SamplerActor:
         return Ended(self.look())
 
     def look(self) -> Look:
-        report = NOTHING if self._sampler is None else self._sampler.summary()
+        report = SamplerReport() if self._sampler is None else self._sampler.summary()
         lines, self._lines = self._lines, []
         return Look(self._start, platform.node(), os.getpid(), report, tuple(lines))
 
@@ -254,17 +254,10 @@ class RaySamplers:
         """Return the sum of all samplers' reports. The last second of a process that died may be missing."""
         all_reports = [report for member in self._members for report in member.reports.values()]
         phases = [report.phase for report in all_reports if report.phase is not None]
-        return SamplerReport(
-            answered=sum(report.answered for report in all_reports),
-            failed=sum(report.failed for report in all_reports),
-            dropped=sum(report.dropped for report in all_reports),
-            refused=sum(report.refused for report in all_reports),
-            impossible=sum(report.impossible for report in all_reports),
-            steps=sum(report.steps for report in all_reports),
-            seconds=max((report.seconds for report in all_reports), default=0.0),
-            phase=phases[-1] if phases else None,
-            fallback_steps=sum(report.fallback_steps for report in all_reports),
-        )
+        counted = (*get_args(Outcome), *OF_STEPS)
+        counts = {name: sum(getattr(report, name) for report in all_reports) for name in counted}
+        seconds = max((report.seconds for report in all_reports), default=0.0)
+        return SamplerReport(**counts, seconds=seconds, phase=phases[-1] if phases else None)
 
     def _heard(self, member: _Member) -> Sequence[Line]:
         owed, member.asked = member.asked, member.actor.look.remote()

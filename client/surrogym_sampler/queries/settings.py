@@ -65,12 +65,12 @@ class SamplerReport:
             ran; the ledger does not count them.
     """
 
-    answered: int
-    failed: int
-    dropped: int
-    refused: int
-    impossible: int
-    steps: int
-    seconds: float
-    phase: Phase | None
+    answered: int = 0
+    failed: int = 0
+    dropped: int = 0
+    refused: int = 0
+    impossible: int = 0
+    steps: int = 0
+    seconds: float = 0.0
+    phase: Phase | None = None
     fallback_steps: int = 0

@@ -10,7 +10,7 @@ import numpy as np
 
 from surrogym_shared.logs.columns import EITHER_END, Roles, heading
 from surrogym_shared.logs.table import Bools, Floats, Ints, Table, UnusableLog, flags, groups, numbers, times
-from surrogym_shared.spec import BoxAction, DiscreteAction, EnvironmentSpec, limits
+from surrogym_shared.spec import EnvironmentSpec, limits
 
 SLACK = 1e-6  # a value may lie outside its range by this share of the range's width, because of rounding to float32
 Ends = Mapping[str, tuple[float | None, float | None]]
@@ -139,14 +139,7 @@ def _state_limits(roles: Roles, spec: EnvironmentSpec | None) -> Ends:
 def _action_limits(roles: Roles, spec: EnvironmentSpec | None) -> Ends:
     if spec is None:
         return roles.limits
-    match spec.action:
-        case BoxAction(low=low, high=high):
-            ends = list(zip(low, high, strict=True))
-        case DiscreteAction(n=n):
-            ends = [(0.0, n - 1.0)]
-        case _:
-            ends = [(0.0, count - 1.0) for count in spec.action.nvec]
-    return dict(zip(roles.action, ends, strict=True))
+    return dict(zip(roles.action, spec.action.ranges, strict=True))
 
 
 BEYOND = 20.0  # a log is refused if half of a column lies this many widths of the coordinate's range outside the range

@@ -41,19 +41,15 @@ def command(
     from surrogym_shared.terminal import on_interrupt
 
     if program is not None:
+        from surrogym_sampler.diagnosis import executables
+
         with on_interrupt(lambda: "interrupted; the program was ended"):
-            _show(_of_program(program, step_limit), output)
+            _show(executables.conformance(program, step_limit), output)
         return
     from surrogym_sampler.diagnosis.conformance import conformance
 
     with on_interrupt(lambda: f"interrupted; {surrogate!r} was deleted"):
         _show(conformance(service.server, service.token_for(context), surrogate), output)
-
-
-def _of_program(program: str, step_limit: float) -> Iterable[Outcome]:
-    from surrogym_sampler.diagnosis.executables import conformance
-
-    return conformance(program, step_limit)
 
 
 def _show(checked: Iterable[Outcome], output: Output) -> None:

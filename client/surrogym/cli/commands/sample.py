@@ -361,8 +361,7 @@ def _without_queries(view: SurrogateView, output: Output, *, until_done: bool) -
     if not awaits_log(view):
         return False
     if until_done:
-        nothing = SamplerReport(0, 0, 0, 0, 0, steps=0, seconds=0.0, phase=view.phase)
-        output.give(asdict(nothing), lambda: words_of_no_log(view.name))
+        output.give(asdict(SamplerReport(phase=view.phase)), lambda: words_of_no_log(view.name))
     else:
         say(f"{words_of_no_log(view.name)}; this sampler waits for queries, Ctrl-C ends it", quiet=output.quiet)
     return until_done

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from surrogym_sampler.original.describing.counting import Counted
 from surrogym_sampler.original.describing.usable import require_few, require_numbers, require_variables
 from surrogym_sampler.original.protocol import Array
-from surrogym_shared.spec import BoxAction, DiscreteAction
+from surrogym_shared.spec import BoxAction
 from surrogym_shared.spec.actions import Action
 
 STEPS = 400
@@ -164,5 +164,4 @@ def _drawn(space: Action, rng: np.random.Generator, *, ends: bool) -> Array:
     if isinstance(space, BoxAction):
         low, high = np.array(space.low), np.array(space.high)
         return np.where(rng.random(len(low)) < 0.5, low, high) if ends else rng.uniform(low, high)
-    counts = [space.n] if isinstance(space, DiscreteAction) else space.nvec
-    return rng.integers(0, counts).astype(np.float64)
+    return rng.integers(0, space.nvec).astype(np.float64)

@@ -172,7 +172,10 @@ def _fewest(columns: Array, reward: Array, tolerance: float) -> Array | None:
 
 def _read(spec: EnvironmentSpec, q: Array, u: Array) -> Array:
     """Return the values (n, k) of the k quantities of a quadratic reward in states (n, C) under actions (n, F)."""
-    return np.stack([_values(spec, one, q, u) for one in _quantities(spec)], axis=1)
+    columns = [
+        u @ np.array(one.action) if one.term is None else evaluate(spec, one.term, q) for one in _quantities(spec)
+    ]
+    return np.stack(columns, axis=1)
 
 
 def _scaled(x: Array) -> tuple[Array, Array, Array]:
@@ -237,15 +240,16 @@ def _sum(quantities: Sequence[Quantity], weights: Array) -> Quantity:
 
 def _quantities(spec: EnvironmentSpec) -> list[Quantity]:
     """Return the quantities of a quadratic reward: coordinates, cosines and sines of angles, and action entries."""
+    unit = np.eye(spec.action.size)
+    terms = (Quantity(term=term) for term in coordinate_terms(spec))
+    return [*terms, *(Quantity(action=tuple(map(float, row))) for row in unit)]
+
+
+def coordinate_terms(spec: EnvironmentSpec) -> list[Term]:
+    """Return the coordinates as terms, each angle followed by its cosine and sine."""
     terms: list[Term] = []
     for coordinate in spec.coordinates:
         terms.append(Term.linear(**{coordinate.name: 1.0}))
         if coordinate.kind == "angle":
             terms += [Term.cos(**{coordinate.name: 1.0}), Term.sin(**{coordinate.name: 1.0})]
-    unit = np.eye(spec.action.size)
-    return [*(Quantity(term=term) for term in terms), *(Quantity(action=tuple(map(float, row))) for row in unit)]
-
-
-def _values(spec: EnvironmentSpec, quantity: Quantity, q: Array, u: Array) -> Array:
-    values = u @ np.array(quantity.action) if quantity.term is None else evaluate(spec, quantity.term, q)
-    return np.asarray(values, dtype=np.float64)
+    return terms

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surrogym_sampler.original.describing.probing import EXACT
-from surrogym_sampler.original.describing.rewarding import Paid, Timing, error_of
+from surrogym_sampler.original.describing.rewarding import Paid, Timing, coordinate_terms, error_of
 from surrogym_sampler.original.protocol import Array
 from surrogym_shared.spec import DeclaredReward, EnvironmentSpec, Inequality, Quantity, RewardTerm, Term
 from surrogym_shared.terms import evaluate, holds
@@ -329,12 +329,7 @@ def _groups(spec: EnvironmentSpec) -> Iterator[tuple[Term, ...]]:
 def _single(spec: EnvironmentSpec) -> list[Term]:
     """Return the terms that may have one value (a level) on the whole boundary of a reward: observation entries,
     coordinates, cosines and sines of angles, and differences of observation entries."""
-    own: list[Term] = []
-    for coordinate in spec.coordinates:
-        own.append(Term.linear(**{coordinate.name: 1.0}))
-        if coordinate.kind == "angle":
-            own += [Term.cos(**{coordinate.name: 1.0}), Term.sin(**{coordinate.name: 1.0})]
-    return [*(shown := _shown(spec)), *own, *_differences(shown)]
+    return [*(shown := _shown(spec)), *coordinate_terms(spec), *_differences(shown)]
 
 
 def _shown(spec: EnvironmentSpec) -> list[Term]:
