@@ -231,19 +231,13 @@ def _not_compared(first_seed: int, why: str) -> Differing:
 
 def _await_model(server: str | None, token: str | None, surrogate: str, seconds: float, *, quiet: bool) -> None:
     """Wait until the server has fitted a model to all samples. If that fails or takes too long, print the reason."""
-    from surrogym.cli.options import connect
+    from surrogym.cli.options import await_model
     from surrogym_client.errors import SurrogymClientError
-    from surrogym_client.surrogates.waiting import DesignUnfinished, wait_for_model, words_of_design
-    from surrogym_shared.terminal import on_interrupt, progress, say
+    from surrogym_client.surrogates.waiting import DesignUnfinished, words_of_design
+    from surrogym_shared.terminal import say
 
-    stays = f"interrupted while the server fits the model; surrogym status {surrogate} shows it"
     try:
-        with (
-            on_interrupt(lambda: stays),
-            progress("fit", quiet=quiet) as update,
-            connect(server, token) as api,
-        ):
-            wait_for_model(api, surrogate, seconds, lambda view: update(None, words_of_design(view)))
+        await_model(server, token, surrogate, seconds, lambda view, _: words_of_design(view), quiet=quiet)
     except DesignUnfinished as error:
         say(str(error), quiet=quiet)
     except SurrogymClientError as error:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Iterator, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +16,7 @@ import typer
 if TYPE_CHECKING:
     from surrogym_client.transport.api import Api
     from surrogym_shared.spec import EnvironmentSpec
+    from surrogym_shared.terminal import Update
     from surrogym_shared.wire import SurrogateView
 
 SHOWN = (
@@ -169,12 +171,44 @@ def awaited_surrogate(api: Api, name: str, wait: float, *, quiet: bool) -> Surro
 
 
 @contextmanager
-def _waiting(words: str, *, quiet: bool) -> Iterator[None]:
+def working(what: str, stays: str, *, quiet: bool) -> Iterator[Update]:
+    """Context of a command's work, whose progress the terminal shows under the name ``what``. Yields the function that
+    shows it. Ctrl-C prints ``stays``, which says what is kept."""
     from surrogym_shared.terminal import on_interrupt, progress
 
-    with on_interrupt(lambda: "interrupted; the same command waits again"), progress("wait", quiet=quiet) as update:
+    with on_interrupt(lambda: stays), progress(what, quiet=quiet) as update:
+        yield update
+
+
+@contextmanager
+def _waiting(words: str, *, quiet: bool) -> Iterator[None]:
+    with working("wait", "interrupted; the same command waits again", quiet=quiet) as update:
         update(None, words)
         yield
+
+
+def await_model(
+    server: str | None,
+    token: str | None,
+    surrogate: str,
+    seconds: float,
+    words: Callable[[SurrogateView, float], str],
+    *,
+    quiet: bool,
+) -> SurrogateView:
+    """Wait up to ``seconds`` until the server has fitted a model to all samples, and return the surrogate. The terminal
+    shows the ``words`` for it and the seconds waited so far.
+
+    Raises:
+        DesignUnfinished: there is no such model in time.
+        SurrogymClientError: the server does not answer, or has no such surrogate.
+    """
+    from surrogym_client.surrogates.waiting import wait_for_model
+
+    stays = f"interrupted while the server fits the model; surrogym status {surrogate} shows it"
+    with working("fit", stays, quiet=quiet) as update, connect(server, token) as api:
+        began = time.monotonic()
+        return wait_for_model(api, surrogate, seconds, lambda view: update(None, words(view, time.monotonic() - began)))
 
 
 def given_here(context: typer.Context, name: str) -> bool:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from surrogym.cli.groups import Output, Service
-from surrogym.cli.options import Surrogate, connect
+from surrogym.cli.options import Surrogate, connect, working
 
 if TYPE_CHECKING:
     from surrogym_client.transport.api import Api
@@ -38,15 +38,9 @@ def command(
 
     Example: surrogym export pendulum --out samples.csv
     """
-    from surrogym_shared.terminal import on_interrupt, progress
-
     token = service.token_for(context)
     stays = "interrupted; nothing was written; the same command starts from the beginning"
-    with (
-        on_interrupt(lambda: stays),
-        progress("export", quiet=output.quiet) as update,
-        connect(service.server, token) as api,
-    ):
+    with working("export", stays, quiet=output.quiet) as update, connect(service.server, token) as api:
         update(0.0, f"reading {surrogate}")
         content = _content(api, surrogate, out)
         out.write_bytes(content)

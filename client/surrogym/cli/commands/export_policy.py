@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from surrogym.cli.groups import Output, PolicyReading
+from surrogym.cli.options import working
 
 
 def command(
@@ -29,12 +30,11 @@ def command(
 
     Example: surrogym export-policy policy.zip --out policy.onnx
     """
-    from surrogym_shared.terminal import on_interrupt, progress
     from surrogym_trainer.policies.card import read_card
 
     card = read_card(policy)
     stays = "interrupted; no checked file was written; the same command starts from the beginning"
-    with on_interrupt(lambda: stays), progress("export", quiet=output.quiet) as update:
+    with working("export", stays, quiet=output.quiet) as update:
         update(0.0, "converting and checking")
         from surrogym_trainer.policies.export import CHECKS, export_policy
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from surrogym.cli.groups import Output, Service
-from surrogym.cli.options import SpecFile, Wait, connect, given_here, read_spec, typed
+from surrogym.cli.options import SpecFile, Wait, await_model, connect, given_here, read_spec, typed, working
 
 if TYPE_CHECKING:
     from surrogym_sampler.logs import Imported, ReadLog
@@ -143,15 +142,10 @@ def _require_outputs(file: Path, log: OfLogs) -> None:
 def _import_surrogate(context: typer.Context, file: Path, name: str | None, service: Service, output: Output) -> None:
     from surrogym_client.surrogates.transfer import import_surrogate
     from surrogym_shared.surrogate_file import SurrogateFile
-    from surrogym_shared.terminal import on_interrupt, progress
 
     token = service.token_for(context)
     stays = "interrupted; the server kept nothing of it; the same command starts from the beginning"
-    with (
-        on_interrupt(lambda: stays),
-        progress("import", quiet=output.quiet) as update,
-        connect(service.server, token) as api,
-    ):
+    with working("import", stays, quiet=output.quiet) as update, connect(service.server, token) as api:
         update(0.0, f"reading {file}")
         read = SurrogateFile.load(file)
         view = import_surrogate(api, read, name, lambda share: update(share, f"{len(read.samples)} real samples"))
@@ -164,11 +158,10 @@ def _import_surrogate(context: typer.Context, file: Path, name: str | None, serv
 
 def _import_log(context: typer.Context, file: Path, log: OfLogs, wait: float, service: Service, output: Output) -> None:
     from surrogym_sampler.logs import import_log
-    from surrogym_shared.terminal import on_interrupt, progress
 
     token = service.token_for(context) if log.register or log.to else None
     stays = "interrupted; the steps stored so far are kept; the same command stores the others"
-    with on_interrupt(lambda: stays), progress("import", quiet=output.quiet) as update:
+    with working("import", stays, quiet=output.quiet) as update:
         imported = import_log(
             file,
             register=log.register,
@@ -186,7 +179,9 @@ def _import_log(context: typer.Context, file: Path, log: OfLogs, wait: float, se
         _draw(imported.log, log.picture)
     view = None
     if imported.surrogate is not None and wait > 0:
-        view = _await_model(imported.surrogate, wait, service.server, token, quiet=output.quiet)
+        from surrogym_client.surrogates.waiting import words_of_long_fit
+
+        view = await_model(service.server, token, imported.surrogate, wait, words_of_long_fit, quiet=output.quiet)
     following = _following(context, log, imported, view)
     output.give(_as_json(imported, view), lambda: "\n".join([*_words(file, imported, view), following]))
 
@@ -229,22 +224,6 @@ def _again(context: typer.Context, log: OfLogs) -> str:
     if drafted:
         without.append("spec")
     return f"surrogym import {typed(context, without)}{drafted} --register NAME"
-
-
-def _await_model(name: str, wait: float, server: str | None, token: str | None, *, quiet: bool) -> SurrogateView:
-    """Wait until the server has fitted a model to the log, and return the surrogate. Raises ``DesignUnfinished``."""
-    from surrogym_client.surrogates.waiting import wait_for_model, words_of_long_fit
-    from surrogym_shared.terminal import on_interrupt, progress
-
-    stays = f"interrupted while the server fits the model; surrogym status {name} shows it"
-    with (
-        on_interrupt(lambda: stays),
-        progress("fit", quiet=quiet) as update,
-        connect(server, token) as api,
-    ):
-        began = time.monotonic()
-        look = lambda view: update(None, words_of_long_fit(view, time.monotonic() - began))  # noqa: E731
-        return wait_for_model(api, name, wait, look)
 
 
 def _as_json(imported: Imported, view: SurrogateView | None) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from surrogym.cli.groups import Output, Service
-from surrogym.cli.options import Surrogate
+from surrogym.cli.options import Surrogate, working
 
 
 def command(
@@ -37,14 +37,8 @@ def command(
 
     Example: surrogym report pendulum --out report.html
     """
-    from surrogym_shared.terminal import on_interrupt, progress
-
     stays = "interrupted; nothing was written; the same command starts from the beginning"
-    with (
-        on_interrupt(lambda: stays),
-        progress("report", quiet=output.quiet) as update,
-        service.connect(context) as api,
-    ):
+    with working("report", stays, quiet=output.quiet) as update, service.connect(context) as api:
         update(0.0, f"reading {surrogate}")
         from surrogym_trainer.report.known import collect, cuts_of
 

@@ -24,6 +24,7 @@ from surrogym.cli.options import (
     push_or_say,
     require_known,
     typed,
+    working,
 )
 from surrogym.cli.train_options import LogOptions, LoopOptions, SearchOptions, SessionOptions, StartOptions
 
@@ -125,10 +126,9 @@ def _settings(search: SearchOptions, session: SessionOptions, start: StartOption
 
 def _import(settings: TrainSettings, *, quiet: bool) -> None:
     """Import the packages of the policy search, which may take seconds, and show the progress on the terminal."""
-    from surrogym_shared.terminal import on_interrupt, progress
     from surrogym_trainer.training.search import SEARCHES, name_of
 
-    with on_interrupt(lambda: NOTHING_YET), progress("prepare", quiet=quiet) as update:
+    with working("prepare", NOTHING_YET, quiet=quiet) as update:
         update(None, f"importing what {name_of(settings)} needs")
         SEARCHES.get(name_of(settings))
 
@@ -190,7 +190,7 @@ def _trainable(
         words_of_design,
         words_of_uncertainty,
     )
-    from surrogym_shared.terminal import on_interrupt, progress, say
+    from surrogym_shared.terminal import say
     from surrogym_trainer.training.search import SEARCHES, name_of
 
     with connect(server, token, wait, quiet=quiet) as api:
@@ -198,7 +198,7 @@ def _trainable(
         if wait > 0:
             SEARCHES.get(name_of(settings))
             stays = "interrupted; the design continues on the server; the same command waits again"
-            with on_interrupt(lambda: stays), progress("design", quiet=quiet) as update:
+            with working("design", stays, quiet=quiet) as update:
                 view = wait_for_design(
                     api, surrogate, wait, lambda view: update(share_of_design(view), words_of_design(view))
                 )
