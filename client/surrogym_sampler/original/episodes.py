@@ -35,35 +35,22 @@ class GymnasiumEpisode(Episode):
     parallel = True
 
     def __init__(self, spec: EnvironmentSpec) -> None:
-        super().__init__(spec)
-        self._env = self._open()
-        self._physics = self._read_physics()
-        self._own_observation = shows_the_same(spec)
-
-    def _open(self) -> Any:
         import gymnasium
 
-        self._task = task_for(self.spec.environment, "default")
-        return gymnasium.make(self.spec.environment).unwrapped
-
-    def _read_physics(self) -> Any:
-        """Return the attributes that ``perturb`` changes, with their original values."""
-        return {name: getattr(self._env, name) for name in self._task.perturbable}
-
-    def _read(self) -> Array:
-        coordinates: Array = self._task.read(self._env)
-        return coordinates
-
-    def _write(self, coordinates: Array) -> None:
-        self._env.reset(seed=0)
-        self._task.write(self._env, coordinates)
+        super().__init__(spec)
+        self._task = task_for(spec.environment, "default")
+        self._env: Any = gymnasium.make(spec.environment).unwrapped
+        # the attributes that ``perturb`` changes, with their original values
+        self._physics = {name: getattr(self._env, name) for name in self._task.perturbable}
+        self._own_observation = shows_the_same(spec)
 
     def reset(self, seed: int) -> Moment:
         observation, _ = self._env.reset(seed=seed)
         return self._moment(observation, 0.0, terminated=False)
 
     def place(self, coordinates: Array) -> Moment:
-        self._write(coordinates)
+        self._env.reset(seed=0)
+        self._task.write(self._env, coordinates)
         return Moment(self._shown(coordinates), 0.0, False, coordinates)
 
     def step(self, action: Array) -> Moment:
@@ -80,7 +67,7 @@ class GymnasiumEpisode(Episode):
         self._env.close()
 
     def _moment(self, observation: Any, reward: float, *, terminated: bool) -> Moment:
-        coordinates = wrapped(self.spec, self._read())
+        coordinates = wrapped(self.spec, self._task.read(self._env))
         shown = np.asarray(observation) if self._own_observation else self._shown(coordinates)
         return Moment(shown, reward, terminated, coordinates)
 

@@ -7,8 +7,9 @@ Shapes: C coordinates, F action entries, D observation entries.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, TypeGuard, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -168,6 +169,14 @@ def runs_in_parallel(environment: object) -> bool:
                 parallel = True
     """
     return bool(getattr(environment, "parallel", False))
+
+
+def is_number(value: object) -> TypeGuard[float]:
+    """Return whether a value is a finite number that a float can represent, and no bool."""
+    try:
+        return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    except OverflowError:  # an integer that is too large for a float
+        return False
 
 
 Environment = OriginalEnvironment | RolloutEnvironment

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surrogym_sampler.original.errors import OriginalError, UnknownEnvironment
-from surrogym_sampler.original.protocol import Array
+from surrogym_sampler.original.protocol import Array, is_number
 from surrogym_shared.spec import EnvironmentSpec
 
 # the default range of a parameter goes from its own value divided by this factor to its own value times this factor
@@ -58,7 +58,7 @@ class Attributes:
     def parameters(self) -> dict[str, float]:
         """Return the attributes that are numbers, including those of the class."""
         names = [name for name in dir(self._plant) if not name.startswith("_")]
-        return {name: float(value) for name in names if _is_number(value := getattr(self._plant, name))}
+        return {name: float(value) for name in names if is_number(value := getattr(self._plant, name))}
 
     def set_parameters(self, values: Mapping[str, float]) -> None:
         """Set attributes of the object; those of its class stay as they are."""
@@ -148,10 +148,6 @@ def _layers(simulator: Any) -> list[Any]:
     while (inner := getattr(layers[-1], "wrapped", None) or getattr(layers[-1], "simulator", None)) is not None:
         layers.append(inner)
     return layers
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
 
 
 FEWEST = 2  # smallest number of real steps for a calibration

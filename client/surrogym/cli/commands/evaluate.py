@@ -41,6 +41,9 @@ Ledger = Annotated[
 ]
 
 
+SHOWN = ("first_seed", "wide", "start_scale", "perturb", "explore")  # settings that are part of the result as JSON
+
+
 @dataclass(frozen=True)
 class Episodes:
     """Options of the real episodes: how many, from which starts, in how many instances of the environment."""
@@ -170,7 +173,7 @@ def command(
     summary = {
         "policy": str(policy),
         "environment": _named(env, card),
-        **_settings(settings),
+        **{name: getattr(settings, name) for name in SHOWN},
         **_summary(reports, beside.reference),
     }
     summary |= {"promise_kept": None if elsewhere else _kept(expected, result)}
@@ -418,11 +421,6 @@ def enter_steps(
             api.report_steps(surrogate, steps, episodes=episodes, note=note)
     except SurrogymClientError as error:
         say(f"not entered into the ledger of {surrogate!r}: {error}", quiet=quiet)
-
-
-def _settings(settings: EvaluationSettings) -> dict[str, Any]:
-    names = ("first_seed", "wide", "start_scale", "perturb", "explore")
-    return {name: getattr(settings, name) for name in names}
 
 
 def _kept(promise: Promise | None, result: Evaluation) -> bool | None:

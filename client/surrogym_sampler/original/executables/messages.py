@@ -7,14 +7,13 @@ Shapes: C coordinates, F action entries.
 from __future__ import annotations
 
 import json
-import math
 from typing import Any, NoReturn
 
 import numpy as np
 from pydantic import ValidationError
 
 from surrogym_sampler.original.errors import RequestRefused, StepFailed, StepRefused, UnknownEnvironment
-from surrogym_sampler.original.protocol import Array
+from surrogym_sampler.original.protocol import Array, is_number
 from surrogym_shared.faults import first_fault
 from surrogym_shared.spec import BoxAction, EnvironmentSpec
 from surrogym_shared.spec.actions import Action
@@ -92,7 +91,7 @@ def numbers(reply: Reply, key: str, size: int) -> Array:
         StepFailed: the reply has no such list.
     """
     came = reply.get(key)
-    if not isinstance(came, list) or len(came) != size or not all(map(_is_number, came)):
+    if not isinstance(came, list) or len(came) != size or not all(map(is_number, came)):
         raise _wrong(f"expected {size} finite numbers for {key!r}", reply, key)
     return np.array(came, dtype=np.float64)
 
@@ -103,7 +102,7 @@ def number(reply: Reply, key: str) -> float:
     Raises:
         StepFailed: the reply has no such number.
     """
-    if not _is_number(reply.get(key)):
+    if not is_number(reply.get(key)):
         raise _wrong(f"expected a finite number for {key!r}", reply, key)
     return float(reply[key])
 
@@ -162,13 +161,6 @@ def specification_in(reply: Reply) -> EnvironmentSpec:
 def _wrong(expected: str, reply: Reply, key: str) -> StepFailed:
     """Return the error for an answer whose entry ``key`` can't be used; its message begins with ``expected``."""
     return StepFailed(f"{expected} in the program's answer, got {_got(reply, key)}; {CHECK}")
-
-
-def _is_number(value: object) -> bool:
-    try:
-        return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-    except OverflowError:  # an integer that is too large for a float
-        return False
 
 
 class _Twice(ValueError):

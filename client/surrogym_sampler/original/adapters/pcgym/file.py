@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from surrogym_sampler.original.errors import UnknownEnvironment
+from surrogym_sampler.original.protocol import is_number
 
 FEWEST, MOST = 2, 100_000  # smallest and largest number N of samples in an episode that a file may declare
 NEEDED = ("model", "N", "tsim", "SP", "a_space", "o_space", "x0")
@@ -79,7 +79,7 @@ def _check_times(path: Path, given: Mapping[str, Any]) -> None:
     count = given["N"]
     if not isinstance(count, int) or isinstance(count, bool) or not FEWEST <= count <= MOST:
         raise _expected(path, f"expected the parameter N to be a whole number from {FEWEST} to {MOST:,}", count)
-    if not _number(given["tsim"]) or given["tsim"] <= 0:
+    if not is_number(given["tsim"]) or given["tsim"] <= 0:
         raise _expected(path, "expected the parameter tsim to be a positive number", given["tsim"])
 
 
@@ -120,16 +120,7 @@ def _check_length(where: str | Path, key: str, values: Sequence[float], count: i
 
 
 def _numbers(given: Any) -> bool:
-    return isinstance(given, list) and bool(given) and all(map(_number, given))
-
-
-def _number(given: Any) -> bool:
-    if not isinstance(given, int | float) or isinstance(given, bool):
-        return False
-    try:
-        return math.isfinite(float(given))
-    except OverflowError:  # an integer that is too large for a float
-        return False
+    return isinstance(given, list) and bool(given) and all(map(is_number, given))
 
 
 def _expected(path: Path, expected: str, got: Any) -> UnknownEnvironment:
