@@ -118,10 +118,6 @@ class RequestRefused(StepFailed):
     def __init__(self, message: str, code: str = "failed") -> None:
         super().__init__(message)
         self.code = code
-        self._arguments = (message, code)
-
-    def __reduce__(self) -> tuple[type[RequestRefused], tuple[str, str]]:
-        return type(self), self._arguments
 
 
 def message_of(error: BaseException) -> str:

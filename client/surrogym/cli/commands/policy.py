@@ -84,9 +84,10 @@ def push(
 
     Example: surrogym policy push policy.zip
     """
+    from surrogym_trainer.policies.card import read_card
     from surrogym_trainer.policies.pushing import push as send
 
-    converted = {form: _converted(policy, form) for form in forms or ()}
+    converted = {form: _converted(policy, form, read_card(policy).algorithm) for form in forms or ()}
     with service.connect(context) as api:
         sent = send(api, policy, surrogate)
         for form, content in converted.items():
@@ -197,28 +198,24 @@ def _card(name: str, found: PolicyDetail, spec: EnvironmentSpec | None) -> Polic
     return PolicyCard.model_validate({**noted, "surrogate": name, "spec": spec})
 
 
-def _converted(policy: Path, form: str) -> bytes:
+def _converted(policy: Path, form: str, algorithm: str) -> bytes:
     from tempfile import TemporaryDirectory
 
-    from surrogym_trainer.policies.card import read_card
     from surrogym_trainer.policies.export import export_policy
 
     with TemporaryDirectory() as folder:
         out = Path(folder) / f"policy.{form}"
-        export_policy(policy, out, read_card(policy).algorithm)
+        export_policy(policy, out, algorithm)
         return out.read_bytes()
 
 
 def _from_zip(content: bytes, form: str, algorithm: str) -> bytes:
     from tempfile import TemporaryDirectory
 
-    from surrogym_trainer.policies.export import export_policy
-
     with TemporaryDirectory() as folder:
-        policy, out = Path(folder) / "policy.zip", Path(folder) / f"policy.{form}"
+        policy = Path(folder) / "policy.zip"
         policy.write_bytes(content)
-        export_policy(policy, out, algorithm)
-        return out.read_bytes()
+        return _converted(policy, form, algorithm)
 
 
 def _words(name: str, policy: PolicyDetail) -> str:
