@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -121,11 +121,6 @@ def _reason(lacking: dict[str, float]) -> str:
         return ""
     way_out = "; --ray-resources CPU=0 takes none, and a smaller --ray-hosts of the server leaves more"
     return f", and the cluster has {amounts(lacking)} free{way_out if 'CPU' in lacking else ''}"
-
-
-def result_of(samplers: RaySamplers) -> dict[str, Any]:
-    """Return the result of the command for its option ``--json``."""
-    return {**asdict(samplers.report()), "restarts": samplers.restarts, "errors": samplers.errors}
 
 
 def resources_of(given: str) -> dict[str, float]:

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     import typer
 
     from surrogym.cli.groups import Service
-    from surrogym_client.transport import Api
     from surrogym_sampler.original.episode import Episode
     from surrogym_shared.spec import EnvironmentSpec
     from surrogym_trainer.deployment.controller import Choices, Controller
@@ -144,7 +143,7 @@ class Checking:
             if self.env is not None:
                 episode = opener_for_policy(self.env, policy.given, policy.card, quiet=policy.output.quiet)()
             else:
-                api = stack.enter_context(policy.connect())
+                api = stack.enter_context(policy.service.connect(policy.context))
                 token = policy.service.token_for(policy.context)
                 episode = VirtualEpisode(
                     stack.enter_context(HttpSurrogate(api.url, str(policy.card.surrogate), token)), api
@@ -198,10 +197,6 @@ class LocalPolicy:
     reading: PolicyReading
     service: Service
     output: Output
-
-    def connect(self) -> Api:
-        """Connect to the server."""
-        return self.service.connect(self.context)
 
     def load(self) -> Predict:
         """Load the policy as a function of observations."""

@@ -166,12 +166,10 @@ class _Target:
 
 def _opened(api: Api, view: SurrogateView, simulator: str, parameters: list[str], steps: int | None) -> ServerPrior:
     from surrogym.cli.errors import CommandError
-    from surrogym.cli.printing import prints_aside
     from surrogym_sampler.priors.on_server import ServerPrior
 
     try:
-        with prints_aside():
-            return ServerPrior(api, view.name, simulator, view.spec, parameters, steps=steps)
+        return ServerPrior(api, view.name, simulator, view.spec, parameters, steps=steps)
     except ValueError as error:
         raise CommandError(f"the simulator {simulator} can't be the prior: {error}") from error
 

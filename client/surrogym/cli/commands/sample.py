@@ -262,7 +262,7 @@ def _require_shared(asked: EnvironmentSpec, settings: SamplerSettings) -> None:
 
 
 def _sample_on_ray(api: Api, plan: SamplerPlan, cluster: RayOptions, output: Output) -> None:
-    from surrogym.cli.sampling_on_ray import result_of, run_samplers, samplers_on_ray
+    from surrogym.cli.sampling_on_ray import run_samplers, samplers_on_ray
     from surrogym_client.runtime.lifetime import terminations_as_interrupts
     from surrogym_shared.terminal import on_interrupt, say
 
@@ -275,7 +275,9 @@ def _sample_on_ray(api: Api, plan: SamplerPlan, cluster: RayOptions, output: Out
     ):
         run_samplers(samplers, time_limit, tell or (lambda _: None), lambda text: say(text, quiet=output.quiet))
     report = samplers.report()
-    output.give(result_of(samplers), lambda: f"{_words(plan.surrogate, report)}{_restarts(samplers.restarts)}")
+    result = {**asdict(report), "restarts": samplers.restarts, "errors": samplers.errors}
+    again = f"; {samplers.restarts} samplers died and were started again" if samplers.restarts else ""
+    output.give(result, lambda: f"{_words(plan.surrogate, report)}{again}")
     if report.phase == "failed" or samplers.errors:
         raise typer.Exit(1)
 
@@ -390,10 +392,6 @@ def _of_fallback(steps: int) -> str:
 
     are = "is" if steps == 1 else "are"
     return f"; {counted(steps, 'step')} of the fallback, which {are} not in the ledger" if steps else ""
-
-
-def _restarts(count: int) -> str:
-    return f"; {count} samplers died and were started again" if count else ""
 
 
 def _words(surrogate: str, report: SamplerReport) -> str:
