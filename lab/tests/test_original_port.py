@@ -31,7 +31,7 @@ def test_rewards_in_a_session_of_the_original_environment_equal_gymnasiums(name)
     env.reset()
     native = gymnasium.make(name).unwrapped
     native.reset(seed=0)
-    native.state = np.array(port._sessions[env.session][0].instance()._read())
+    native.state = np.array(port._sessions[env.session][0].instance()._env.state)
     rng = np.random.default_rng(0)
     for _ in range(5):
         action = [env.action_space.sample() if name == "CartPole-v1" else rng.uniform(-2, 2, 1) for _ in range(2)]
