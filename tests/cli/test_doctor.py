@@ -6,7 +6,7 @@ import pytest
 
 from support.programs import HANGS, NOTES_ITSELF, UNTERMINABLE, left_behind, program
 from support.scripted_server import problem, reply, scripted_server
-from surrogym_client.runtime.missing_packages import EXTRAS
+from surrogym_client.runtime.versions import EXTRAS
 from surrogym_shared import wire
 from surrogym_shared.codes import Code
 

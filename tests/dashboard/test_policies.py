@@ -18,7 +18,7 @@ from support.server import ServerProcess
 from surrogym_client.transport import Api
 from surrogym_sampler.original.classic import cartpole, pendulum
 from surrogym_shared import wire
-from surrogym_shared.wire.drifts import AddDrift
+from surrogym_shared.wire.policies import AddDrift
 from surrogym_trainer.evaluation.evaluator import Evaluation, Trace
 from surrogym_trainer.evaluation.videos import record
 

@@ -9,13 +9,13 @@ import pytest
 
 from support.simulators import Register, Spiral, installed
 from surrogym_sampler.original.describing import describe
-from surrogym_sampler.original.describing.rewarding import Paid
-from surrogym_sampler.original.describing.thresholds import (
+from surrogym_sampler.original.describing.rewarding import (
     BATCH,
     ENOUGH,
     HALVINGS,
     POINTS,
     SEEK,
+    Paid,
     regions,
     threshold_reward,
 )

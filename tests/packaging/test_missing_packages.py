@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from packaging.utils import canonicalize_name
 
-from surrogym_client.runtime.missing_packages import EXTRAS, missing
+from surrogym_client.runtime.versions import EXTRAS, missing
 
 PROJECT = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
 

@@ -18,10 +18,9 @@ from surrogym_client.transport import Api
 from surrogym_shared import wire
 from surrogym_shared.spec import Inequality, Success, Term
 from surrogym_trainer.report.coverage import Cut
-from surrogym_trainer.report.decision import cost, decision, outcome
+from surrogym_trainer.report.decision import cost, criterion, decision, original, outcome, share
 from surrogym_trainer.report.known import Known, chosen_real, chosen_reference, chosen_without
 from surrogym_trainer.report.page import NoPdf, as_pdf
-from surrogym_trainer.report.wording import criterion, original, share
 
 SEED = 10_000
 Parts = dict[str, str]

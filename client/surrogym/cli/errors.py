@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import errno
 
-from surrogym_client.runtime.missing_packages import missing
+from surrogym_client.runtime.versions import missing
 
 # numbers of errors that writing to an open file raises, such as a full disk; they do not name the file
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)

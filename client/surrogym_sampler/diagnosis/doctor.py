@@ -24,8 +24,7 @@ from surrogym_client.errors import (
     SurrogymClientError,
     Unauthenticated,
 )
-from surrogym_client.runtime.missing_packages import EXTRAS
-from surrogym_client.runtime.versions import versions
+from surrogym_client.runtime.versions import EXTRAS, versions
 from surrogym_client.transport.api import Api
 from surrogym_sampler.diagnosis.access import EXACT, Access, CheckFailed, examine
 from surrogym_sampler.diagnosis.history import History, declared, look_back

@@ -20,7 +20,7 @@ from surrogym_client.transport.api import Api
 from surrogym_client.transport.routes import parse
 from surrogym_shared.spec import BoxAction, EnvironmentSpec, limits
 from surrogym_shared.wire import PolicyView, SurrogateView
-from surrogym_shared.wire.drifts import AddDrift
+from surrogym_shared.wire.policies import AddDrift
 from surrogym_trainer.evaluation.audit import Compared
 from surrogym_trainer.evaluation.comparing import StepOfEpisode, compared, steady
 from surrogym_trainer.watching.detector import FALSE_ALARM_STEPS, Detector

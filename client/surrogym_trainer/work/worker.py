@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from surrogym_client.errors import SurrogymClientError
-from surrogym_client.runtime.missing_packages import missing
+from surrogym_client.runtime.versions import missing
 from surrogym_client.transport import HttpSurrogate
 from surrogym_client.transport.api import Api
 from surrogym_sampler.original.errors import OriginalError

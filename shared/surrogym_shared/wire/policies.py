@@ -1,4 +1,5 @@
-"""Wire models of policies: versions with their files, evaluations and aliases."""
+"""Wire models of policies: versions with their files, evaluations, reports of drift and aliases. A drift is a change
+of the original environment since its model was learned."""
 
 from __future__ import annotations
 
@@ -379,3 +380,17 @@ class PolicyList(Reply):
     """All policies of a surrogate."""
 
     policies: list[PolicyView] = Field(description="policies of the surrogate, newest first")
+
+
+class AddDrift(Request):
+    """Report that real steps no longer agree with the model, so that the return that a policy's promise predicts is not
+    trusted."""
+
+    output: Text = Field(description="name of the output that differs most")
+    error: Measured = Field(
+        description="mean of real minus predicted values of the output, in its unit; or the root mean square, if the "
+        "errors have grown in both directions"
+    )
+    words: Text = Field(description="the error and the region in which it was found, for people")
+    steps: Count = Field(description="number of real steps that were compared with the model until drift was found")
+    idempotency_key: Key = Field(description="a repeat with the same key adds nothing")

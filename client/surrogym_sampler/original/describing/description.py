@@ -11,12 +11,19 @@ from pydantic import ValidationError
 
 from surrogym_sampler.original.adapters import open_simulator
 from surrogym_sampler.original.describing.counting import Counted
-from surrogym_sampler.original.describing.exploring import RESETS, STEPS, Seen, explore, moved_by
+from surrogym_sampler.original.describing.exploring import (
+    RESETS,
+    STEPS,
+    Seen,
+    explore,
+    moved_by,
+    require_coordinates,
+    require_numbers,
+)
 from surrogym_sampler.original.describing.expressing import express, names_in, shown_by_itself
-from surrogym_sampler.original.describing.known_rewards import known_reward
 from surrogym_sampler.original.describing.probing import EXACT, Probed, probe
 from surrogym_sampler.original.describing.ranges import FASTER, Ranges
-from surrogym_sampler.original.describing.usable import require_coordinates, require_numbers
+from surrogym_sampler.original.describing.rewarding import known_reward
 from surrogym_sampler.original.errors import UnknownEnvironment
 from surrogym_sampler.original.protocol import Array
 from surrogym_sampler.original.simulator import Variable

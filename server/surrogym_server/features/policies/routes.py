@@ -52,7 +52,7 @@ from surrogym_shared.wire import (
     PushedPolicy,
     PutAlias,
 )
-from surrogym_shared.wire.drifts import AddDrift
+from surrogym_shared.wire.policies import AddDrift
 
 router = APIRouter(prefix="/v1/surrogates/{name}/policies", tags=["policies"], route_class=DoorRoute)
 

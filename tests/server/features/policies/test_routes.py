@@ -24,7 +24,7 @@ from surrogym_server.features.policies import routes
 from surrogym_shared import wire
 from surrogym_shared.network import Network
 from surrogym_shared.spec import EnvironmentSpec
-from surrogym_shared.wire.drifts import AddDrift
+from surrogym_shared.wire.policies import AddDrift
 
 PROMISE = wire.PolicyPromise(median=-150, low=-170, high=-130)
 
