@@ -95,12 +95,12 @@ class SpecConflict(Conflict):
 
 
 class IdempotencyConflict(Conflict):
-    """The same idempotency key came with another body."""
+    """The idempotency key of a request was sent before, with a request of another body."""
 
 
 class SeqConflict(Conflict):
     """A session's request has a sequence number that is neither the next one (``expected``) nor that of the last
-    request."""
+    request, or it has that of the last request and another body."""
 
     def __init__(self, message: str, expected: int) -> None:
         super().__init__(message)

@@ -28,7 +28,8 @@ class Service(Protocol):
     """Interface of an optional feature's service, of which a server process has one: periodic work and metrics."""
 
     async def sweep(self) -> None:
-        """Do the periodic work of the feature. The server calls this every ``sweep_seconds``."""
+        """Do the periodic work of the feature. The server calls this after each interval of its setting
+        ``sweep_seconds``."""
 
     def metrics(self) -> Iterable[Metric]:
         """Return the Prometheus metrics of the feature, which the endpoint ``/metrics`` shows."""

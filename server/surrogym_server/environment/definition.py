@@ -192,8 +192,8 @@ class EnvironmentDefinition:
 
     @cached_property
     def sources(self) -> tuple[int, ...]:
-        """Index, in [coordinates, action], of the value from which each coordinate that is a lag follows, (C,). A
-        counter of steps follows from itself. Coordinates that are no lags have their own index."""
+        """Index, in [coordinates, action], of the value that each coordinate repeats if it is a lag, (C,): a coordinate
+        or an action entry of the past. A counter of steps, and a coordinate that is no lag, has its own index."""
         names = self.coordinate_names
         sources: list[int] = []
         for index, c in enumerate(self.coordinates):

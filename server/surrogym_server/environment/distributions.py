@@ -38,8 +38,8 @@ def quantile(distribution: Distribution, p: Tensor) -> Tensor:
 
 
 def log_density(distribution: Distribution, value: Tensor) -> Tensor:
-    """Return the log density at each entry of ``value``, of any shape and within the limits, less its maximum: the log
-    density at the mean of a normal distribution; 0 for other distributions."""
+    """Return the log density at each entry of ``value``, of any shape and within the limits, less the largest log
+    density. For a normal distribution the largest is that at the mean; for others the result is 0."""
     if isinstance(distribution, Normal):
         return -0.5 * ((value - distribution.mean) / distribution.std).square()
     return torch.zeros_like(value)

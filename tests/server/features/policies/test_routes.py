@@ -305,7 +305,7 @@ def test_a_policy_file_of_the_wrong_format_is_refused(api: Api, surrogate: str, 
     api.policies.put_file(surrogate, version, "gif", b"GIF89a and so on")
     with pytest.raises(InvalidInput, match="was announced with, got a different file"):
         api.policies.put_file(surrogate, version, "zip", network_file(tmp_path, seed=1))
-    with pytest.raises(UnknownPolicy, match=r"\(zip, gif\), got 'onnx'"):
+    with pytest.raises(UnknownPolicy, match=r"\(stored: zip, gif\), got 'onnx'"):
         api.policies.file(surrogate, version, "onnx")
 
 
