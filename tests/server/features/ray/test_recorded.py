@@ -298,7 +298,7 @@ def test_opening_with_one_idempotency_key_at_two_hosts_opens_one_session(host, s
     async def opened() -> None:
         first, second = host(), host()
         info = await first.engine.open(first.case.asked(key="once"))
-        await refused(Unavailable, second.engine.open(second.case.asked(key="once")), "under this key")
+        await refused(Unavailable, second.engine.open(second.case.asked(key="once")), "with this idempotency key")
         known = storage.part(LiveSessions).opened(first.case.surrogate_id, "once")
         assert known is not None
         assert known[0] == info.id
