@@ -363,7 +363,10 @@ def judged(definition: EnvironmentDefinition, found: Foretold, samples: Samples)
         kept = ~samples.terminated if name == REWARD else torch.ones_like(samples.terminated)
         size = float(truth[kept, column].std(correction=0))
         if size > 1e-9:
-            off = (found.mean[:, kept, column] - truth[kept, column]) / size
+            off = found.mean[:, kept, column] - truth[kept, column]
+            if column < len(definition.moving) and definition.moving[column] in definition.angles:
+                off = wrap(off)
+            off = off / size
             variance = (found.std[:, kept, column] / size).square()
             rows[name] = scored(off.mean(0), variance[0])
             if len(off) > 1:
