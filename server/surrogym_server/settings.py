@@ -36,8 +36,8 @@ def _without_path(url: str) -> str:
 def _http(url: str) -> str:
     if not re.fullmatch(r"https?://[^/@?#\s]+(/\S*)?", url):
         raise ValueError(
-            "expected an address such as https://hooks.example.org/drift, without a user name, got another form: "
-            "correct it"
+            "expected an address that begins with http:// or https:// and a host, without a user name, got another "
+            "form: correct it"
         )
     return url
 
