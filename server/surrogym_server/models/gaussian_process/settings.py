@@ -42,9 +42,9 @@ class Settings:
     def __post_init__(self) -> None:
         for name, choices in CHOICES.items():
             if (value := getattr(self, name)) not in choices:
-                raise ValueError(f"expected {name} to be one of {', '.join(choices)}, got {value!r}")
+                raise ValueError(f"expected the setting {name} to be one of {', '.join(choices)}, got {value!r}")
         for name in ("reward_jumps", "reward_peaks", "rates", "drop_inputs", "repeated_parts"):
             if not isinstance(value := getattr(self, name), bool):
-                raise ValueError(f"expected {name} to be true or false, got {value!r}")
+                raise ValueError(f"expected the setting {name} to be true or false, got {value!r}")
         if self.inducing != 0 or isinstance(self.inducing, bool):
             require_whole("inducing", self.inducing, FEWEST, MOST)

@@ -196,7 +196,7 @@ def test_the_exported_c_step_of_a_sparse_model_equals_the_model():
         ({"inducing": 2_001}, "inducing to be a whole number from 10 to 2000"),
         ({"inducing": True}, "expected inducing to be a whole number, got True"),
         ({"inducing": -1}, "inducing to be a whole number from 10 to 2000, got -1"),
-        ({"kernel": "matern"}, "expected kernel to be one of"),
+        ({"kernel": "matern"}, "expected the setting kernel to be one of"),
         ({"points": 3}, "inducing, got 'points'"),
     ],
 )
