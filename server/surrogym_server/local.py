@@ -27,8 +27,9 @@ from surrogym_server.engine.requests import (
 )
 from surrogym_server.engine.session import Outcome, Session, check_opening, digest_of
 from surrogym_server.errors import InvalidInput, UnknownModel, UnknownSession
-from surrogym_server.models.files import from_bytes
+from surrogym_server.models.files import from_bytes, to_bytes
 from surrogym_server.models.port import DynamicsModel
+from surrogym_server.planning import Planner, planner_of
 from surrogym_shared.acting import ActingPolicy, NoiseKey, PolicyRun
 from surrogym_shared.port import Bools, Floats, Ints, PolicyRollout, ResetResult, StepResult, quick
 from surrogym_shared.spec import EnvironmentSpec
@@ -99,6 +100,18 @@ class LocalSurrogate:
     def model(self) -> DynamicsModel:
         """The model that computes the steps."""
         return self._model
+
+    def model_file(self) -> bytes:
+        return to_bytes(self._model)
+
+    def planner(self, horizon: int, seed: int = 0) -> Planner:
+        """Return a policy that plans each action by rollouts of ``horizon`` steps, after value iteration on a grid of
+        states, which takes some seconds. ``seed`` is that of the changes of actions that it tries.
+
+        Raises:
+            InvalidInput: the horizon is out of its range, or the model or its environment does not allow planning.
+        """
+        return planner_of(self._model, horizon, seed)
 
     def open(self, request: OpenSession) -> SessionView:
         if request.model not in ("latest", VERSION):

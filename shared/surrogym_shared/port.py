@@ -8,7 +8,7 @@ steps.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol, Self, TypeVar, runtime_checkable
 
@@ -177,6 +177,25 @@ class SurrogatePort(Protocol):
 
     def close(self, session: str) -> None:
         """Close a session. Does nothing if the session is closed already."""
+        ...
+
+
+@runtime_checkable
+class ModelPort(SurrogatePort, Protocol):
+    """A surrogate whose model can be read."""
+
+    def model_file(self) -> bytes:
+        """Return the latest model as the content of a safetensors file."""
+        ...
+
+
+@runtime_checkable
+class PlanningPort(SurrogatePort, Protocol):
+    """A surrogate in this process, on whose model actions can be planned."""
+
+    def planner(self, horizon: int, seed: int) -> Callable[[NDArray[np.float32]], NDArray[Any]]:
+        """Return a function from observations (N, D) to actions, (N, F), or (N,) if they are discrete. It plans each
+        action by rollouts of ``horizon`` steps, in which it tries random changes of actions."""
         ...
 
 

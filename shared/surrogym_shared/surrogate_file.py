@@ -35,6 +35,7 @@ LENGTH_BYTES = 8
 METADATA = "__metadata__"
 OWN = "surrogate"  # key of the surrogate's own metadata in the file's header
 SAMPLES = "samples."
+PLANNER_HEAD = "surrogym-planner.json"  # name of the header in a planner's zip file, which contains such a file
 LOGGED = "logged"  # name of the array that marks samples from a log; it is absent without such samples
 DTYPES: dict[str, np.dtype[Any]] = {"F64": np.dtype("<f8"), "BOOL": np.dtype("?")}
 UNREADABLE = (ValueError, LookupError, TypeError, AttributeError, RecursionError, OverflowError)

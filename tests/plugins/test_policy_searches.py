@@ -33,6 +33,7 @@ SEARCHED = {  # small enough to take a second each
     "FASTPPO": {"n_steps": 16, "batch_size": 32, "n_epochs": 2},
     "SAC": {"learning_starts": 32, "batch_size": 16},
     "CMAES": {"population": 4, "starts": 2, "units": 2},
+    "PLANNER": {"horizon": 3},
     "cross_entropy": {"population": 8, "starts": 2, "units": 2},
 }
 
@@ -83,7 +84,7 @@ def test_every_policy_search_passes_the_policy_search_interface_tests(
 @pytest.mark.parametrize(
     ("name", "said"),
     [
-        ("nobody", "expected one of A2C, DDPG, DQN, PPO, SAC, TD3, FASTPPO, CMAES, cross_entropy"),
+        ("nobody", "expected one of A2C, DDPG, DQN, PPO, SAC, TD3, FASTPPO, CMAES, PLANNER, cross_entropy"),
         ("missing_module", "package 'package_of_missing_module', entry point missing_module = 'nowhere_to_be_found"),
         ("missing_module", "No module named 'nowhere_to_be_found'"),
         ("no_search", "expected a subclass of surrogym_trainer.training.search.PolicySearch, got <class 'json"),

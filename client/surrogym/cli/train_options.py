@@ -28,8 +28,9 @@ class SearchOptions:
         str | None,
         typer.Option(
             help="Policy search: fastppo (PPO in compiled code), ppo, a2c, sac, td3, ddpg, dqn (Stable-Baselines3), "
-            "cmaes, or one from an installed package. [default: fastppo; ppo if --log, --set or --start-from "
-            "needs it, or if the specification has the paper's preset]",
+            "cmaes, planner (plans each action with the model, nothing is trained), or one from an installed package. "
+            "[default: fastppo; ppo if --log, --set or --start-from needs it, or if the specification has the paper's "
+            "preset]",
             show_default=False,
         ),
     ] = None

@@ -16,14 +16,21 @@ from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar, get_args
 
 import numpy as np
 
-from surrogym_client.errors import ProtocolMismatch, SeqConflict, SessionLost, SurrogymClientError, refused_here
+from surrogym_client.errors import (
+    NoModel,
+    ProtocolMismatch,
+    SeqConflict,
+    SessionLost,
+    SurrogymClientError,
+    refused_here,
+)
 from surrogym_client.transport import routes
 from surrogym_client.transport.connection import Connection, Retries, Timeouts
 from surrogym_client.transport.routes import check_protocol, new_key, parse
 from surrogym_client.transport.step_codecs import UNREADABLE, BinaryForm, Form, JsonForm
 from surrogym_client.transport.stream import Stream, StreamLost, StreamUnavailable
 from surrogym_shared import wire
-from surrogym_shared.codes import Code
+from surrogym_shared.codes import STATUS, Code, Problem
 from surrogym_shared.frames import Shape
 from surrogym_shared.port import Bools, Floats, Ints, PolicyRollout, ResetResult, StepResult
 from surrogym_shared.spec import EnvironmentSpec
@@ -163,6 +170,14 @@ class HttpSurrogate:
         if self._spec is None:
             self._spec = parse(wire.SurrogateView, self.connection.send("GET", self._route), self._route).spec
         return self._spec
+
+    def model_file(self) -> bytes:
+        view = parse(wire.SurrogateView, self.connection.send("GET", self._route), self._route)
+        if view.model_version is None:
+            detail = f"{self.surrogate!r} has no model yet: let a sampler answer its first queries, or import a log"
+            raise NoModel(Problem(title="No model", status=STATUS[Code.NO_MODEL], code=Code.NO_MODEL, detail=detail))
+        route = f"{self._route}/models/{view.model_version}"
+        return self.connection.send("GET", route, params={"format": "safetensors"})
 
     def open(self, request: wire.OpenSession) -> wire.SessionView:
         if request.idempotency_key is None:

@@ -30,6 +30,7 @@ from surrogym_trainer.deployment.controller import (
 from surrogym_trainer.deployment.reference import act, scores
 from surrogym_trainer.policies.card import UnusablePolicy, read_card
 from surrogym_trainer.policies.files import ONNX, load_network, load_policy, require_policy
+from surrogym_trainer.policies.planner_files import PlannerFile
 from surrogym_trainer.policies.predict import Predict
 
 if TYPE_CHECKING:
@@ -98,6 +99,8 @@ def _network(policy: Path, algorithm: str, *, trust: bool) -> tuple[Decision, Pr
     if Network.is_at(policy):
         network = load_network(policy)
         return _of_arrays(network), network
+    if PlannerFile.is_at(policy):
+        raise NotDeployable(f"{policy} is a planner, which has no network; {CAN}")
     try:
         predict = load_policy(policy, algorithm, trust=trust)
     except UnusablePolicy as error:

@@ -1,4 +1,5 @@
-"""Readers of policy files that run no code from them: those of Stable-Baselines3, networks of arrays, and ONNX.
+"""Readers of policy files that run no code from them: those of Stable-Baselines3, networks of arrays, planners, and
+ONNX.
 
 The file of a policy of Stable-Baselines3 lacks the statistics with which ``VecNormalize`` normalised the
 observations. They are read from a file of arrays beside it, because the file of ``VecNormalize.save`` is pickled.
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 from surrogym_shared.network import Network
 from surrogym_trainer.policies.card import DEFAULT_ALGORITHM, PolicyCard, UnusablePolicy, read_card
 from surrogym_trainer.policies.onnx_files import load_onnx
+from surrogym_trainer.policies.planner_files import PlannerFile
 from surrogym_trainer.policies.predict import Predict
 
 if TYPE_CHECKING:
@@ -123,6 +125,8 @@ def load_policy(path: Path, algorithm: str = DEFAULT_ALGORITHM, *, trust: bool =
         return load_network(path)
     if path.suffix.lower() == ONNX:
         return load_onnx(path)
+    if PlannerFile.is_at(path):
+        return PlannerFile.load(path).acting()
     model = read_learner(path, algorithm, trust, {})
     normalise = _normalisation(path, model)
 
@@ -180,6 +184,10 @@ def read_learner(path: Path, algorithm: str, trust: bool, changes: dict[str, Any
     """Load an algorithm of Stable-Baselines3 from its file. Arguments and errors are those of ``load_learner``."""
     import stable_baselines3
 
+    if PlannerFile.is_at(path):
+        raise UnusablePolicy(
+            f"{path} is a planner, which has no network: surrogym evaluate and surrogym audit can run it"
+        )
     kind = getattr(stable_baselines3, algorithm.upper(), None)
     if kind is None or not hasattr(kind, "load"):
         raise UnusablePolicy(f"Stable-Baselines3 has no algorithm {algorithm!r}: expected for instance PPO, SAC or DQN")

@@ -118,6 +118,7 @@ SEARCHES = Registry[PolicySearch](
         **{name: f"surrogym_trainer.training.stable_baselines.algorithms:{name}" for name in ALGORITHMS},
         FAST: "surrogym_trainer.training.fast_ppo.search:FastPpo",
         "CMAES": "surrogym_trainer.training.cma_es:CmaEs",
+        "PLANNER": "surrogym_trainer.training.planner:Planner",
     },
 )
 

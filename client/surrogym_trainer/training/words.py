@@ -45,7 +45,7 @@ def words_of_result(
 def _of_asked(result: TrainResult, asked: int | None) -> str:
     """Return a sentence about why fewer virtual steps than requested were taken, if the reason is that the rest was
     less than a rollout; else an empty text."""
-    rollout = result.settings.get("n_steps", 0) * result.settings.get("num_envs", 0)
+    rollout = result.settings.get("n_steps", 0) * (result.settings.get("num_envs") or 0)
     if asked is None or not 0 < asked - result.virtual_steps < rollout:
         return ""
     return f" ({asked} asked for; they are taken in rollouts of {rollout})"

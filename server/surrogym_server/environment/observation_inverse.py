@@ -52,9 +52,9 @@ def _source(definition: EnvironmentDefinition, index: int) -> tuple[int, ...]:
     if coordinate.kind == "angle" and cosine is not None and sine is not None:
         return (cosine, sine)
     raise InvalidSpec(
-        f"preset 'paper' predicts observations, but coordinate {coordinate.name!r} can't be computed from one: "
+        f"coordinate {coordinate.name!r} can't be computed from the observation, as preset 'paper' and planners need: "
         "expected an observation entry that is the coordinate, or for an angle entries that are its cos and its sin; "
-        "add them, or use preset 'default'"
+        "add them, or train a policy with preset 'default'"
     )
 
 

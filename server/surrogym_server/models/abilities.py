@@ -340,6 +340,47 @@ class ArraySteps(ABC):
         """
 
 
+@dataclass(frozen=True)
+class GridPolicy:
+    """A policy and its values at the S nodes of a grid of states, as ``compiled.grid`` describes it."""
+
+    grid: tuple[Floats, Floats, NDArray[np.int64], NDArray[np.bool_]]  # low, cell, count, cyclic, (C,) each
+    values: Floats  # (S,) expected return from each node
+    table: Floats  # (S, F) action at each node
+    discount: float  # factor of later rewards
+    choices: int  # number of discrete actions; 0 for continuous actions
+    least: Floats  # (F,) smallest action
+    most: Floats  # (F,) largest action
+
+
+class PlannedActions(ABC):
+    """Ability to plan an action by rollouts of the mean around a policy on a grid, in one call of compiled code.
+
+    A model without this ability is refused by ``planning``.
+    """
+
+    @property
+    @abstractmethod
+    def plans(self) -> bool:
+        """Whether the model can plan. It can't without compiled steps, or if a prior model takes part."""
+
+    @abstractmethod
+    def planned(
+        self, policy: GridPolicy, start: Floats, changes: Floats, elite: int, best: Floats
+    ) -> tuple[Floats, Floats]:
+        """Return the first action (F,) of the best of R rounds of N rollouts over T steps, and the state (C,) that the
+        model predicts after it.
+
+        Args:
+            policy: the policy, which acts in each rollout, and the values after the last step.
+            start: (C,) state.
+            changes: (R, N, T, F) changes of the policy's actions to try: numbers to add to the mean plan of the round
+                before; or discrete actions, -1 for the policy's, -2 for the best plan's.
+            elite: number of the best rollouts of a round whose mean the next round changes.
+            best: (T, F) plan of an earlier decision, which is tried too. It becomes the best plan.
+        """
+
+
 class CompiledSteps(ABC):
     """Ability to predict steps by compiled code on CPU arrays. Results equal those of ``transition`` except for
     rounding errors. For few rows, compiled code takes a tenth of the time.

@@ -39,6 +39,7 @@ from surrogym_server.storage.records import JSON
 from surrogym_shared import intervals, network
 from surrogym_shared.checks import trace_fault
 from surrogym_shared.environments import is_name, is_same
+from surrogym_shared.surrogate_file import PLANNER_HEAD
 from surrogym_shared.wire import AddEvaluation
 
 logger = logging.getLogger(__name__)
@@ -414,11 +415,14 @@ def _names(content: bytes) -> set[str]:
 
 def _is_policy(content: bytes) -> bool:
     names = _names(content)
-    return network.HEAD in names or names >= STABLE_BASELINES
+    return not names.isdisjoint({network.HEAD, PLANNER_HEAD}) or names >= STABLE_BASELINES
 
 
 FORMS: dict[str, tuple[str, Callable[[bytes], bool]]] = {
-    "zip": (f"a zip of Stable-Baselines3, or of a network of arrays ({network.HEAD})", _is_policy),
+    "zip": (
+        f"a zip of Stable-Baselines3, of a network of arrays ({network.HEAD}), or of a planner ({PLANNER_HEAD})",
+        _is_policy,
+    ),
     "onnx": ("a model in ONNX", lambda content: content[:1] == b"\x08"),  # begins with the field of the format version
     "pt2": ("a program of torch.export", lambda content: bool(_names(content))),
     "mp4": ("an MP4 video", lambda content: content[4:8] == b"ftyp"),

@@ -7,7 +7,9 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from surrogym_server.environment.definition import EnvironmentDefinition
@@ -20,12 +22,14 @@ from surrogym_server.models.abilities import (
     AtSamples,
     CompiledSteps,
     FunctionDraws,
+    GridPolicy,
     LearnedNoise,
     LeaveOneOut,
     LeaveOneOutErrors,
     Lookahead,
     OutputOutlook,
     PathOutlook,
+    PlannedActions,
     PredictedSteps,
     RewardEdges,
     RewardPeaks,
@@ -53,6 +57,8 @@ from surrogym_shared import compiled
 if TYPE_CHECKING:
     from surrogym_server.models.gaussian_process.prediction.compiled.step import StepsOfModel
 
+Array = NDArray[np.float64]
+
 # If a process has more points than this, standard deviations are computed faster by a linear algebra library than by
 # compiled code.
 COMPILED_SOLVES = 300
@@ -70,6 +76,7 @@ class GaussianProcessModel(
     RewardEdges,
     RewardPeaks,
     CompiledSteps,
+    PlannedActions,
     WrittenInC,
 ):
     """Model with one Gaussian process for each output. It can also contain learned regions of states: one in which
@@ -241,6 +248,40 @@ class GaussianProcessModel(
     def compiled_pays(self, *, stds: bool) -> bool:
         points = max((len(o.posterior.x) for o in self.outputs if o.posterior is not None), default=0)
         return not stds or points <= COMPILED_SOLVES
+
+    @property
+    def plans(self) -> bool:
+        return self._compiled is not None and self.prior is None
+
+    def planned(self, policy: GridPolicy, start: Array, changes: Array, elite: int, best: Array) -> tuple[Array, Array]:
+        from surrogym_server.models.gaussian_process.prediction.compiled.plan import plan
+
+        steps, action, arrival = self._compiled, np.empty(changes.shape[3]), np.empty(len(start))
+        assert steps is not None
+        low, cell, count, cyclic = policy.grid
+        plan(
+            *steps.tables,
+            steps.has_regions,
+            steps.outputs,
+            self.terminal_reward,
+            low,
+            cell,
+            count,
+            cyclic,
+            policy.values,
+            policy.table,
+            policy.discount,
+            policy.choices,
+            policy.least,
+            policy.most,
+            start,
+            changes,
+            elite,
+            best,
+            action,
+            arrival,
+        )
+        return action, arrival
 
     def step_source(self) -> StepSource | None:
         if self._compiled is None or self.prior is not None:

@@ -1,0 +1,82 @@
+"""Files of planners: a surrogate's model and a horizon, from which the actions are planned when they are needed."""
+
+from __future__ import annotations
+
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Literal, Self
+
+from pydantic import BaseModel, ValidationError
+
+from surrogym_client.environments.file_factories import open_file
+from surrogym_shared.archives import read_entries
+from surrogym_shared.faults import first_fault
+from surrogym_shared.port import PlanningPort
+from surrogym_shared.surrogate_file import MAX_FILE_BYTES, PLANNER_HEAD
+from surrogym_trainer.policies.card import UnusablePolicy
+from surrogym_trainer.policies.predict import Predict
+
+MODEL = "model.surrogate"
+
+
+class _Head(BaseModel):
+    """JSON header in the file of a planner."""
+
+    version: Literal[1] = 1
+    horizon: int
+    seed: int
+
+
+@dataclass(frozen=True)
+class PlannerFile:
+    """A planner as it is saved."""
+
+    surrogate: bytes  # specification and model, as the content of a surrogate's file
+    horizon: int  # number of steps of each planned rollout
+    seed: int  # seed of the changes of actions that the planner tries
+
+    def save(self, path: Path) -> None:
+        """Write the planner to a zip file, which contains no code."""
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
+            file.writestr(PLANNER_HEAD, _Head(horizon=self.horizon, seed=self.seed).model_dump_json())
+            file.writestr(MODEL, self.surrogate)
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """Read a file that ``save`` wrote. Raises ``UnusablePolicy`` if it is damaged."""
+        try:
+            entries = read_entries(path, MAX_FILE_BYTES)
+            head = _Head.model_validate_json(entries[PLANNER_HEAD])
+            return cls(entries[MODEL], head.horizon, head.seed)
+        except ValidationError as error:
+            raise UnusablePolicy(f"{path} is not a planner: {first_fault(error)}; train it again") from error
+        except (KeyError, ValueError) as error:
+            raise UnusablePolicy(f"{path} is not a planner: {error}; train it again") from error
+
+    @staticmethod
+    def is_at(path: Path) -> bool:
+        """Whether a file is a zip file with the header that ``save`` writes."""
+        try:
+            with zipfile.ZipFile(path) as file:
+                return PLANNER_HEAD in file.namelist()
+        except (OSError, zipfile.BadZipFile):
+            return False
+
+    def acting(self) -> Predict:
+        """Return the planner as a function from observations to actions. This computes its values, in some seconds.
+
+        Raises:
+            UnusablePolicy: the extra ``server`` is missing, or the model does not allow planning; with the reason.
+        """
+        try:
+            with TemporaryDirectory() as folder:
+                path = Path(folder) / MODEL
+                path.write_bytes(self.surrogate)
+                port = open_file(path)
+            if not isinstance(port, PlanningPort):
+                raise TypeError("the installed server can't plan")
+            return port.planner(self.horizon, self.seed)
+        except Exception as error:  # errors of the server's package, whose classes the client does not import
+            raise UnusablePolicy(str(error)) from error

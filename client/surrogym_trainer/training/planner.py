@@ -1,0 +1,50 @@
+"""Control without training: a planner on the surrogate's model in the place of a trained policy."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import cast
+
+import numpy as np
+
+from surrogym_shared.port import ModelPort, SurrogatePort
+from surrogym_shared.surrogate_file import RealSamples, SurrogateFile
+from surrogym_trainer.policies.card import UnusablePolicy
+from surrogym_trainer.policies.planner_files import PlannerFile
+from surrogym_trainer.training.checks import checked
+from surrogym_trainer.training.search import Found, PolicySearch, SearchTask
+from surrogym_trainer.training.settings import TrainProgress
+
+
+@dataclass(frozen=True)
+class Planner(PolicySearch):
+    """A policy that plans each action by rollouts of the model. Nothing is trained."""
+
+    horizon: int = 20  # number of steps of each planned rollout
+
+    suggested_steps = 1
+    resumable = False  # it computes its values anew from the latest model
+
+    def search(self, task: SearchTask) -> Found:
+        planner = PlannerFile(_file_of(task.port).to_bytes(), self.horizon, task.settings.seed)
+        try:
+            predict = planner.acting()
+        except UnusablePolicy as error:
+            raise ValueError(f"algorithm PLANNER: {error}") from error
+        imagined, whole = None, True
+        try:
+            imagined = float(checked(task.port, predict, task.settings).mean())
+            task.progress(TrainProgress(1, 1, imagined, 0.0))
+        except KeyboardInterrupt:
+            whole = False
+        return Found(planner, 0, imagined, asdict(self), whole=whole)
+
+
+def _file_of(port: SurrogatePort) -> SurrogateFile:
+    """Return the surrogate as a file without samples, which a planner does not need."""
+    if not hasattr(port, "model_file"):
+        raise ValueError("algorithm PLANNER: expected a surrogate with a model, got an original environment")
+    spec, model = port.spec(), cast("ModelPort", port).model_file()
+    states, none = np.zeros((0, len(spec.coordinates))), np.zeros(0, dtype=np.bool_)
+    samples = RealSamples(states, np.zeros((0, spec.action.size)), states, np.zeros(0), none, none)
+    return SurrogateFile("planner", spec, model, samples)

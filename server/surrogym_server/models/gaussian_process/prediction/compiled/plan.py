@@ -1,0 +1,144 @@
+"""Compiled code that plans one action: rollouts of the model under a policy on a grid and changes of its actions."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import types
+from numpy.typing import NDArray
+
+from surrogym_server.compiled.grid import GRID, interpolated, locate, policy_action
+from surrogym_server.models.gaussian_process.prediction.compiled.regions import judge
+from surrogym_server.models.gaussian_process.prediction.compiled.step import step
+from surrogym_shared.compiled.jit import entry
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+KEEP = -2.0  # in the changes of a discrete action: the action of the best plan so far, -1 being the policy's
+
+
+@entry(
+    types.float64[::1],
+    types.int64[:, ::1],
+    types.boolean,
+    types.int64,
+    types.float64,
+    *GRID,
+    types.float64[::1],
+    types.float64[:, ::1],
+    types.float64,
+    types.int64,
+    types.float64[::1],
+    types.float64[::1],
+    types.float64[::1],
+    types.float64[:, :, :, ::1],
+    types.int64,
+    types.float64[:, ::1],
+    types.float64[::1],
+    types.float64[::1],
+)
+def plan(
+    numbers: Floats,
+    places: Ints,
+    has_regions: bool,
+    outputs: int,
+    terminal_reward: float,
+    low: Floats,
+    cell: Floats,
+    count: Ints,
+    cyclic: Bools,
+    values: Floats,
+    table: Floats,
+    discount: float,
+    choices: int,
+    least: Floats,
+    most: Floats,
+    start: Floats,
+    changes: Floats,
+    elite: int,
+    best: Floats,
+    action: Floats,
+    arrival: Floats,
+) -> float:
+    """Search the changes of a policy's actions over T steps from one state, by R rounds of N rollouts. Return the
+    return of the best rollout.
+
+    In each rollout the policy acts on the state that the rollout has reached, so it also corrects the effect of earlier
+    changes. Rewards after the last step are estimated by the values on the grid.
+
+    Args:
+        numbers, places, has_regions, outputs: the model, as in ``step.StepsOfModel``.
+        terminal_reward: reward that steps that end the episode pay in addition.
+        low, cell, count, cyclic: the grid, as in ``compiled.grid``.
+        values: (S,) value of each node.
+        table: (S, F) action of the policy at each node.
+        discount: factor of later rewards.
+        choices: number of discrete actions; 0 for continuous actions.
+        least, most: (F,) smallest and largest action.
+        start: (C,) state.
+        changes: (R, N, T, F) changes to try. Continuous ones are added to the mean of the ``elite`` best plans of the
+            round before. A discrete one is an action, -1 for the policy's, or ``KEEP``. Rollout 0 of the first round
+            follows the policy, rollout 1 the plan ``best``, whatever their changes are.
+        elite: number of the best rollouts of a round whose mean the next round changes.
+        best: (T, F) best plan of an earlier decision; becomes the best plan found.
+        action: (F,) first action of the best rollout, written.
+        arrival: (C,) state after its first step, written.
+    """
+    rounds, lanes, steps, size = changes.shape[0], changes.shape[1], changes.shape[2], len(start)
+    entries, none = changes.shape[3], np.zeros((0, 0))
+    q, q_next, u = np.empty((lanes, size)), np.empty((lanes, size)), np.empty((lanes, entries))
+    reward, std, over = np.empty(lanes), np.empty((lanes, outputs)), np.empty(lanes, np.bool_)
+    running, total = np.empty(lanes, np.bool_), np.empty(lanes)
+    plans, first, reached = np.empty((lanes, steps, entries)), np.empty((lanes, entries)), np.empty((lanes, size))
+    ends, share, votes = np.empty((size, 2), np.int64), np.empty(size), np.empty(choices)
+    centre, highest = best.copy(), -np.inf
+    for k in range(rounds):
+        for i in range(lanes):
+            for t in range(steps):
+                for f in range(entries):
+                    change = changes[k, i, t, f]
+                    if choices:
+                        plans[i, t, f] = centre[t, f] if change == KEEP else change
+                    else:
+                        plans[i, t, f] = centre[t, f] + change
+                    if k == 0 and i == 0:
+                        plans[i, t, f] = -1.0 if choices else 0.0
+                    elif i <= 1 and (k == 0 or i == 0):
+                        plans[i, t, f] = centre[t, f]
+            q[i], running[i], total[i] = start, True, 0.0
+        weight = 1.0
+        for t in range(steps):
+            for i in range(lanes):
+                policy_action(low, cell, count, cyclic, table, choices, q[i], ends, share, votes, u[i])
+                for f in range(entries):
+                    if choices and plans[i, t, f] >= 0:
+                        u[i, f] = plans[i, t, f]
+                    elif not choices:
+                        u[i, f] = min(max(u[i, f] + plans[i, t, f], least[f]), most[f])
+            step(numbers, places, q, u, none, none, none, none, False, False, q_next, reward, std, over, none)
+            if has_regions:
+                judge(numbers, places, q, q_next, entries, False, reward, std, over)
+            for i in range(lanes):
+                if t == 0:
+                    first[i], reached[i] = u[i], q_next[i]
+                if running[i]:
+                    total[i] += weight * (reward[i] + terminal_reward if over[i] else reward[i])
+                    running[i] = not over[i]
+            q, q_next = q_next, q
+            weight *= discount
+        for i in range(lanes):
+            if running[i]:
+                locate(low, cell, count, cyclic, q[i], ends, share)
+                total[i] += weight * interpolated(values, ends, share)
+        order = np.argsort(-total)
+        if total[order[0]] > highest:
+            highest = total[order[0]]
+            best[:], action[:], arrival[:] = plans[order[0]], first[order[0]], reached[order[0]]
+        if choices:
+            centre[:] = best
+        else:
+            centre[:] = 0.0
+            for e in range(elite):
+                centre += plans[order[e]] / elite
+    return highest

@@ -1,0 +1,157 @@
+"""``Planner``: a policy that plans each action by rollouts of a model around a policy on a grid."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from surrogym_server.environment.definition import EnvironmentDefinition
+from surrogym_server.environment.observation_inverse import ObservationInverse
+from surrogym_server.errors import InvalidInput
+from surrogym_server.models.abilities import CompiledSteps, GridPolicy, PlannedActions, offers
+from surrogym_server.models.port import DynamicsModel
+from surrogym_server.planning.grid import LEVELS, solve
+from surrogym_shared.spec import BoxAction, DiscreteAction
+
+Floats = NDArray[np.float64]
+
+MOST_COORDINATES = 4
+MOST_HORIZON = 200
+LONGEST_EPISODE = 1_000  # number of steps of an episode that has no time limit
+ROUNDS, ROLLOUTS, ELITE = 2, 24, 4
+SPREAD = 0.3  # standard deviation of the changes of a continuous action, as a share of half its range
+NARROWING = 0.5  # factor of this standard deviation from one round to the next
+COLOUR = 0.8  # correlation of the changes of two steps in a row
+SETS = 64  # number of sets of changes, which the decisions take in turns
+LENGTHS, BEGINNINGS = (1, 1, 2, 3, 5), (0, 0, 0, 1, 2, 4, 7)  # changes of a discrete action: steps, and first step
+# A plan of an earlier decision is continued if the state lies within this share of each coordinate's sampling range
+# from the state that the plan predicted.
+NEAR = 0.1
+
+
+def planner_of(model: DynamicsModel, horizon: int, seed: int = 0) -> Planner:
+    """Return a planner on a model, after value iteration on a grid, which takes some seconds.
+
+    Args:
+        model: the model.
+        horizon: number of steps of each rollout.
+        seed: seed of the changes of actions that the planner tries.
+
+    Raises:
+        InvalidInput: the horizon is out of its range, or the model or its environment does not allow planning.
+    """
+    definition = model.definition
+    if type(horizon) is not int or not 1 <= horizon <= MOST_HORIZON:
+        raise InvalidInput(f"horizon: expected a whole number of steps from 1 to {MOST_HORIZON}, got {horizon!r}")
+    inverse = _inverse(definition)
+    able, compiled = offers(model, PlannedActions), offers(model, CompiledSteps)
+    steps = None if compiled is None else compiled.compiled()
+    if able is None or steps is None or not able.plans:
+        raise InvalidInput(
+            "expected a model of Gaussian processes without a prior, with compiled steps, because a planner rolls it "
+            "out in compiled code: train a policy"
+        )
+    limit = definition.time_limit or LONGEST_EPISODE
+    policy = solve(steps, model.terminal_reward, limit)
+    return Planner(definition, inverse, able, policy, horizon, seed)
+
+
+def _inverse(definition: EnvironmentDefinition) -> ObservationInverse:
+    """Return the function that computes coordinates from observations, or raise ``InvalidInput`` with the reason why
+    the environment does not allow planning."""
+    action, names = definition.action, [c.name for c in definition.coordinates]
+    asked: dict[str, bool] = {
+        f"at most {MOST_COORDINATES} coordinates, got {len(names)}": len(names) <= MOST_COORDINATES,
+        "one discrete action, or at most three continuous ones": isinstance(action, DiscreteAction)
+        or (isinstance(action, BoxAction) and action.size in LEVELS),
+        "an action without bins": not (isinstance(action, BoxAction) and action.bins),
+        "an action without rate": not definition.rates,
+        "no declared limits": definition.limits is None,
+        "no reward outside of the log's states": definition.outside_reward is None,
+    }
+    for expected, holds in asked.items():
+        if not holds:
+            raise InvalidInput(f"a planner needs {expected}: train a policy")
+    inverse = ObservationInverse.of(definition)
+    found = {index for index, _ in inverse.sources}
+    missing = [name for i, name in enumerate(names) if i not in found]
+    if missing:
+        raise InvalidInput(
+            f"a planner reads the state from the observation, and {', '.join(missing)} can't be computed from it: "
+            "train a policy"
+        )
+    return inverse
+
+
+@dataclass(eq=False)
+class Planner:
+    """A policy: a function from observations (N, D) to actions, (N, F), or (N,) if they are discrete.
+
+    It keeps the plans of its last call. A plan is continued from the state that it predicted; elsewhere the search
+    begins anew. So episodes need no names, and a planner may serve several at once.
+    """
+
+    definition: EnvironmentDefinition
+    inverse: ObservationInverse
+    model: PlannedActions
+    policy: GridPolicy
+    horizon: int
+    seed: int
+    _calls: int = field(default=0, init=False)
+
+    def __post_init__(self) -> None:
+        low, high = (ends.cpu().numpy() for ends in self.definition.sampled)
+        self._near = NEAR * (high - low)
+        self._cyclic = self.policy.grid[3]
+        self._changes = _changes(self.policy, self.horizon, self.seed)
+        self._arrived, self._plans = np.empty((0, len(low))), np.empty((0, self.horizon, len(self.policy.least)))
+
+    def __call__(self, observations: NDArray[np.floating[Any]]) -> NDArray[Any]:
+        shown = torch.from_numpy(np.asarray(observations, dtype=np.float64))
+        q = self.inverse(shown, shown.new_zeros(len(shown), len(self._near))).numpy()
+        plans, arrived = self._continued(q), np.empty_like(q)
+        actions = np.empty((len(q), plans.shape[2]))
+        changes = self._changes[self._calls % SETS]
+        for i in range(len(q)):
+            actions[i], arrived[i] = self.model.planned(self.policy, q[i], changes, ELITE, plans[i])
+        self._calls += 1
+        self._arrived, self._plans = arrived, plans
+        return actions[:, 0].astype(np.int64) if self.policy.choices else actions
+
+    def _continued(self, q: Floats) -> Floats:
+        """Return the plan (T, F) to continue at each state q (N, C): that of the last call which predicted the nearest
+        state, one step later; or the policy's, if none is near."""
+        count, idle = len(q), -1.0 if self.policy.choices else 0.0
+        plans = np.full((count, *self._plans.shape[1:]), idle)
+        for i in range(count if len(self._arrived) else 0):
+            apart = np.abs(self._arrived - q[i])
+            apart = np.where(self._cyclic, np.minimum(apart, 2 * np.pi - apart), apart) / self._near
+            nearest = int(np.argmin(apart.max(1)))
+            if apart[nearest].max() <= 1:
+                plans[i, :-1] = self._plans[nearest, 1:]
+        return plans
+
+
+def _changes(policy: GridPolicy, horizon: int, seed: int) -> Floats:
+    """Return the sets of changes (SETS, R, N, T, F) that decisions try."""
+    rng, shape = np.random.default_rng(seed), (SETS, ROUNDS, ROLLOUTS, horizon, len(policy.least))
+    if not policy.choices:
+        noise = rng.standard_normal(shape)
+        for t in range(1, horizon):
+            noise[..., t, :] = COLOUR * noise[..., t - 1, :] + np.sqrt(1 - COLOUR**2) * noise[..., t, :]
+        narrow = NARROWING ** np.arange(ROUNDS)[:, None, None, None]
+        changes: Floats = noise * narrow * SPREAD * (policy.most - policy.least) / 2
+        changes[:, :, 0] = 0.0
+        return changes
+    changes = np.where(rng.random(shape[:3]) < 0.5, -1.0, -2.0)[..., None, None] * np.ones(shape[3:])
+    for chosen in changes.reshape(-1, *shape[3:]):
+        begin = int(rng.choice(BEGINNINGS))
+        chosen[begin : begin + int(rng.choice(LENGTHS))] = rng.integers(policy.choices)
+    for a in range(min(policy.choices, ROLLOUTS - 2)):
+        changes[:, 0, 2 + a] = -1.0
+        changes[:, 0, 2 + a, 0] = a
+    return changes

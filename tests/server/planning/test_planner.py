@@ -1,0 +1,167 @@
+"""A planner: values on a grid keep the Bellman equation, plans hold what is unstable, misfits are refused."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from support.models import learn
+from support.real_steps import random_steps
+from surrogym_sampler.original.classic import acrobot, cartpole, pendulum
+from surrogym_sampler.original.mujoco_tasks import reacher
+from surrogym_server.convert import definition_from_spec
+from surrogym_server.errors import InvalidInput
+from surrogym_server.local import LocalSurrogate
+from surrogym_server.planning import planner_of
+from surrogym_server.planning.grid import _nodes, solve
+from surrogym_shared.spec import EnvironmentSpec, with_history
+from surrogym_trainer.deployment.controller import NotDeployable
+from surrogym_trainer.deployment.reading import controller_of
+from surrogym_trainer.evaluation import imagined_returns
+from surrogym_trainer.policies import load_policy
+from surrogym_trainer.policies.card import UnusablePolicy
+from surrogym_trainer.policies.files import load_learner
+from surrogym_trainer.training import TrainSettings, train
+from surrogym_trainer.training.words import words_of_result
+
+
+def local(spec, steps: int) -> LocalSurrogate:
+    return LocalSurrogate(spec, learn(definition_from_spec(spec), random_steps(spec, steps, seed=0)).model)
+
+
+@pytest.fixture(scope="module")
+def hanging() -> LocalSurrogate:
+    return local(pendulum().model_copy(update={"time_limit": 60}), 25)
+
+
+@pytest.fixture(scope="module")
+def falling() -> LocalSurrogate:
+    return local(cartpole().model_copy(update={"time_limit": 100}), 40)
+
+
+def bilinear(policy, q: np.ndarray) -> np.ndarray:
+    """The values (n,) at states (n, 2) of a pendulum, whose angle is cyclic."""
+    low, cell, count, _ = policy.grid
+    at = (q - low) / cell
+    at[:, 0] %= count[0]
+    at[:, 1] = at[:, 1].clip(0, count[1] - 1)
+    first = np.minimum(at.astype(int), count - [1, 2])
+    share = at - first
+    table = policy.values.reshape(count[1], count[0])
+    (i, j), (a, b) = first.T, share.T
+    k = (i + 1) % count[0]
+    return (1 - b) * ((1 - a) * table[j, i] + a * table[j, k]) + b * ((1 - a) * table[j + 1, i] + a * table[j + 1, k])
+
+
+def test_values_on_the_grid_keep_the_bellman_equation(hanging: LocalSurrogate):
+    steps = hanging.model.compiled()
+    policy = solve(steps, hanging.model.terminal_reward, 60)
+    nodes = _nodes(*policy.grid[:3])
+    chosen = np.random.default_rng(0).choice(len(nodes), 500, replace=False)
+    best = np.full(500, -np.inf)
+    for force in np.linspace(-2, 2, 5):
+        moved = steps(
+            nodes[chosen],
+            np.full((500, 1), force),
+            noise=None,
+            process=None,
+            paths=None,
+            stds=False,
+            reward_std=False,
+        )
+        best = np.maximum(best, moved.reward + policy.discount * bilinear(policy, moved.q_next))
+    apart = np.abs(best - policy.values[chosen])
+    assert apart.max() < 0.02 * np.ptp(policy.values)
+
+
+def test_a_planner_earns_more_than_the_policy_on_its_grid_and_far_more_than_nothing(hanging: LocalSurrogate):
+    planner = hanging.planner(20)
+    idle = imagined_returns(hanging, lambda o: np.zeros((len(o), 1)), 8, seed=0).mean()
+    planned = imagined_returns(hanging, planner, 8, seed=0).mean()
+    assert planned > 0.5 * idle  # costs are negative
+
+
+def test_planned_discrete_actions_hold_an_unstable_pole(falling: LocalSurrogate):
+    planner = falling.planner(10)
+    shown = np.zeros((1, 4), dtype=np.float32)
+    assert planner(shown).shape == (1,)
+    assert planner(shown).dtype == np.int64
+    assert imagined_returns(falling, planner, 4, seed=0).min() == 100
+
+
+def test_a_plan_is_continued_only_from_the_state_that_it_predicted(hanging: LocalSurrogate):
+    planner = hanging.planner(5)
+    planner._arrived = np.array([[3.1, 1.0]])
+    planner._plans = np.arange(5.0).reshape(1, 5, 1)
+    near, wrapped, far = planner._continued(np.array([[3.0, 1.1], [-3.1, 1.0], [1.0, 1.0]]))[:, :, 0]
+    assert near.tolist() == wrapped.tolist() == [1, 2, 3, 4, 0]
+    assert far.tolist() == [0, 0, 0, 0, 0]
+
+
+def test_equal_planners_act_alike_and_other_seeds_try_other_changes(hanging: LocalSurrogate):
+    shown = np.random.default_rng(0).normal(size=(6, 3)).astype(np.float32)
+    first, again, other = (hanging.planner(5, seed)(shown) for seed in (0, 0, 1))
+    assert first.tolist() == again.tolist() != other.tolist()
+    assert np.abs(first).max() <= 2
+
+
+@pytest.mark.parametrize("horizon", [0, 201, 2.5, True])
+def test_a_horizon_out_of_its_range_is_refused(hanging: LocalSurrogate, horizon):
+    with pytest.raises(InvalidInput, match="horizon: expected a whole number of steps from 1 to 200, got"):
+        hanging.planner(horizon)
+
+
+def refused(spec: EnvironmentSpec, said: str) -> None:
+    """The definition alone is refused, before the model is looked at."""
+    model: Any = SimpleNamespace(definition=definition_from_spec(spec))
+    with pytest.raises(InvalidInput, match=said):
+        planner_of(model, 20)
+
+
+def test_an_environment_with_too_many_coordinates_is_refused():
+    refused(reacher(), "a planner needs at most 4 coordinates, got 6: train a policy")
+
+
+def test_a_coordinate_that_the_observation_does_not_show_is_named():
+    spec = acrobot()
+    blind = spec.model_copy(update={"observation": spec.observation[:5]})
+    refused(blind, "coordinate 'speed2' can't be computed from the observation")
+
+
+def test_an_action_with_a_rate_is_refused():
+    resets = pendulum().model_copy(update={"query": "rollout"})
+    rated = with_history(resets, actions=1, rate=(4.0,))
+    refused(rated, "a planner needs an action without rate: train a policy")
+
+
+def test_a_training_by_planner_writes_a_file_that_any_reader_of_policies_runs(hanging: LocalSurrogate, tmp_path):
+    settings = TrainSettings(algorithm="planner", seed=3, hyperparameters={"horizon": 5})
+    result = train(hanging, tmp_path / "planner.zip", settings)
+    shown = np.random.default_rng(0).normal(size=(4, 3)).astype(np.float32)
+    assert load_policy(result.path, result.algorithm)(shown).tolist() == hanging.planner(5, 3)(shown).tolist()
+    assert result.settings["horizon"] == 5
+    assert result.imagined_return < 0
+    assert words_of_result(result).startswith(f"{result.path}: 0 virtual steps in ")
+    with pytest.raises(UnusablePolicy, match="is a planner, which has no network"):
+        load_learner(result.path, "PPO")
+    with pytest.raises(NotDeployable, match="is a planner, which has no network; a deterministic feed-forward"):
+        controller_of(result.path, pendulum())
+
+
+def test_a_planner_that_can_not_be_made_leaves_no_file(hanging: LocalSurrogate, tmp_path):
+    settings = TrainSettings(algorithm="planner", hyperparameters={"horizon": 0})
+    with pytest.raises(ValueError, match="algorithm PLANNER: horizon: expected"):
+        train(hanging, tmp_path / "planner.zip", settings)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_damaged_planner_is_refused_in_words(hanging: LocalSurrogate, tmp_path):
+    path = train(hanging, tmp_path / "planner.zip", TrainSettings(algorithm="planner")).path
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 255
+    path.write_bytes(content)
+    with pytest.raises(UnusablePolicy, match=r"planner.zip"):
+        load_policy(path)
