@@ -21,13 +21,13 @@ from common import figures, parser, ratio, started, take_turns, timed, write
 from threadpoolctl import threadpool_limits
 
 from support.models import learn
-from support.ppo import ROWS, batch_of, reference
+from support.ppo import OBJECTIVE, ROWS, batch_of, reference
 from support.real_steps import random_steps
 from surrogym_sampler.original.classic import pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.local import LocalSurrogate
 from surrogym_trainer.training import TrainSettings, train
-from surrogym_trainer.training.fast_ppo.learner import Learner, Objective
+from surrogym_trainer.training.fast_ppo.learner import Learner
 
 SEARCHES = ("ppo", "fastppo")
 STEPS, SEEDS, SAMPLES = 600_000, 3, 24
@@ -44,8 +44,8 @@ def updates(rounds: int) -> dict[str, Any]:
     rows, weights = torch.randn(ROWS, 64), torch.randn(64, 64)
     subjects = {
         "ppo": timed(theirs.train),
-        "fastppo": timed(lambda: learner.update(batch, Objective(), 1e-6)),
-        "fastppo in NumPy": timed(lambda: in_numpy.update(batch, Objective(), 1e-6)),
+        "fastppo": timed(lambda: learner.update(batch, OBJECTIVE, 1e-6)),
+        "fastppo in NumPy": timed(lambda: in_numpy.update(batch, OBJECTIVE, 1e-6)),
         "six products": timed(lambda: [rows @ weights for _ in range(6)]),
     }
     turns = take_turns(subjects, rounds, calls=20, warm_up=5)

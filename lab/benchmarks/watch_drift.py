@@ -47,6 +47,7 @@ BEFORE = 200  # steps before a change, and up to one episode more
 AFTER = 400
 AIM = 30  # steps
 EPISODES = 50  # of a mean return
+FALSE_ALARM_STEPS = 10_000  # as `surrogym watch` has it
 Change = Callable[[Machine, int], dict[str, float]]  # the plant, steps since the change: parameters
 
 
@@ -115,7 +116,7 @@ class Case(NamedTuple):
     act: Callable[[Array], Array]
 
     def watcher(self) -> Watcher:
-        return Watcher(cast(Api, self.served), self.view)
+        return Watcher(cast(Api, self.served), self.view, FALSE_ALARM_STEPS)
 
 
 def fitted(machine: Machine, seed: int) -> Case:

@@ -14,9 +14,10 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_trainer.policies.networks import WIDER, PaperPolicy, Standardise
-from surrogym_trainer.training.fast_ppo.learner import Batch, Learner
+from surrogym_trainer.training.fast_ppo.learner import Batch, Learner, Objective
 
 ROWS, RATE = 1_024, 1e-3
+OBJECTIVE = Objective(clip_range=0.2, vf_coef=0.5, max_grad_norm=0.5)
 HYPERPARAMETERS = {"n_steps": ROWS, "batch_size": ROWS, "n_epochs": 1, "learning_rate": RATE, "device": "cpu"}
 
 

@@ -15,7 +15,7 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 
 from support.acting import Forgetful
 from support.models import learn
-from support.ppo import RATE, batch_of, layers, linear, reference
+from support.ppo import OBJECTIVE, RATE, batch_of, layers, linear, reference
 from support.real_steps import random_steps
 from surrogym_client.environments.lanes import Lanes, session_request
 from surrogym_sampler.original.classic import cartpole, mountain_car_continuous, pendulum
@@ -31,7 +31,6 @@ from surrogym_trainer.training.fast_ppo.learner import (
     Bounded,
     Choices,
     Learner,
-    Objective,
     compiled_update,
     noisy,
     restored,
@@ -71,7 +70,7 @@ def test_a_numpy_ppo_update_equals_that_of_stable_baselines3(make: Callable[[], 
     made = reference(learner, spec, given)
     for _ in range(3):
         made.train()
-        learner.update(batch, Objective(), RATE)
+        learner.update(batch, OBJECTIVE, RATE)
     for module, (weights, bias) in zip(linear(made), layers(learner), strict=True):
         np.testing.assert_allclose(weights.T, module.weight.detach().numpy(), atol=2e-5)
         np.testing.assert_allclose(bias, module.bias.detach().numpy(), atol=2e-5)

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from surrogym_trainer.watching.detector import FALSE_ALARM_STEPS, Detector, Drift
+from surrogym_trainer.watching.detector import Detector, Drift
 
 CLAIMED, TOLERANCE = np.array([1.0, 0.02]), np.array([0.5, 0.01])
 KNOWN = 0.2 * CLAIMED  # deviations of the model
+FALSE_ALARM_STEPS = 10_000
 
 
 def first(errors: np.ndarray, false_alarm_steps: float = FALSE_ALARM_STEPS) -> tuple[int, Drift] | None:
@@ -101,7 +102,7 @@ def test_heavy_tailed_noise_is_not_reported_as_drift(kind: str):
 
 def test_errors_far_below_the_tolerance_are_not_reported_as_drift():
     """An output that the model knows by a formula errs by rounding alone."""
-    detector = Detector(np.array([1e-12]), np.array([1.0]))
+    detector = Detector(np.array([1e-12]), np.array([1.0]), FALSE_ALARM_STEPS)
     rng = np.random.default_rng(0)
     for error in 1e-6 * rng.standard_normal(500) ** 3:
         assert detector.step(np.array([error]), np.zeros(1)) is None

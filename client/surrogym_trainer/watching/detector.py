@@ -35,7 +35,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-FALSE_ALARM_STEPS = 10_000  # default: without a change, false alarms are at least this number of steps apart on average
 # the detector tests for changes of the mean error of these sizes, in standard deviations of an error
 SHIFTS = (0.5, 1.0, 2.0)
 # the detector tests for an increase of the errors' variance by the factor 1 / (1 - g), for each g
@@ -78,7 +77,7 @@ class Drift(NamedTuple):
 class Detector:
     """A detector that tests the errors of a model step by step for a change."""
 
-    def __init__(self, claimed: Array, tolerance: Array, false_alarm_steps: float = FALSE_ALARM_STEPS) -> None:
+    def __init__(self, claimed: Array, tolerance: Array, false_alarm_steps: float) -> None:
         """Start a detector.
 
         Args:

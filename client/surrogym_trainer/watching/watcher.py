@@ -23,7 +23,7 @@ from surrogym_shared.wire import PolicyView, SurrogateView
 from surrogym_shared.wire.policies import AddDrift
 from surrogym_trainer.evaluation.audit import Compared
 from surrogym_trainer.evaluation.comparing import StepOfEpisode, compared, steady
-from surrogym_trainer.watching.detector import FALSE_ALARM_STEPS, Detector
+from surrogym_trainer.watching.detector import Detector
 
 BATCH = 500  # largest number of real steps that one request to the server contains
 KEPT = 2_000  # a drift is described from at most this number of latest steps
@@ -98,7 +98,7 @@ class Watcher:
     """Compares real steps with the model that a surrogate serves now, and detects drift. The model does not learn from
     the steps."""
 
-    def __init__(self, api: Api, view: SurrogateView, false_alarm_steps: float = FALSE_ALARM_STEPS) -> None:
+    def __init__(self, api: Api, view: SurrogateView, false_alarm_steps: float) -> None:
         """Start watching a surrogate.
 
         Args:

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Sequence
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-import numpy as np
 from fastapi import APIRouter, Query
 from fastapi.responses import Response
 
@@ -16,9 +12,9 @@ from surrogym_server.api.door import READ, SAMPLE, TRAIN_OR_SAMPLE, DoorRoute, e
 from surrogym_server.api.problems import documented
 from surrogym_server.api.state import Use
 from surrogym_server.convert import resources
-from surrogym_server.storage.records import LogPart, SampleRecord
+from surrogym_server.convert.exports import samples_as_csv, samples_as_npz
+from surrogym_server.storage.records import LogPart
 from surrogym_shared.codes import Code
-from surrogym_shared.logs.writing import npz_of_steps, spreadsheet_cell
 from surrogym_shared.wire import (
     AddedSamples,
     AddSamples,
@@ -32,10 +28,6 @@ from surrogym_shared.wire import (
 
 CSV = "text/csv"
 NPZ = "application/x-npz"
-
-SOURCE = ("id", "purpose", "query_id", "sampler", "attempt", "late", "trajectory", "step")
-PLAIN = (*SOURCE, "reward", "terminated", "truncated")
-ARRAYS = ("id", "purpose", "coordinates", "action", "next_coordinates", "reward", "terminated", "truncated")
 
 router = APIRouter(prefix="/v1/surrogates/{name}", tags=["samples"], route_class=DoorRoute)
 
@@ -84,7 +76,7 @@ def samples(
     NPZ contain all samples."""
     if format == "json":
         return resources.sample_page(use.samples.page(name, after, limit), limit)
-    write, media_type = (as_csv, CSV) if format == "csv" else (as_npz, NPZ)
+    write, media_type = (samples_as_csv, CSV) if format == "csv" else (samples_as_npz, NPZ)
     content = write(use.samples.coordinate_names(name), use.samples.all(name))
     return Response(content, media_type=media_type, headers=_attachment(f"{name}.{format}"))
 
@@ -131,26 +123,3 @@ def report(name: str, body: Annotated[ReportSteps, example(examples.LEDGER)], us
 
 def _attachment(name: str) -> dict[str, str]:
     return {"content-disposition": f'attachment; filename="{name}"'}
-
-
-def as_csv(coordinate_names: Sequence[str], records: Sequence[SampleRecord]) -> bytes:
-    """Return samples as a CSV table with one row for each sample.
-
-    Columns of coordinates are named ``q.<name>``, of next coordinates ``next.<name>``, of actions ``u.0``, ``u.1``, ...
-    """
-    text = io.StringIO()
-    writer = csv.writer(text)
-    actions = [f"u.{i}" for i in range(len(records[0].action))] if records else []
-    q, q_next = [f"q.{name}" for name in coordinate_names], [f"next.{name}" for name in coordinate_names]
-    writer.writerow(map(spreadsheet_cell, [*PLAIN, *q, *actions, *q_next]))
-    for record in records:
-        plain = [spreadsheet_cell(getattr(record, name)) for name in PLAIN]
-        writer.writerow([*plain, *record.coordinates, *record.action, *record.next_coordinates])
-    return text.getvalue().encode()
-
-
-def as_npz(coordinate_names: Sequence[str], records: Sequence[SampleRecord]) -> bytes:
-    """Return samples as an NPZ archive: coordinates (n, C), action (n, F), next_coordinates (n, C), and one array (n,)
-    for each other field, such as reward, terminated and purpose."""
-    arrays: dict[str, Any] = {name: np.array([getattr(record, name) for record in records]) for name in ARRAYS}
-    return npz_of_steps(coordinate_names, arrays)
