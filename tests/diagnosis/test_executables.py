@@ -77,7 +77,7 @@ def test_program_check_errors_name_fields_without_python_terms(tmp_path: Path):
     assert "expected a text for 'snapshot' in the program's answer, got nothing" in no_snapshot
 
 
-def test_a_program_with_limits_that_falls_back_when_its_input_ends_passes_every_check(tmp_path: Path):
+def test_a_program_that_applies_its_safe_action_when_its_input_ends_passes_every_check(tmp_path: Path):
     checked = list(conformance(program(tmp_path, KEEPS_LIMITS, FALLS_BACK), 10.0))
     assert {outcome.name: outcome.failure for outcome in checked if outcome.failure} == {}
     assert FALLS in {outcome.name for outcome in checked if outcome.left_out is None}

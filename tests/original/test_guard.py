@@ -311,8 +311,8 @@ def test_a_fallback_by_the_name_of_a_program_acts_as_the_same_fallback_of_terms(
         (NamedCart, "brake=support.limited:DIARY", "to be callable, got a str"),
         (NamedCart, "brake=support.limited:parking", "has no attribute 'parking'"),
         (NamedCart, "brake", "expected package.module:factory, got ''"),
-        (PatientCart, "brake=support.limited:brake", "expected limits that name a fallback"),
-        (FreeCart, "brake=support.limited:brake", "expected limits that name a fallback"),
+        (PatientCart, "brake=support.limited:brake", "expected a specification whose limits name a program"),
+        (FreeCart, "brake=support.limited:brake", "expected a specification whose limits name a program"),
     ],
 )
 def test_a_named_fallback_without_its_program_is_refused_before_the_first_step(

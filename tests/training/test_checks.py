@@ -67,7 +67,9 @@ def test_training_stops_after_three_checks_with_the_maximum_return():
         pytest.param(0.0, 10.0, [50.0, 60.0, 70.0, 80.0, 80.0], id="each check earns more"),
     ],
 )
-def test_training_continues_while_a_higher_return_is_possible(untrained: float, earned: float, checks: Sequence[float]):
+def test_training_continues_while_an_episode_earned_more_than_the_last_checks(
+    untrained: float, earned: float, checks: Sequence[float]
+):
     flat = np.ones(64)
     assert not after(untrained * flat, *(each * flat for each in checks), earned=earned).saturated
 

@@ -151,8 +151,11 @@ class Systematic:
         return odds / (1 + odds)
 
     def draws(self, count: int, rng: np.random.Generator, wrong: NDArray[np.bool_] | None = None) -> Array:
-        """Draw ``count`` shared errors from their posterior distribution, as weights (count, O, 1 + P). The weights of
-        an output are 0 in those draws in which it has no shared error.
+        """Draw ``count`` samples of the shared error of each output from its posterior distribution.
+
+        A shared error is one that all steps have: a constant plus a linear function of P standardised inputs. Returns
+        the weights (count, O, 1 + P) of this function: first the constant, then the factor of each input. They are 0 in
+        those samples in which an output has no shared error.
 
         The outputs that ``wrong`` (O,) marks have a shared error in all draws, because the size of their errors has
         shown that the model is wrong there.

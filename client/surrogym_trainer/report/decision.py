@@ -520,8 +520,8 @@ def outcome(promise: PolicyPromise, real: EvaluationView) -> Outcome:
 
 
 def outcome_of(known: Known) -> Outcome | None:
-    """Return the outcome for the policy of a report; None if there is no promise, or no episodes to which
-    it applies."""
+    """Return how the real episodes of a report's policy compare with its promise: better, worse, or as predicted. None
+    if the policy has no promise, or if no real episodes from the declared starts were reported."""
     promise = None if known.policy is None else known.policy.promise
     return outcome(promise, known.real) if promise and known.real and known.real.declared else None
 

@@ -78,7 +78,7 @@ def test_predictions_of_new_samples_use_model_deviation_plus_noise(model, unseen
     torch.testing.assert_close(found.T, expected)
 
 
-def test_clipped_increments_and_rewards_of_terminated_steps_are_not_scored(model, unseen):
+def test_neither_clipped_increments_nor_rewards_of_steps_that_end_an_episode_are_scored(model, unseen):
     cut = saturated(model.definition, unseen.q_next)
     assert 0 < int(cut.sum()) < len(unseen)
     ended = Samples(unseen.q, unseen.u, unseen.q_next, unseen.reward, torch.arange(len(unseen)) < 7)

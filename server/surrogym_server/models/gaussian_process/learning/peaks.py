@@ -42,8 +42,9 @@ EPS = 4 * torch.finfo(torch.float64).eps  # a reward within this share of the ba
 # Explanations are compared by the probability of an interval around each reward, whose half width is this share of the
 # largest distance of a reward from the base.
 RESOLUTION = 1e-3
-# The logarithms of the heights are used only if the log odds of their process, against targets that don't depend on the
-# inputs, are at least this. Heights that spread over DECADES are used in any case.
+# A peak's process (a Gaussian process) learns logarithms of heights, that is of how far rewards are above the usual
+# reward. It is used only if the log odds of this process, against targets that don't depend on the inputs, are at least
+# this. Heights that spread over DECADES are used in any case.
 GAIN = 3.0
 
 
