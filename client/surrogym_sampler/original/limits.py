@@ -51,8 +51,8 @@ def program_of(spec: EnvironmentSpec, given: str | None) -> Program | None:
     if not isinstance(declared, NamedFallback):
         if given is not None:
             raise UnknownEnvironment(
-                f"--fallback: expected a specification whose limits name a program as their fallback, got {given!r} for one that "
-                "names none: leave the option out"
+                "--fallback: expected a specification whose limits name a program as their fallback, got "
+                f"{given!r} for one that names none: leave the option out"
             )
         return None
     name, _, target = (given or "").partition("=")
