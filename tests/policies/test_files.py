@@ -309,10 +309,10 @@ def test_a_too_large_replay_buffer_is_refused_only_for_further_training(
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
-        ({"batch_size": "x"}, "data: batch_size: expected a whole number, got 'x'"),
-        ({"n_epochs": 10**9}, "data: n_epochs: expected a number less than or equal to 10000, got 1000000000"),
-        ({"gamma": float("nan")}, "data: gamma: expected a finite number, got nan"),
-        ({"_n_updates": [1]}, "data: _n_updates: expected a whole number"),
+        ({"batch_size": "x"}, "batch_size: expected a whole number, got 'x'"),
+        ({"n_epochs": 10**9}, "n_epochs: expected a number less than or equal to 10000, got 1000000000"),
+        ({"gamma": float("nan")}, "gamma: expected a finite number, got nan"),
+        ({"_n_updates": [1]}, "_n_updates: expected a whole number"),
     ],
     ids=str,
 )

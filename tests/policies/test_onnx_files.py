@@ -134,7 +134,7 @@ def test_an_onnx_policy_with_functions_is_refused_with_a_remedy_that_works():
 def test_a_too_large_onnx_policy_is_refused_without_reading_all_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(onnx_files, "MAX_BYTES", 1_000)
     (tmp_path / "policy.onnx").write_bytes(bytes(10_000))
-    with pytest.raises(UnusableOnnx, match=r"got 1001 bytes .* expected at most 1000 bytes"):
+    with pytest.raises(UnusableOnnx, match=r"got 1001 bytes .* expected a file of at most 1000 bytes"):
         load_policy(tmp_path / "policy.onnx")
 
 
