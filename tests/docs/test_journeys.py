@@ -89,6 +89,7 @@ OTHERWISE = {
     "docs/how-to/priors.md": "tests/docs/test_how_to.py runs its programs, tests/cli/test_prior.py the command",
     "docs/how-to/history.md": "tests/docs/test_how_to.py runs its programs",
     "docs/how-to/limits.md": "tests/docs/test_how_to.py runs its program",
+    "docs/how-to/planner.md": "tests/plugins/test_policy_searches.py makes and loads a planner",
     "docs/how-to/trust.md": "tests/training/test_handover.py audits beside a sampler that stays",
 }
 BLOCK = re.compile(r"^```(python|console)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
