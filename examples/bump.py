@@ -5,8 +5,8 @@ surrogym sample bump --env bump:Bump
 surrogym train bump --wait 600 --out bump.zip
 surrogym evaluate bump.zip --env bump:Bump
 
-A hundred real steps say little about so narrow a reward, and a model may be sure of a wrong one. The audit at the end
-of the training finds that out. Declared in the specification, the reward would be no problem.
+The reward is next to nothing nearly everywhere. The model learns its logarithm, which is a parabola, and knows it after
+some ten real steps.
 """
 
 import numpy as np
