@@ -23,7 +23,7 @@ class Rate:
     """Largest change of one entry of the action in one step."""
 
     entry: int  # index of the entry in the action
-    last: int  # index of the coordinate that has the entry's value in the last step
+    last: int  # index of the coordinate that repeats the value of this action entry in the previous step
     change: float  # largest change in one step, in the entry's unit
 
 

@@ -206,7 +206,7 @@ class _Ending:
     """Handler that ends the child process on SIGTERM, but lets a running step finish first.
 
     Args:
-        seconds: longest time for which the child may continue after its parent has ended.
+        seconds: if the parent ends, the child is ended after this time at the latest, even within a step.
     """
 
     def __init__(self, seconds: float) -> None:

@@ -175,7 +175,7 @@ def test_changing_the_target_withdraws_queries_that_no_sampler_has_started(
 
 
 @pytest.mark.parametrize(("change", "again"), [({"tolerances": {"theta": 0.5}}, 2), ({"budget": 7}, 0)])
-def test_withdrawn_extra_queries_are_requested_again_unless_the_budget_shrank(
+def test_the_design_chooses_new_queries_for_withdrawn_extra_ones_unless_the_budget_shrank(
     storage: Storage, due: str, design: Callable[..., NewDesign], change: dict[str, Any], again: int
 ) -> None:
     storage.designs.commit(begun(storage, due), design(phase="ready"))

@@ -121,7 +121,7 @@ def test_a_model_with_shared_samples_predicts_the_posteriors_of_its_gaussian_pro
 
 
 @pytest.mark.parametrize("how", WAYS)
-def test_compiled_steps_with_shared_samples_equal_the_model(model, points, how):
+def test_compiled_steps_of_outputs_that_share_their_samples_equal_the_model(model, points, how):
     check_compiled(model, points, how)
 
 
