@@ -100,6 +100,22 @@ def test_missing_or_invalid_files_give_a_one_sentence_error(surrogym, tmp_path, 
 
 
 @pytest.mark.parametrize(
+    "command", ["evaluate", "audit", "export-policy", "policy push", "train pendulum --start-from"]
+)
+@pytest.mark.parametrize("policy", ["pendulum@1", "my.tank@production", "tank@latest"])
+def test_a_reference_to_a_stored_policy_in_place_of_a_file_names_the_download(surrogym, command, policy):
+    out = ("--out", "policy.onnx") if command == "export-policy" else ()
+    said = refused(surrogym(*command.split(), policy, *out))
+    get = f"surrogym policy get {policy} --out policy.zip"
+    assert said == f"error: {policy}: no such policy file; to download it from the server: {get}\n"
+
+
+def test_a_missing_file_that_is_no_reference_names_no_download(surrogym):
+    for policy in ("a/b@1", "tank@", "@1", "tank@1.zip", "tank@A"):
+        assert refused(surrogym("evaluate", policy)) == f"error: {policy}: no such policy file\n"
+
+
+@pytest.mark.parametrize(
     "arguments",
     [("status", "--nonsense"), ("unknown",), ("sample",), ("train", "x", "--steps", "many"), ("demo", "chess")],
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, RootModel, ValidationError
 
 from surrogym_client.errors import SurrogymClientError
 from surrogym_shared.faults import first_fault
+from surrogym_shared.patterns import NAME, POLICY
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import CurvePoint, SurrogateName
 from surrogym_trainer.policies.evidence import Audit, Promise
@@ -64,6 +66,15 @@ class PolicyCard(BaseModel):
     versions: dict[str, str] = Field(default_factory=dict)
 
 
+def missing_policy(policy: Path) -> FileNotFoundError:
+    """Return the error for a policy file that does not exist. If its name is that of a policy on a server, such as
+    ``pendulum@3``, the message has the command that downloads this policy."""
+    name, _, which = str(policy).partition("@")
+    stored = re.match(NAME, name) and re.match(POLICY, which)
+    get = f"; to download it from the server: surrogym policy get {policy} --out policy.zip" if stored else ""
+    return FileNotFoundError(2, f"no such policy file{get}", str(policy))
+
+
 def card_path(policy: Path) -> Path:
     """Return the path of a policy's card."""
     return policy.with_suffix(".json")
@@ -101,7 +112,7 @@ def read_card(policy: Path) -> PolicyCard:
         FileNotFoundError: there is no such policy.
     """
     if not policy.is_file():
-        raise FileNotFoundError(2, "no such policy file", str(policy))
+        raise missing_policy(policy)
     if not card_path(policy).exists():
         return PolicyCard()
     with card_path(policy).open("rb") as file:

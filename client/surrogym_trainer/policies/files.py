@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surrogym_shared.network import Network
-from surrogym_trainer.policies.card import DEFAULT_ALGORITHM, PolicyCard, UnusablePolicy, read_card
+from surrogym_trainer.policies.card import DEFAULT_ALGORITHM, PolicyCard, UnusablePolicy, missing_policy, read_card
 from surrogym_trainer.policies.onnx_files import load_onnx
 from surrogym_trainer.policies.planner_files import PlannerFile
 from surrogym_trainer.policies.predict import Predict
@@ -87,7 +87,7 @@ def require_policy(path: Path) -> None:
         FileNotFoundError: there is no such file.
     """
     if not path.is_file():
-        raise FileNotFoundError(2, "no such policy file", str(path))
+        raise missing_policy(path)
     if path.suffix.lower() != ONNX and not zipfile.is_zipfile(path):
         raise UnusablePolicy(
             f"{path} is not a policy: expected a ZIP file of surrogym train or Stable-Baselines3, or a file ending in "
