@@ -107,7 +107,7 @@ class NotThere(ProblemError):
 class UnknownSurrogate(NotThere):
     """There is no surrogate of this name. Register it first."""
 
-    way_out = "surrogym status lists the existing ones"
+    way_out = "register it first by surrogym register ENVIRONMENT --name NAME; surrogym status lists the existing ones"
 
 
 class UnknownQuery(NotThere):

@@ -3,6 +3,7 @@
 import pytest
 
 from support.scripted_server import problem, reply, scripted_server
+from surrogym.cli.commands.evaluate import enter_steps
 from surrogym_shared.archives import stored
 from surrogym_shared.codes import Code
 
@@ -127,10 +128,18 @@ def test_wrong_command_line_usage_exits_with_code_2_and_without_traceback(surrog
 
 
 @pytest.mark.parametrize("command", ["sample", "train", "status", "improve", "report"])
-def test_the_error_for_an_unknown_surrogate_recommends_status(on_server, command):
+def test_the_error_for_an_unknown_surrogate_recommends_register_and_status(on_server, command):
     said = refused(on_server(command, "nobody"))
     assert "nobody" in said
+    assert "; register it first by surrogym register ENVIRONMENT --name NAME; " in said
     assert said.endswith("; surrogym status lists the existing ones\n")
+
+
+def test_an_evaluation_reported_to_an_unknown_surrogate_recommends_register(server_process, capsys):
+    enter_steps("nobody", server_process.url, None, 5, 1, "1 episode", quiet=False)
+    said = capsys.readouterr().err
+    assert said.startswith("not entered into the ledger of 'nobody': ")
+    assert "register it first by surrogym register ENVIRONMENT --name NAME" in said
 
 
 @pytest.mark.parametrize(

@@ -410,6 +410,7 @@ def enter_steps(
     quiet: bool,
 ) -> None:
     """Report real steps to the server, as steps of a surrogate. If the server does not answer, only print a remark."""
+    from surrogym.cli.errors import sentence
     from surrogym.cli.options import connect
     from surrogym_client.errors import SurrogymClientError
     from surrogym_shared.terminal import say
@@ -420,7 +421,7 @@ def enter_steps(
         with connect(server, token) as api:
             api.report_steps(surrogate, steps, episodes=episodes, note=note)
     except SurrogymClientError as error:
-        say(f"not entered into the ledger of {surrogate!r}: {error}", quiet=quiet)
+        say(f"not entered into the ledger of {surrogate!r}: {sentence(error)}", quiet=quiet)
 
 
 def _kept(promise: Promise | None, result: Evaluation) -> bool | None:
