@@ -271,7 +271,14 @@ def test_the_evaluate_command_reports_that_all_episodes_were_equal(surrogym, mon
         "all 4 episodes are equal in every number: nothing in them was random, so each shows the same return, with 5 "
         "real steps"
     )
+    assert said.err.count("the evaluation takes 4 real episodes in support.moody:Alike: at most 20 real steps\n") == 1
     assert "the first 3 of 4 episodes are equal in every number" in said.err
+    compared = surrogym(
+        "evaluate", "policy.zip", "--env", "support.moody:Alike", "--episodes", "4", "--compare", "zero"
+    )
+    assert (
+        compared.err.count("the evaluation takes 8 real episodes in support.moody:Alike: at most 40 real steps\n") == 1
+    )
     several = surrogym("evaluate", "policy.zip", "--env", "support.moody:Line", "--episodes", "4")
     assert "equal" not in several.out + several.err
 

@@ -172,6 +172,7 @@ def evaluate(
     progress: Progress | None = None,
     remark: Callable[[str], None] | None = None,
     trained_for: EnvironmentSpec | None = None,
+    begin: Callable[[EnvironmentSpec], None] | None = None,
 ) -> Evaluation:
     """Run N real episodes with a policy.
 
@@ -188,6 +189,7 @@ def evaluate(
         remark: called with a sentence if the first episodes are equal and others are still to begin, and if no other
             episode of a machine begins because too many left a limit.
         trained_for: specification that the policy was trained for, such as that of its card. The environment must fit.
+        begin: called with the environment's specification when it is open and fits, before the first reset.
 
     Returns:
         The returns and successes of the episodes, in the order of their seeds. The number of instances has an effect
@@ -202,7 +204,10 @@ def evaluate(
     run = _Run(policy, settings or EvaluationSettings(), progress, remark)
     try:
         with signals_between_steps() as heed, ExitStack() as instances:
-            return run.on(_open(open_episode, run.settings, instances, trained_for), heed)
+            opened = _open(open_episode, run.settings, instances, trained_for)
+            if begin is not None:
+                begin(opened[0].spec)
+            return run.on(opened, heed)
     except KeyboardInterrupt:
         raise EvaluationInterrupted(run.begun) from None
     except RAISED as error:

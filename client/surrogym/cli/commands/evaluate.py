@@ -134,10 +134,10 @@ def command(
 ) -> None:
     """Run real episodes with a policy, and report its returns.
 
-    The real steps are reported to the server. It stores the policy and the episodes; if it does not
-    answer, they wait beside the policy until surrogym policy push. If the mean return lies outside the promised
-    interval, the command compares the steps with the model and shows the states at which the two disagree. With
-    --learn, the model learns from these steps; with --learn-all, from every step.
+    The command says beforehand how many real steps the episodes may take. They are reported to the server. It stores
+    the policy and the episodes; if it does not answer, they wait beside the policy until surrogym policy push. If the
+    mean return lies outside the promised interval, the command compares the steps with the model and shows the states
+    at which the two disagree. With --learn, the model learns from these steps; with --learn-all, from every step.
 
     Example: surrogym evaluate policy.zip --env Pendulum-v1 --episodes 100
 
@@ -155,8 +155,11 @@ def command(
     if learning := differences.learning(ledger, service.server, token):
         opener = learning.checked(opener)
     enter = partial(enter_steps, ledger, service.server, token, quiet=output.quiet)
+    controllers = beside.controllers(policy, card, reading, opener)
+    total = settings.episodes * len(controllers)
+    announce = partial(_announce, episodes=total, environment=_named(env, card), quiet=output.quiet)
     run = partial(_run, opener=opener, settings=settings, enter=enter, quiet=output.quiet)
-    reports = _reports(beside.controllers(policy, card, reading, opener), card.spec, run, enter, settings, policy)
+    reports = _reports(controllers, card.spec, run, announce, enter, settings, policy)
     result = reports[0][1]
     promise = card.promise if is_promised(settings, result, card.spec) else None
     expected = promise if _judges(settings.episodes) else None
@@ -272,6 +275,7 @@ def _reports(
     controllers: Mapping[Controller, Callable[[], Acting]],
     trained_for: EnvironmentSpec | None,
     run: Callable[..., Evaluation],
+    announce: Callable[[EnvironmentSpec], None],
     enter: Callable[[int, int, str], None],
     settings: EvaluationSettings,
     policy: Path,
@@ -282,6 +286,7 @@ def _reports(
         controllers: functions that load the controllers, by their kind.
         trained_for: specification that the policy was trained for.
         run: runs the episodes of one controller.
+        announce: prints the number of real steps of all controllers, given the environment's specification.
         enter: reports real steps and episodes, with a note, to the server.
         settings: settings of the evaluation.
         policy: file of the policy.
@@ -291,7 +296,8 @@ def _reports(
     reports: list[tuple[Controller, Evaluation]] = []
     for controller, load in controllers.items():
         actions = {"policy": "", "reference": "the reference controller"}.get(controller, f"{controller} actions")
-        result = run(load, trained_for if controller == "policy" else None, what=actions or str(policy))
+        first = (trained_for, announce) if controller == "policy" else (None, None)
+        result = run(load, *first, what=actions or str(policy))
         note = f"{counted(settings.episodes, 'episode')} from seed {settings.first_seed}"
         enter(result.steps, settings.episodes, f"{note}, {actions}" if actions else note)
         reports.append((controller, result))
@@ -341,9 +347,20 @@ def _keep(
         keep(policy, one)
 
 
+def _announce(spec: EnvironmentSpec, *, episodes: int, environment: str, quiet: bool) -> None:
+    """Print how many real episodes the evaluation takes in all, and at most how many real steps."""
+    from surrogym_sampler.original.protocol import LONGEST_EPISODE
+    from surrogym_shared.terminal import say
+    from surrogym_shared.words import counted
+
+    most, count = episodes * (spec.time_limit or LONGEST_EPISODE), counted(episodes, "real episode")
+    say(f"the evaluation takes {count} in {environment}: at most {most} real steps", quiet=quiet)
+
+
 def _run(
     load: Callable[[], Acting],
     trained_for: EnvironmentSpec | None,
+    announce: Callable[[EnvironmentSpec], None] | None,
     what: str,
     opener: Callable[[], Episode],
     settings: EvaluationSettings,
@@ -361,7 +378,8 @@ def _run(
         with terminations_as_interrupts(), progress("evaluate", quiet=quiet) as update:
             update(0.0, f"reading {what}")
             tell = _telling(update, settings.episodes)
-            return evaluate(load(), opener, settings, tell, lambda words: say(words, quiet=quiet), trained_for)
+            remark = partial(say, quiet=quiet)
+            return evaluate(load(), opener, settings, tell, remark, trained_for, announce)
     except EvaluationFailed as failure:
         enter(failure.steps, 0, "failed")
         raise
