@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import re
 
 import pytest
 
 from support.scripted_server import lost_reply, reply, scripted_server
 from support.teaching import teach
 from support.terminal import on_terminal
+from surrogym.cli.commands import status
 from surrogym_client.transport import Api
 from surrogym_sampler.original.classic import pendulum
 from surrogym_shared import wire
@@ -45,6 +47,20 @@ def test_the_status_list_shows_used_budget_and_pending_queries(on_server, server
     assert "4 pending, 0 leased" in line
     (summary,) = (s for s in on_server("status", "--json").json["surrogates"] if s["name"] == name)
     assert (summary["budget"], summary["target"], summary["queries"]["pending"]) == (8, 0.999, 4)
+
+
+def test_the_status_list_and_the_status_of_one_count_real_steps_alike(on_server, server_process, name):
+    on_server("register", "Pendulum-v1", "--name", name, "--budget", "8", "--initial", "4")
+    on_server("sample", name, "--max-queries", "4", "--time-limit", "60")
+    with Api(server_process.url) as api:
+        api.report_steps(name, 200, episodes=1, note="1 episode")
+        (summary,) = (s for s in api.surrogates() if s.name == name)
+    words = "4 of 8, 200 of evaluations"
+    (line,) = (line for line in on_server("status").out.splitlines() if line.startswith(name))
+    assert re.search(f"  {words}  ", line)
+    assert f"real steps: {words}\nin the budget: 4 initial, 0 adaptive, 0 manual, " in on_server("status", name).out
+    audited = summary.model_copy(update={"ledger": wire.Ledger(initial=6, total=6, audit=8, logged=3)})
+    assert status._steps(audited) == "6 of 8, 8 of audits, 3 logged"
 
 
 def test_the_status_of_a_design_with_failed_queries_recommends_resume(on_server, server_process, name):

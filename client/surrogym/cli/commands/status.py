@@ -152,9 +152,8 @@ def _detail(view: SurrogateView, models: Sequence[ModelView]) -> str:
     lines = [
         f"{view.name}: {view.environment or 'own environment'}{_period(view)}, "
         f"{'paused, ' if view.paused else ''}{view.phase}",
-        f"real steps: {ledger.initial} initial, {ledger.adaptive} adaptive, {ledger.manual} manual, "
-        f"{ledger.total} of {view.budget} in all; {ledger.audit} of audits, {ledger.logged} logged, "
-        f"{ledger.evaluation} in evaluation, "
+        f"real steps: {_steps(view)}",
+        f"in the budget: {ledger.initial} initial, {ledger.adaptive} adaptive, {ledger.manual} manual, "
         f"{ledger.unresolved} unresolved ({ledger.failed} failed)",
         f"queries: {view.queries.pending} pending, {view.queries.leased} leased, {view.queries.set_aside} set aside",
     ]
@@ -188,12 +187,12 @@ def _period(view: SurrogateView) -> str:
 
 
 def _steps(seen: SurrogateSummary) -> str:
-    """Describe how many real steps of the budget were taken, and how many steps come from logs, which the budget does
-    not include."""
+    """Describe how many real steps of the budget were taken, and those that the budget does not include: of audits, of
+    evaluations and from logs."""
     ledger = seen.ledger
-    taken = f"{ledger.total} of {seen.budget}" if seen.budget or ledger.total else ""
-    logged = f"{ledger.logged} logged" if ledger.logged else ""
-    return ", ".join(part for part in (taken, logged) if part) or "none"
+    taken = [f"{ledger.total} of {seen.budget}"] if seen.budget or ledger.total else []
+    besides = {"of audits": ledger.audit, "of evaluations": ledger.evaluation, "logged": ledger.logged}
+    return ", ".join([*taken, *(f"{count} {what}" for what, count in besides.items() if count)]) or "none"
 
 
 def _hint(view: SurrogateView) -> str | None:
