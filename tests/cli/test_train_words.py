@@ -9,10 +9,15 @@ from types import SimpleNamespace
 
 import pytest
 
+from support.models import learn
+from support.real_steps import random_steps
 from surrogym.cli.commands import train
 from surrogym_sampler.original.classic import pendulum
 from surrogym_sampler.original.loading import env_option
+from surrogym_server.convert import definition_from_spec
+from surrogym_server.local import LocalSurrogate
 from surrogym_trainer.training import TrainProgress, TrainResult, TrainSettings
+from surrogym_trainer.training import train as run
 from surrogym_trainer.training.handover import Handover
 from surrogym_trainer.training.words import words_of, words_of_interruption, words_of_no_sampler, words_of_result
 
@@ -77,6 +82,17 @@ def test_a_closed_loop_training_reports_the_confidence_over_visited_states():
 def test_the_training_progress_names_the_stage_of_a_policy_search():
     now = TrainProgress(100, 512, -1.5, 0.0, stage="refine")
     assert words_of(vars(now)) == "refine: 100 of about 512 virtual steps, imagined return -1.5 (in the surrogate)"
+
+
+def test_a_planner_says_what_it_computes_and_counts_no_virtual_steps(tmp_path):
+    spec = pendulum().model_copy(update={"time_limit": 20})
+    port = LocalSurrogate(spec, learn(definition_from_spec(spec), random_steps(spec, 8, seed=0)).model)
+    seen: list[TrainProgress] = []
+    result = run(port, tmp_path / "p.zip", TrainSettings("PLANNER", hyperparameters={"horizon": 3}), seen.append)
+    first, last = (words_of(vars(now)) for now in seen)
+    assert first == "computes values on a grid"
+    assert last == f"computed values on a grid, imagined return {result.imagined_return:.4g} (in the surrogate)"
+    assert f"{tmp_path / 'p.zip'}: made without training in " in words_of_result(result)
 
 
 def test_a_training_that_still_improves_shows_how_to_continue():

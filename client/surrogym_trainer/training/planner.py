@@ -27,6 +27,7 @@ class Planner(PolicySearch):
 
     def search(self, task: SearchTask) -> Found:
         planner = PlannerFile(_file_of(task.port).to_bytes(), self.horizon, task.settings.seed)
+        task.progress(TrainProgress(0, 0, None, 0.0, stage="computes values on a grid"))
         try:
             predict = planner.acting()
         except UnusablePolicy as error:
@@ -34,7 +35,7 @@ class Planner(PolicySearch):
         imagined, whole = None, True
         try:
             imagined = float(checked(task.port, predict, task.settings).mean())
-            task.progress(TrainProgress(1, 1, imagined, 0.0))
+            task.progress(TrainProgress(0, 0, imagined, 0.0, stage="computed values on a grid"))
         except KeyboardInterrupt:
             whole = False
         return Found(planner, 0, imagined, asdict(self), whole=whole)

@@ -143,7 +143,7 @@ class TrainProgress:
     """The state of a training at one report."""
 
     steps: int
-    total_steps: int
+    total_steps: int  # 0 if the search takes no virtual steps, as a planner
     # imagined return at the last check: mean return of virtual episodes from the declared starts
     imagined_return: float | None
     # Sum of the penalties for uncertainty since the last report, as a share of the sum of absolute rewards.

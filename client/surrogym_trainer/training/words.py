@@ -34,8 +34,9 @@ def words_of_result(
     options = env_option + ("" if server is None else f" --server {shlex.quote(server)}")
     path, lost = shlex.quote(str(result.path)), result.lost_episodes
     cut = f"; {lost} episode{'s' * (lost > 1)} cut short, because the server lost its sessions" if lost else ""
+    taken = f"{result.virtual_steps} virtual steps{_of_asked(result, asked)}"
     return (
-        f"{result.path}: {result.virtual_steps} virtual steps{_of_asked(result, asked)} in {result.seconds:.1f} s"
+        f"{result.path}: {taken if result.virtual_steps else 'made without training'} in {result.seconds:.1f} s"
         f"{_imagined(result.imagined_return)}{cut}{_loop(result.visited_confidence) if closed_loop else ''}"
         f"{_given_up(result.networks - 1)}{_gaining(result)}; next: surrogym evaluate {path}{options}"
         f"{'' if handover is None else chr(10) + words_of_handover(handover)}"
@@ -99,9 +100,9 @@ def words_of_interruption(result: TrainResult, asked: str) -> str:
 def words_of(now: dict[str, Any]) -> str:
     """Return a line about the state of a training, from the fields of ``TrainProgress``."""
     penalty = f", penalty {now['episode_penalty']:.1f} an episode" if now["episode_penalty"] else ""
-    known, stage = _known(now.get("visited_confidence")), f"{now['stage']}: " if now.get("stage") else ""
-    steps = f"{now['steps']} of about {now['total_steps']} virtual steps"
-    return f"{stage}{steps}{_imagined(now['imagined_return'])}{penalty}{known}"
+    steps = f"{now['steps']} of about {now['total_steps']} virtual steps" if now["total_steps"] else ""
+    doing = ": ".join(part for part in (now.get("stage"), steps) if part)
+    return f"{doing}{_imagined(now['imagined_return'])}{penalty}{_known(now.get('visited_confidence'))}"
 
 
 def _given_up(networks: int) -> str:

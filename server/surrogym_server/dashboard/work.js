@@ -34,8 +34,8 @@ export function standing(job) {
   const who = `${job.worker}: ${stage}`;
   const end = job.cancelling ? " It was asked to stop." : "";
   if (job.stage === "evaluating") return `${who}, ${percent(job.share)} done.${end}`;
-  if (job.stage === "training" && job.steps >= job.total_steps) return `${job.worker}: trained, the promise is being computed.${end}`;
-  if (job.steps === null) return `${who}.${end}`;
+  if (job.stage === "training" && job.total_steps && job.steps >= job.total_steps) return `${job.worker}: trained, the promise is being computed.${end}`;
+  if (job.steps === null || !job.total_steps) return `${who}.${end}`;
   const imagined = job.imagined_return === null ? "the first check of the imagined return is to come" : `imagined return ${number(job.imagined_return)} at the last check`;
   return `${who}, ${count(job.steps)} of ${count(job.total_steps)} virtual steps, ${imagined}.${end}`;
 }

@@ -225,7 +225,7 @@ def _words(name: str, policy: PolicyDetail) -> str:
     lines = [f"{name}@{policy.version}{aliases}: {policy.algorithm or 'unknown algorithm'}"]
     if policy.pushed_by is not None:
         lines.append(f"stored by: {policy.pushed_by}")
-    if policy.virtual_steps is not None:
+    if policy.virtual_steps:  # a planner has none
         lines.append(f"training: {policy.virtual_steps} virtual steps")
     if policy.promise is None:
         lines.append("promise: none was made")

@@ -242,8 +242,10 @@ def _recording(path: Path | None, curve: list[CurvePoint], update: Update) -> It
         def record(now: TrainProgress) -> None:
             seconds = round(time.monotonic() - started, 3)
             left = estimate.words_of_time_left(now.steps, now.total_steps, seconds)
-            update(estimate.share(now.steps, now.total_steps), f"{words_of(asdict(now))}{left}")
-            curve.append(CurvePoint(steps=now.steps, imagined_return=now.imagined_return, seconds=seconds))
+            share = estimate.share(now.steps, now.total_steps) if now.total_steps else None
+            update(share, f"{words_of(asdict(now))}{left}")
+            if now.total_steps:
+                curve.append(CurvePoint(steps=now.steps, imagined_return=now.imagined_return, seconds=seconds))
             if file is not None:
                 file.write(json.dumps({**asdict(now), "seconds": seconds}) + "\n")
                 file.flush()
