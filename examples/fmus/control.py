@@ -3,11 +3,13 @@
 python control.py TwoTanks
 python control.py InvertedPendulum --baseline 400000    # also train in the plant, for this many steps
 
-The package pythonfmu builds the FMU: pip install ".[all,fmu]" pythonfmu
+The package pythonfmu builds the FMU: pip install -e ".[all,fmu]" pythonfmu
+Without -e, --baseline does not work, because it needs the package surrogym_lab, which is in a clone only.
 """
 
 import argparse
 import importlib
+import importlib.util
 import subprocess
 import sys
 import tempfile
@@ -106,6 +108,8 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=100)
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
+    if options.baseline and importlib.util.find_spec("surrogym_lab") is None:
+        parser.error('--baseline needs surrogym_lab, which is in a clone only: there, pip install -e ".[all,fmu]"')
     terms, start = GOALS[options.plant]
     with tempfile.TemporaryDirectory() as folder:
         environment = f"fmu:{built(options.plant, Path(folder))}"
@@ -126,7 +130,7 @@ def main() -> None:
         ours = judged(policy, environment, spec, options.episodes)
 
         if options.baseline:
-            from surrogym_lab.original_port import OriginalPort  # this comparison runs in a checkout only
+            from surrogym_lab.original_port import OriginalPort  # in a clone only
 
             port = OriginalPort(spec, lambda: open_episode("own", spec, lambda: Plant(options.plant, spec)))
             settings = TrainSettings(options.algorithm, options.baseline, seed=options.seed)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import runpy
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -59,6 +61,17 @@ def test_a_policy_trained_on_the_surrogate_of_an_fmu_controls_the_fmu(server: Se
     said = run(server, tmp_path, *program, "--episodes", "2", "--baseline", "2048")
     assert "after 10 real steps" in said
     assert said.splitlines()[-1].startswith("from the surrogate")
+
+
+def test_the_fmu_example_without_the_lab_says_what_its_baseline_needs(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    program = str(EXAMPLES / "fmus" / "control.py")
+    monkeypatch.setitem(sys.modules, "surrogym_lab", None)  # as in an installed wheel
+    monkeypatch.setattr(sys, "argv", [program, "TwoTanks", "--baseline", "10"])
+    with pytest.raises(SystemExit):
+        runpy.run_path(program, run_name="__main__")
+    assert "error: --baseline needs surrogym_lab, which is in a clone only" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", ["bump:Bump", "noisy_mass:NoisyMass"])
