@@ -48,7 +48,7 @@ COMPARED = ("pendulum", "cartpole", "swingup", "mountaincar", "acrobot", "invert
 SEEDS = (0, 1)
 TRAINING_STEPS, EPISODES = 8_192, 2
 POINTS, LANES, STEPS = 64, 4, 200  # of a comparison
-ROUNDS, CALLS, FITS = 20, 10, 5  # of a timing
+ROUNDS, CALLS, FITS = 20, 10, 30  # of a timing
 PATIENCE = 600.0  # seconds for a reply: a commit whose steps were never compiled here compiles them first
 SHOWN = 8  # differences of a run
 POINT_ROUTES = ("predict", "query_uncertainty")
@@ -251,22 +251,26 @@ def _turns(calls: Mapping[str, Call], rounds: int) -> Turns:
 
 
 def _fits(servers: Mapping[str, Server]) -> Turns:
-    """Seconds of fits, one after each sample that is added by hand, to one server and then to the other."""
+    """Seconds of fits, one after each sample that is added by hand. The servers take turns at being first. The first
+    fit of a server compiles, and is left out."""
     taken: Turns = {side: [] for side in servers}
-    for number in range(FITS):
-        for side, server in servers.items():
-            taken[side].append([_fit(server, number)])
+    for number in range(FITS + 1):
+        for side in sorted(servers, reverse=number % 2 == 1):
+            seconds = _fit(servers[side], number)
+            if number > 0:
+                taken[side].append([seconds])
     return taken
 
 
 def _fit(server: Server, number: int) -> float:
-    sample = server.get(f"{server.surrogate}/samples")["samples"][number]
+    samples = server.get(f"{server.surrogate}/samples")["samples"]
+    sample = samples[number % len(samples)]
     version = server.newest_model()["version"]
     again = {field: sample[field] for field in OF_A_SAMPLE if field in sample}
     body = {"sampler": "comparison", "samples": [again], "idempotency_key": f"fit {number}"}
     server.post(f"{server.surrogate}/add_sample", body)
     while (model := server.newest_model())["version"] == version:
-        time.sleep(0.05)
+        time.sleep(0.25)
     return float(model["fit_seconds"])
 
 
