@@ -9,27 +9,41 @@ from collections.abc import Mapping
 
 PLANNED = "leave it out for the default, 'integrated_variance'"
 TRUST_POLICY = "use --trust-policy, which reads pickled objects"
+CAUTION = "use {}penalty, or {}trust to end episodes"
+PROPAGATION = "leave it out, each particle moves by a sample of its own"
+WEIGHTING = "leave it out, the particles' rewards are weighted by inverse variance"
 REMOVED: Mapping[str, Mapping[str, str]] = {
     "acquisition": {
         "barl": PLANNED,
         "tip": PLANNED,
         "opax": PLANNED,
     },
+    "algorithm": {"gradient": "use 'FASTPPO', which needs no gradients of the model"},
     "arm": {
         "barl": "use 'no_loop'",
     },
+    "command": {
+        "optimise": "use surrogym train",
+        "reproduce": "use python -m surrogym_lab, in a clone",
+    },
     "option of audit": {"--trust": TRUST_POLICY},
+    "option of demo": {"--arm": "use python -m surrogym_lab demo, in a clone"},
     "option of evaluate": {"--trust": TRUST_POLICY},
     "option of export-policy": {"--trust": TRUST_POLICY},
     "option of train": {
-        "--caution": "use --penalty, or --trust to end episodes",
-        "--propagation": "leave it out, each particle moves by a sample of its own",
-        "--weighting": "leave it out, the particles' rewards are weighted by inverse variance",
+        "--caution": CAUTION.format("--", "--"),
+        "--propagation": PROPAGATION,
+        "--weighting": WEIGHTING,
     },
     "option of register": {"--teleport": "use --access any", "--no-teleport": "use --access reset"},
     "model": {
         "bayesian_last_layer": "use 'gaussian_process' for few real steps, 'ensemble' for contacts and many steps",
         "selected": "name the family itself, such as 'gaussian_process' or 'ensemble'",
+    },
+    "session option": {
+        "caution": CAUTION.format("", ""),
+        "propagation": PROPAGATION,
+        "weighting": WEIGHTING,
     },
 }
 

@@ -42,6 +42,20 @@ def test_the_error_for_an_unreachable_server_recommends_serve(surrogym, quickly,
     assert "start one with surrogym serve" in said
 
 
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("optimise", "pendulum"), "No such command: optimise; 'optimise' was removed: use surrogym train"),
+        (("reproduce",), "No such command: reproduce; 'reproduce' was removed: use python -m surrogym_lab"),
+        (("demo", "--arm", "paper"), "No such option: --arm; '--arm' was removed: use python -m surrogym_lab demo"),
+    ],
+)
+def test_the_error_for_a_removed_command_or_option_names_its_replacement(surrogym, arguments, message):
+    said = surrogym(*arguments)
+    assert (said.code, said.out) == (2, "")
+    assert f"Error: {message}" in said.err
+
+
 def test_an_invalid_server_address_is_refused(surrogym):
     assert "expected a server address" in refused(surrogym("status", "--server", "pendulum"))
 

@@ -76,6 +76,11 @@ def test_an_unknown_keyword_of_the_remote_environment_raises_type_error(kind: Ca
     assert port.opened == []
 
 
+def test_the_error_for_a_removed_session_option_names_its_replacement():
+    with pytest.raises(TypeError, match=r"argument 'caution'.*'caution' was removed: use penalty"):
+        RemoteEnv(ExactPendulum(), caution=1.0)
+
+
 def test_the_single_remote_environment_takes_no_autoreset_mode():
     with pytest.raises(TypeError, match="unexpected keyword argument 'autoreset_mode'"):
         RemoteEnv(ExactPendulum(), autoreset_mode="same_step")

@@ -2,7 +2,7 @@
 use.
 
 Other packages add commands through an entry point. The help lists commands in groups, and options for experts in a
-section of their own. An error names the replacement of an option that was removed.
+section of their own. An error names the replacement of a command or an option that was removed.
 """
 
 from __future__ import annotations
@@ -41,7 +41,9 @@ ADVANCED: Mapping[str, frozenset[str]] = {  # for each command, the options for 
         {"--worker", "--once", "--time-limit", "--most-snapshots", "--most-bytes", "--on-ray", "--ray-address"}
         | {"--ray-resources", "--runtime-env"}
     ),
-    "serve": frozenset({"--synchronous", "--engine", "--ray-address", "--ray-hosts", "--ready-file"}),
+    "serve": frozenset(
+        {"--synchronous", "--engine", "--ray-address", "--ray-hosts", "--ready-file", "--exit-with-parent"}
+    ),
     "train": frozenset(
         {"--variant", "--particles", "--spread", "--process-noise", "--start-box"}
         | {"--start-visited", "--horizon", "--penalty", "--trust", "--num-envs", "--audit-steps"}
@@ -66,7 +68,8 @@ class Command(TyperCommand):
 
 
 class Commands(TyperGroup):
-    """Group of all commands of ``surrogym``. The error about an option that was removed names its replacement."""
+    """Group of all commands of ``surrogym``. The error about a command or an option that was removed names its
+    replacement."""
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write a section for each group of commands to the help of ``surrogym``."""
@@ -81,6 +84,12 @@ class Commands(TyperGroup):
             for heading, names in groups.items()
         }
         _write(formatter, sections)
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Find the command that the arguments begin with. The error about a removed one names its replacement."""
+        if (said := remark("command", args[0])) and self.get_command(ctx, args[0]) is None:
+            ctx.fail(f"No such command: {args[0]}{said}")
+        return super().resolve_command(ctx, args)
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command, and add the replacement of a removed option to the error about it."""

@@ -65,7 +65,12 @@ def session_request(num_envs: int, mode: AutoresetMode, options: dict[str, Any])
     """
     for name in options:
         if name not in OPTIONS:
-            raise TypeError(f"got an unexpected keyword argument {name!r}: session options are {', '.join(OPTIONS)}")
+            from surrogym_shared.removed import remark  # imported late, because only an error needs it
+
+            raise TypeError(
+                f"got an unexpected keyword argument {name!r}: session options are {', '.join(OPTIONS)}"
+                f"{remark('session option', name)}"
+            )
     try:
         return OpenSession(num_envs=num_envs, autoreset_mode=mode, **options)
     except ValidationError as error:

@@ -17,6 +17,7 @@ from surrogym_server.logs import REQUEST_ID
 from surrogym_shared.codes import PROBLEM_MEDIA_TYPE, STATUS, Code, Problem
 from surrogym_shared.faults import in_words
 from surrogym_shared.frames import FrameError
+from surrogym_shared.removed import remark
 
 CODES: dict[type[errors.SurrogymError], Code] = {
     errors.InvalidInput: Code.INVALID_REQUEST,
@@ -162,7 +163,9 @@ def validation_detail(found: Sequence[Any]) -> str:
     telling = max(found, key=lambda error: len(error["loc"]))
     said = in_words(telling)
     came = "" if ", got " in said else f", got {shown(telling.get('input'))}"
-    return f"{_field(telling) or 'the body'}: {said}{came}"
+    unknown = telling["type"] == "extra_forbidden"
+    instead = remark("session option", str(telling["loc"][-1])) if unknown else ""
+    return f"{_field(telling) or 'the body'}: {said}{came}{instead}"
 
 
 def shown(value: Any) -> str:

@@ -13,7 +13,7 @@ from torch import Tensor
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import InvalidInput
 from surrogym_server.models.port import DynamicsModel, StoredModel
-from surrogym_server.models.registry import learner_of
+from surrogym_server.models.registry import MODELS, SHORT, learner_of
 
 METADATA = "surrogym"
 FAMILY, CHECKSUM = "family", "checksum"
@@ -75,6 +75,11 @@ def _content(data: bytes) -> tuple[dict[str, Any], dict[str, Tensor]]:
 
 def _model(definition: EnvironmentDefinition, header: dict[str, Any], tensors: dict[str, Tensor]) -> DynamicsModel:
     expected, got = definition.learning.model, header.pop(FAMILY)
+    if str(got) in SHORT or MODELS.instead_of(str(got)) is not None:
+        raise InvalidInput(
+            f"expected a model of this version, got one of the family {got!r}, which another version wrote: "
+            "export its samples with that version, and learn from them again"
+        )
     if got != expected.name:
         raise InvalidInput(
             f"expected a model of the family {expected.name!r}, as the specification says, "

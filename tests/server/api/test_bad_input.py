@@ -253,6 +253,11 @@ def test_sessions_and_predictions_before_the_first_fit_are_refused(client: httpx
     refused(post(client, f"/v1/surrogates/{fresh}/predict", points), Code.NO_MODEL)
 
 
+def test_a_removed_session_option_is_refused_with_its_replacement(client: httpx.Client, fresh: str):
+    reply = post(client, f"/v1/surrogates/{fresh}/sessions", {"caution": 1.0})
+    refused(reply, Code.INVALID_REQUEST, "caution: expected no entry of this name, got 1.0; 'caution' was removed: use")
+
+
 @pytest.mark.parametrize("content", [b"", b"no model", b"\x80\x04K\x01.", (2**40).to_bytes(8, "little") + b"{}"])
 def test_importing_a_file_that_is_not_a_model_is_refused(client: httpx.Client, taught: str, content: bytes):
     before = client.get(f"/v1/surrogates/{taught}/models").json()

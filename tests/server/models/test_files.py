@@ -82,6 +82,12 @@ def test_a_model_file_of_another_family_than_specified_is_refused(model, family)
     assert len(str(refused.value)) < 300
 
 
+@pytest.mark.parametrize("family", ["sparse_gaussian_process", "bayesian_last_layer"])
+def test_a_model_file_of_a_removed_family_is_refused_as_one_of_another_version(model, family):
+    with pytest.raises(InvalidInput, match=rf"got one of the family '{family}', which another version wrote: export"):
+        from_bytes(model.definition, with_header(model, family=family))
+
+
 def test_the_model_family_is_taken_from_the_specification_and_not_the_file(model):
     """The specification names it, and the registry knows what is installed."""
     learning = replace(model.definition.learning, model=Choice("gaussian_process"))
