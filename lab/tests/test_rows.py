@@ -1,12 +1,11 @@
 """Rows survive the file, and merge without losing a seed or hiding an error."""
 
-import csv
 from dataclasses import replace
 
 import pytest
 
 from support.metrics import METRICS
-from surrogym_lab.reproduce.rows import LATER, Row, UnusableRows, merge, read_rows, row_of, write_rows
+from surrogym_lab.reproduce.rows import Row, UnusableRows, merge, read_rows, row_of, write_rows
 
 ROW = Row("pendulum", "default", 0, 14, 4, 5, 9, mean=-150.123, success=0.97, reached=True, phase="ready")
 
@@ -29,16 +28,6 @@ def test_result_rows_survive_writing_and_reading(tmp_path):
     write_rows(tmp_path / "rows.csv", rows)
     assert read_rows(tmp_path / "rows.csv") == rows
     assert read_rows(tmp_path / "none.csv") == []
-
-
-def test_a_result_file_without_promised_return_columns_is_still_read(tmp_path):
-    path = tmp_path / "rows.csv"
-    write_rows(path, [ROW])
-    with path.open(newline="") as file:
-        lines = list(csv.reader(file))
-    kept = [i for i, name in enumerate(lines[0]) if name not in LATER]
-    path.write_text("\n".join(",".join(line[i] for i in kept) for line in lines) + "\n")
-    assert read_rows(path) == [ROW]
 
 
 def test_two_concurrent_writers_of_a_result_file_lose_no_rows(tmp_path):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_type_hints
@@ -74,7 +74,6 @@ class Row:
 
 
 COLUMNS = tuple(field.name for field in fields(Row))
-LATER = ("promise", "promise_low", "promise_high", "trusted", "audit_steps", "without")  # columns that older files lack
 
 
 def row_of(metrics: dict[str, Any]) -> Row:
@@ -111,7 +110,7 @@ def read_rows(path: Path) -> list[Row]:
     Raises:
         UnusableRows: other columns than expected, or a value that is none.
     """
-    return read_records(path, Row, LATER)
+    return read_records(path, Row)
 
 
 def write_rows(path: Path, rows: Iterable[Row]) -> None:
@@ -128,13 +127,12 @@ def merge(*sources: Iterable[Row]) -> list[Row]:
     return sorted(merged.values(), key=lambda row: row.key)
 
 
-def read_records(path: Path, kind: type[R], later: Sequence[str] = ()) -> list[R]:
+def read_records(path: Path, kind: type[R]) -> list[R]:
     """The lines of a CSV file as records of a dataclass; none where there is no file.
 
     Args:
         path: the file.
         kind: a dataclass of numbers, texts and truth values.
-        later: columns that older files lack.
 
     Raises:
         UnusableRows: other columns than expected, a value that is none, an empty file, or no text in UTF-8.
@@ -143,22 +141,22 @@ def read_records(path: Path, kind: type[R], later: Sequence[str] = ()) -> list[R
         return []
     try:
         with path.open(newline="", encoding="utf-8") as file:
-            return _records(path, csv.DictReader(file), kind, later)
+            return _records(path, csv.DictReader(file), kind)
     except (UnicodeDecodeError, csv.Error) as error:
         raise UnusableRows(f"{path}: expected a CSV file in UTF-8: {error}") from error
 
 
-def _records(path: Path, reader: csv.DictReader[str], kind: type[R], later: Sequence[str]) -> list[R]:
+def _records(path: Path, reader: csv.DictReader[str], kind: type[R]) -> list[R]:
     columns, kinds = _columns(kind), get_type_hints(kind)
     given = tuple(reader.fieldnames or ())
     if not given:
         raise UnusableRows(f"{path}: expected a file of rows, got an empty one")
-    if given != tuple(name for name in columns if name in given or name not in later):
+    if given != columns:
         raise UnusableRows(f"{path}: expected the columns {', '.join(columns)}, got {reader.fieldnames}")
     records = []
     for number, line in enumerate(reader, start=2):
         try:
-            records.append(kind(**{name: _read(kinds[name], line.get(name, "")) for name in columns}))
+            records.append(kind(**{name: _read(kinds[name], line[name]) for name in columns}))
         except (ValueError, TypeError) as error:
             raise UnusableRows(f"{path}, line {number}: {error}") from error
     return records
