@@ -12,7 +12,7 @@ from surrogym.demo.tasks import ROUNDS, TASKS, DemoTask, design_budget, queries_
 from surrogym_sampler.original import make
 from surrogym_sampler.original.loading import with_choices
 from surrogym_shared.spec import Access, EnvironmentSpec
-from surrogym_trainer.training.search import FAST, REFERENCE, SEARCHES
+from surrogym_trainer.training.search import FAST, SEARCHES
 from surrogym_trainer.training.settings import TrainSettings, prolongs
 
 
@@ -110,12 +110,8 @@ class DemoSettings:
         """Return all settings that a result depends on, except the seed, as values that JSON can represent."""
         spec = self.spec().model_dump(mode="json")
         spec["design"].pop("seed")
-        # a result without snapshots has no such field, so that its settings equal those of older results
-        if not spec["snapshots"]:
-            del spec["snapshots"]
         names = ["task", "real_steps", "virtual_steps", "prolong", "episodes"]
-        search = {} if self.search == REFERENCE else {"algorithm": self.search.lower()}
-        return {"spec": spec, **{name: getattr(self, name) for name in names}, **search}
+        return {"spec": spec, **{name: getattr(self, name) for name in names}, "algorithm": self.search.lower()}
 
 
 def fingerprint(content: Any) -> str:

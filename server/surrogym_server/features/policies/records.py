@@ -17,12 +17,6 @@ MAX_POLICIES = 200  # largest number of policies of a surrogate
 MAX_EVALUATIONS = 100  # largest number of evaluations and reports of drift of a policy
 PUSHED_BY = "pushed_by"  # key in a card: role and fingerprint of the token that stored the policy
 DRIFT = "drift"  # key in the summary of a report of drift; summaries of episodes don't have it
-# Values of fields that the summary of an older evaluation lacks.
-OLDER: JSON = {
-    "environment": "",
-    "own": True,
-    "seeded": True,
-}
 
 
 @dataclass(frozen=True)
@@ -53,9 +47,8 @@ def judges(summary: JSON) -> bool:
     It can if the evaluation has enough episodes, if the policy itself acted, if the starts were those of the
     specification, and if the original environment was the surrogate's own.
     """
-    there = OLDER | summary
-    declared = there.get("controller") == "policy" and there.get("declared") and there["own"]
-    return bool(declared) and int(there["episodes"]) >= FEWEST_TO_JUDGE
+    declared = summary["controller"] == "policy" and summary["declared"] and summary["own"]
+    return bool(declared) and int(summary["episodes"]) >= FEWEST_TO_JUDGE
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,6 @@ from surrogym_server.convert.stored import read_stored
 from surrogym_server.feature import part
 from surrogym_server.features.policies.records import (
     DRIFT,
-    OLDER,
     PUSHED_BY,
     EvaluationRecord,
     PolicyFile,
@@ -356,6 +355,6 @@ def _latest(evaluations: list[dict[str, Any]]) -> dict[str, Any] | None:
 
 
 def _evaluation(record: EvaluationRecord, card: wire.PushedCard) -> dict[str, Any]:
-    summary, promise = {**OLDER, **record.summary}, card.promise
+    summary, promise = record.summary, card.promise
     kept = bool(summary["mean"] >= promise.low) if promise is not None and judges(summary) else None
     return {"id": record.id, "created_at": record.created_at, **summary, "promise_kept": kept}
