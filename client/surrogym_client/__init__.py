@@ -1,4 +1,4 @@
-"""The Surrogym client: virtual environments over HTTP, the sampler, training and evaluation.
+"""The thin client of Surrogym: virtual environments over HTTP and the stream, for Gymnasium and Stable-Baselines3.
 
 Importing this package registers ``surrogym/Remote-v0`` with Gymnasium: at once if Gymnasium is loaded, otherwise as
 soon as it is. This keeps commands that don't need Gymnasium fast. Since version 1.0, Gymnasium does not search for

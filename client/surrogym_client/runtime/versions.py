@@ -54,11 +54,14 @@ def _processor() -> str:
 
 
 EXTRAS = {  # modules that each extra of surrogym installs
-    "server": (
-        *("alembic", "fastapi", "jiter", "numba", "prometheus_client", "psycopg", "safetensors", "scipy", "sqlalchemy"),
-        *("starlette", "threadpoolctl", "uvicorn"),
+    # The server needs numba, scipy, threadpoolctl and torch too, but if they are missing, it misses uvicorn first.
+    "train": (
+        *("cmaes", "matplotlib", "numba", "scipy", "stable_baselines3", "tensorboard", "threadpoolctl", "torch"),
     ),
-    "train": ("cmaes", "matplotlib", "stable_baselines3", "tensorboard", "torch"),
+    "server": (
+        *("alembic", "fastapi", "jiter", "prometheus_client", "psycopg", "safetensors", "sqlalchemy"),
+        *("starlette", "uvicorn"),
+    ),
     "export": ("onnx", "onnxruntime", "onnxscript"),
     "render": ("imageio_ffmpeg", "moviepy", "PIL", "pygame"),
     "trackers": ("mlflow", "wandb"),

@@ -260,7 +260,6 @@ class Respecified:
 
     def __init__(self, environment: object, spec: EnvironmentSpec) -> None:
         self._spec = spec
-        self.wrapped = environment
         for name in ATTRIBUTES:
             if hasattr(environment, name):
                 setattr(self, name, getattr(environment, name))

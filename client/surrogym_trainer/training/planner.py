@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import cast
 
 import numpy as np
 
@@ -43,9 +42,9 @@ class Planner(PolicySearch):
 
 def _file_of(port: SurrogatePort) -> SurrogateFile:
     """Return the surrogate as a file without samples, which a planner does not need."""
-    if not hasattr(port, "model_file"):
+    if not isinstance(port, ModelPort):
         raise ValueError("algorithm PLANNER: expected a surrogate with a model, got an original environment")
-    spec, model = port.spec(), cast("ModelPort", port).model_file()
+    spec, model = port.spec(), port.model_file()
     states, none = np.zeros((0, len(spec.coordinates))), np.zeros(0, dtype=np.bool_)
     samples = RealSamples(states, np.zeros((0, spec.action.size)), states, np.zeros(0), none, none)
     return SurrogateFile("planner", spec, model, samples)

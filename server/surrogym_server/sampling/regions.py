@@ -35,23 +35,20 @@ class Region:
     share: float  # share of the total model uncertainty that lies in the region
 
 
-def regions_of(
-    definition: EnvironmentDefinition, points: Points, doubt: Tensor, names: Sequence[str] = ()
-) -> tuple[Region | None, ...]:
+def regions_of(definition: EnvironmentDefinition, points: Points, doubt: Tensor) -> tuple[Region | None, ...]:
     """Find, for each output, a range of one input in which most of the model uncertainty of this output lies.
 
     Args:
         definition: gives the names of the coordinates.
         points: the m points of the Monte Carlo set.
         doubt: model uncertainty 1 - C_m of each output at these points, (m, O).
-        names: names of the action's entries; if empty, they are called ``action`` or ``action 1``, ``action 2``...
 
     Returns:
         One region for each output. It is None if there is hardly any uncertainty, or if no range of a single input
         contains most of it.
     """
     entries = points.u.shape[1]
-    actions = names or (["action"] if entries == 1 else [f"action {i + 1}" for i in range(entries)])
+    actions = ["action"] if entries == 1 else [f"action {i + 1}" for i in range(entries)]
     inputs = torch.cat([points.q, points.u.to(points.q.dtype)], 1)
     every = [*(coordinate.name for coordinate in definition.coordinates), *actions]
     return tuple(_region(inputs, doubt[:, output], every) for output in range(doubt.shape[1]))

@@ -144,7 +144,7 @@ def test_a_training_by_planner_writes_a_file_that_any_reader_of_policies_runs(ha
     assert load_policy(result.path, result.algorithm)(shown).tolist() == hanging.planner(5, 3)(shown).tolist()
     assert result.settings["horizon"] == 5
     assert result.imagined_return < 0
-    assert words_of_result(result).startswith(f"{result.path}: 0 virtual steps in ")
+    assert words_of_result(result).startswith(f"{result.path}: made without training in ")
     with pytest.raises(UnusablePolicy, match="is a planner, which has no network"):
         load_learner(result.path, "PPO")
     with pytest.raises(NotDeployable, match="is a planner, which has no network; a deterministic feed-forward"):

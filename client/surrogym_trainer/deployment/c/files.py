@@ -51,16 +51,16 @@ class Vector:
     action: Array  # (F,) action that the controller must give, one number for each of F entries
 
 
-def vectors_of(controller: Controller, seed: int = 0) -> list[Vector]:
+def vectors_of(controller: Controller) -> list[Vector]:
     """Return the test vectors: random walks, ends of the sensors' ranges, and each kind of fault with steps after it.
 
     A measurement whose rounding to float32 would change the action, such as an angle at half a turn, is left out. If no
     measurement without a fault is left then, such measurements are kept: then float is not precise enough for this
     policy, and the test fails.
     """
-    vectors = _vectors_of(controller, np.random.default_rng(seed), only_steady=True)
+    vectors = _vectors_of(controller, np.random.default_rng(0), only_steady=True)
     if all(vector.status for vector in vectors):
-        return _vectors_of(controller, np.random.default_rng(seed), only_steady=False)
+        return _vectors_of(controller, np.random.default_rng(0), only_steady=False)
     return vectors
 
 

@@ -30,7 +30,7 @@ from surrogym_server.storage.sql import surrogates as surrogate_rows
 from surrogym_server.storage.sql.database import NOW, Database, conflict_insert, constant, damaged
 from surrogym_server.storage.sql.models import insert_model
 from surrogym_server.storage.sql.queries import IS_INCOMPLETE, begin_initial, insert_queries, queue_initial
-from surrogym_server.storage.sql.rows import append_event, checksum, find, hold, recall, remember, touch
+from surrogym_server.storage.sql.rows import append_event, checksum, find, hold, recall, remember, set_columns, touch
 from surrogym_server.storage.sql.surrogates import NO_RIGHT
 from surrogym_server.storage.sql.tables import occupancies, priors, queries, samples, surrogates
 from surrogym_shared.nouns import Query
@@ -144,7 +144,9 @@ class SqlDesigns(port.Designs):
             if row is None:
                 return None
             lease = FitLease(name, secrets.token_urlsafe(16), *row, expires=surrogate.now + seconds)
-            _update(connection, surrogate, fit_token=lease.token, fit_owner=owner, **_lasting(lease.expires, seconds))
+            set_columns(
+                connection, surrogate.id, fit_token=lease.token, fit_owner=owner, **_lasting(lease.expires, seconds)
+            )
             surrogate_rows.update_phase(connection, surrogate, "fitting", None)
             return lease
 
@@ -152,7 +154,7 @@ class SqlDesigns(port.Designs):
         with self._database.write() as connection:
             surrogate = _hold_right(connection, lease)
             renewed = replace(lease, expires=surrogate.now + seconds)
-            _update(connection, surrogate, **_lasting(renewed.expires, seconds))
+            set_columns(connection, surrogate.id, **_lasting(renewed.expires, seconds))
             return renewed
 
     def commit(self, lease: FitLease, design: NewDesign) -> int:
@@ -171,7 +173,7 @@ class SqlDesigns(port.Designs):
             except (LeaseExpired, UnknownSurrogate):
                 return
             changes = {} if error is None else {"fitted_revision": lease.revision}
-            _update(connection, surrogate, **NO_RIGHT, **changes)
+            set_columns(connection, surrogate.id, **NO_RIGHT, **changes)
             surrogate_rows.update_phase(connection, surrogate, _phase_after(surrogate, error), error)
 
 
@@ -211,14 +213,10 @@ def _hold_right(connection: Connection, lease: FitLease) -> Row[Any]:
     return surrogate
 
 
-def _update(connection: Connection, surrogate: Row[Any], **changes: Any) -> None:
-    connection.execute(sa.update(surrogates).where(surrogates.c.id == surrogate.id).values(**changes))
-
-
 def _finish(connection: Connection, surrogate: Row[Any], lease: FitLease, design: NewDesign) -> None:
-    _update(
+    set_columns(
         connection,
-        surrogate,
+        surrogate.id,
         **NO_RIGHT,
         state=design.state,
         phase=design.phase,

@@ -54,6 +54,11 @@ def hold(connection: Connection, name: str, *extra: sa.ColumnElement[Any]) -> Ro
     return row
 
 
+def set_columns(connection: Connection, surrogate: int, **values: Any) -> None:
+    """Set columns of the surrogate with the id ``surrogate``."""
+    connection.execute(sa.update(surrogates).where(surrogates.c.id == surrogate).values(**values))
+
+
 def within(table: sa.Table, span: Span) -> sa.ColumnElement[bool]:
     """Return the SQL condition that a row of a table belongs to a surrogate in a range of ids."""
     return table.c.surrogate_id.between(*span)

@@ -38,7 +38,7 @@ from surrogym_server.storage.records import (
 )
 from surrogym_server.storage.sql.database import NOW, Database, constant, damaged
 from surrogym_server.storage.sql.queries import Answered, insert_snapshots, read_answered, settle
-from surrogym_server.storage.sql.rows import Span, append_event, find, hold, recall, remember, touch
+from surrogym_server.storage.sql.rows import Span, append_event, find, hold, recall, remember, set_columns, touch
 from surrogym_server.storage.sql.tables import evaluations, leases, queries, samples, surrogates
 from surrogym_shared.nouns import RealSteps, Vector
 from surrogym_shared.states import SamplePurpose
@@ -251,7 +251,7 @@ def store_logged(
     new = [row | {"fingerprint": link} for row, link in zip(rows[old:], links[old:], strict=True)]
     ids = [stored_ids[link] for link in links[:old]] + insert_samples(connection, surrogate, sampler, new)
     if new:
-        _set(connection, surrogate, logged_revision=surrogates.c.revision + 1)
+        set_columns(connection, surrogate.id, logged_revision=surrogates.c.revision + 1)
     return AddedSamples(tuple(ids), old, digest=chain[-1])
 
 
@@ -274,10 +274,6 @@ def _continued(connection: Connection, surrogate: Row[Any], digest: str) -> bool
     follows = samples.c.fingerprint.startswith(f"{digest}:")
     statement = sa.select(samples.c.id).where(samples.c.surrogate_id == surrogate.id, follows).limit(1)
     return connection.execute(statement).first() is not None
-
-
-def _set(connection: Connection, surrogate: Row[Any], **changes: Any) -> None:
-    connection.execute(sa.update(surrogates).where(surrogates.c.id == surrogate.id).values(**changes))
 
 
 COUNTED = ("initial", "adaptive", "manual", "audit", "logged", "evaluation", "failed", "expired")

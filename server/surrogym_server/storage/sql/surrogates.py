@@ -36,6 +36,7 @@ from surrogym_server.storage.sql.rows import (
     REMOVED,
     append_event,
     hold,
+    set_columns,
     touch,
     unknown_surrogate,
 )
@@ -210,7 +211,7 @@ def withdraw_unbegun(
     unbegun = is_unbegun(surrogate.id)
     statement = sa.delete(queries).where(unbegun, queries.c.purpose == "adaptive")
     withdrawn = connection.execute(statement.returning(queries.c.steps, queries.c.extra)).all()
-    connection.execute(sa.update(surrogates).where(surrogates.c.id == surrogate.id).values(**NO_RIGHT))
+    set_columns(connection, surrogate.id, **NO_RIGHT)
     changes = {"phase": resting_phase(surrogate.round)} if surrogate.phase == "fitting" else {}
     if budget is None:
         again = sum(row.steps for row in withdrawn if row.extra)
@@ -245,7 +246,7 @@ def _apply(connection: Connection, surrogate: Row[Any], changes: dict[str, Any])
     if changes.keys() - {"paused"}:
         touch(connection, surrogate, **changes)
     else:
-        connection.execute(sa.update(surrogates).where(surrogates.c.id == surrogate.id).values(**changes))
+        set_columns(connection, surrogate.id, **changes)
 
 
 # Fields of a summary that are columns of the table of surrogates.
@@ -365,8 +366,7 @@ def _take_name(connection: Connection, name: str) -> int:
     for table in metadata.tables.values():
         if AT_ONCE in table.info:
             connection.execute(sa.delete(table).where(table.c.surrogate_id == id))
-    gone = {"name": f"{REMOVED}{id}", "paused": True, **NO_RIGHT}
-    connection.execute(sa.update(surrogates).where(surrogates.c.id == id).values(**gone))
+    set_columns(connection, id, name=f"{REMOVED}{id}", paused=True, **NO_RIGHT)
     return id
 
 

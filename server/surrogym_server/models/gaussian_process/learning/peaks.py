@@ -48,12 +48,6 @@ RESOLUTION = 1e-3
 GAIN = 3.0
 
 
-def hides(reward: Tensor) -> bool:
-    """Return whether a peak may be hidden: all rewards (n,) are zero, or many are nearly zero compared with the
-    largest."""
-    return bool((reward == 0).all()) or any(True for _ in _bases(reward))
-
-
 def with_peak(
     learner: OutputLearner, reward: Tensor, inputs: Mapping[FeatureMap, Tensor], going: Tensor, plain: OutputModel
 ) -> OutputModel:

@@ -27,7 +27,6 @@ from surrogym_server.models.abilities import OutputOutlook, PathOutlook, Predict
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 
 BLOCK = 4_000_000  # greatest number of covariances computed at once
-ROUNDING = 1e-12
 SMALLEST = 1e-300  # slopes are divided by the largest slope, or by this if all are 0
 
 
