@@ -25,7 +25,7 @@ print(json.dumps({name: getattr(module, "__file__", None) for name, module in sy
 
 
 @pytest.mark.parametrize("transport", ["stream", "binary", "json"])
-def test_a_stepped_surrogate_loads_few_lines_and_no_original_environment(pendulum_server, transport: str) -> None:
+def test_a_stepped_surrogate_loads_few_lines_no_original_environment_and_no_logs(pendulum_server, transport: str) -> None:
     environment = {**os.environ, "SURROGYM_URL": pendulum_server.url}
     ran = subprocess.run(
         [sys.executable, "-c", STEPPED, transport], env=environment, capture_output=True, text=True, check=True
@@ -38,6 +38,7 @@ def test_a_stepped_surrogate_loads_few_lines_and_no_original_environment(pendulu
     client = {name.split(".")[1] for name in ours if name.startswith("surrogym_client.")}
     assert client <= {"environments", "transport", "errors", "registration", "runtime"}
     assert not [name for name in NEVER if name in files]
+    assert not [name for name in ours if name.startswith("surrogym_shared.logs")]
 
 
 def _lines(file: str) -> int:
