@@ -25,7 +25,9 @@ print(json.dumps({name: getattr(module, "__file__", None) for name, module in sy
 
 
 @pytest.mark.parametrize("transport", ["stream", "binary", "json"])
-def test_a_stepped_surrogate_loads_few_lines_no_original_environment_and_no_logs(pendulum_server, transport: str) -> None:
+def test_a_stepped_surrogate_loads_few_lines_no_original_environment_and_no_logs(
+    pendulum_server, transport: str
+) -> None:
     environment = {**os.environ, "SURROGYM_URL": pendulum_server.url}
     ran = subprocess.run(
         [sys.executable, "-c", STEPPED, transport], env=environment, capture_output=True, text=True, check=True

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from surrogym_sampler.original.classic import cartpole, pendulum
-from surrogym_trainer.report.coverage import CELLS, columns_shown, coverage_of
-from surrogym_trainer.report.figures import draw_coverage
+from surrogym_trainer.coverage import CELLS, columns_shown, coverage_of
+from surrogym_trainer.figures import draw_coverage
 
 
 def steps(speeds: tuple[float, float], rows: int = 4_000) -> tuple[np.ndarray, np.ndarray]:

@@ -17,9 +17,10 @@ from support.server import ServerProcess
 from surrogym_client.transport import Api
 from surrogym_shared import wire
 from surrogym_shared.spec import Inequality, Success, Term
-from surrogym_trainer.report.coverage import Cut
+from surrogym_trainer.coverage import Cut
+from surrogym_trainer.policies.evidence import chosen_real
 from surrogym_trainer.report.decision import cost, criterion, decision, original, outcome, share
-from surrogym_trainer.report.known import Known, chosen_real, chosen_reference, chosen_without
+from surrogym_trainer.report.known import Known, chosen_reference, chosen_without
 from surrogym_trainer.report.page import NoPdf, as_pdf
 
 SEED = 10_000

@@ -16,8 +16,8 @@ import pytest
 from support.server import ServerProcess
 from surrogym_client.transport import Api
 from surrogym_shared.wire import PrequentialScores
-from surrogym_trainer.report.coverage import Cut, cuts
-from surrogym_trainer.report.figures import draw_fidelity, svg
+from surrogym_trainer.coverage import Cut, cuts
+from surrogym_trainer.figures import draw_fidelity, svg
 from surrogym_trainer.report.known import Known
 from surrogym_trainer.report.page import page
 

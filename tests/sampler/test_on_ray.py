@@ -15,7 +15,8 @@ from support.moody import SPEC
 from surrogym.cli.sampling_on_ray import run_samplers
 from surrogym_client.transport import Api
 from surrogym_sampler.queries import SamplerSettings
-from surrogym_sampler.queries.on_ray import RaySamplers, SamplerActor, SamplerPlan
+from surrogym_sampler.queries.on_ray import RaySamplers, SamplerActor
+from surrogym_sampler.queries.settings import SamplerPlan
 from surrogym_shared.spec import Design
 
 ray = pytest.importorskip("ray")

@@ -13,7 +13,9 @@ import typer
 from surrogym.cli.errors import CommandError
 
 if TYPE_CHECKING:
-    from surrogym_sampler.queries.on_ray import Line, RaySamplers, SamplerPlan
+    from surrogym_sampler.queries.on_ray import RaySamplers
+    from surrogym_sampler.queries.settings import SamplerPlan
+    from surrogym_sampler.queries.words import Line
 
 ROOM_SECONDS = 30.0  # if samplers have not started after this number of seconds, a remark says so
 

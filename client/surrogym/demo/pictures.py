@@ -14,7 +14,7 @@ from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import SampleView, SurrogateView
 from surrogym_shared.words import counted
 from surrogym_trainer.evaluation.evaluator import Evaluation
-from surrogym_trainer.report.figures import WIDTH, draw_samples, with_unit
+from surrogym_trainer.figures import WIDTH, draw_samples, with_unit
 
 
 def draw_all(

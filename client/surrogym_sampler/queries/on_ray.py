@@ -16,9 +16,9 @@ from surrogym_client.errors import SurrogymClientError
 from surrogym_client.transport.api import Api
 from surrogym_sampler.original.errors import OriginalError
 from surrogym_sampler.original.loading import for_queries
-from surrogym_sampler.queries.settings import Outcome, SamplerReport, SamplerSettings
+from surrogym_sampler.queries.settings import Outcome, SamplerPlan, SamplerReport
+from surrogym_sampler.queries.words import Line, line_of
 from surrogym_sampler.queries.worker import Sampler
-from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import Query
 
 IDLE_SECONDS = 5.0  # longest wait of a claim for queries; a sampler can stop only between claims
@@ -29,42 +29,6 @@ WITHOUT_CODE = (
     "; install it on each machine of the cluster, or bring it by --runtime-env FILE, a YAML file with working_dir: ."
 )
 OF_STEPS = ("steps", "fallback_steps")  # fields of a report that count steps; those that count queries are outcomes
-
-
-@dataclass(frozen=True)
-class SamplerPlan:
-    """What a sampler in a cluster needs to work; it is sent to the machines of the cluster.
-
-    Attributes:
-        url: the server's address.
-        token: the server's access token.
-        surrogate: name of the surrogate.
-        environment: name of the environment, such as a Gymnasium id or ``package.module:factory``; its modules must be
-            importable on the machines.
-        spec: a specification that replaces the environment's own; None keeps the own one.
-        step_limit: seconds that one real step may take.
-        settings: settings of the sampler.
-        fallback: program of the fallback that the specification's limits name, as NAME=package.module:function.
-        version: version of surrogym, which must be the same on all machines.
-    """
-
-    url: str
-    token: str | None = field(repr=False)
-    surrogate: str
-    environment: str
-    spec: EnvironmentSpec | None
-    step_limit: float
-    settings: SamplerSettings
-    fallback: str | None = None
-    version: str = field(default_factory=lambda: version("surrogym"))
-
-
-@dataclass(frozen=True)
-class Line:
-    """A line of output about one answered or failed query."""
-
-    text: str
-    is_error: bool
 
 
 @dataclass(frozen=True)
@@ -92,12 +56,6 @@ class Ended:
 
     look: Look
     error: str | None = None
-
-
-def line_of(query: Query, outcome: Outcome, error: str) -> str:
-    """Return a line of output about the outcome of a query; ``error`` is empty if there was none."""
-    asked = f", {len(query.actions)} steps" if query.kind == "rollout" else ""
-    return f"query {query.id} ({query.purpose}{asked}) {outcome}{': ' if error else ''}{error}"
 
 
 class SamplerActor:

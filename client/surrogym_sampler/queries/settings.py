@@ -1,14 +1,16 @@
-"""The settings of a sampler, and the report of its run."""
+"""The settings of a sampler, what it needs to work, and the report of its run."""
 
 from __future__ import annotations
 
 import os
 import socket
 from dataclasses import dataclass, field
+from importlib.metadata import version
 from pathlib import Path
 from typing import Literal
 
 from surrogym_sampler.queries.snapshots import Bounds
+from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import QUERY_LEASE_SECONDS, Phase
 
 Outcome = Literal["answered", "failed", "dropped", "refused", "impossible"]
@@ -46,6 +48,34 @@ class SamplerSettings:
     time_limit: float | None = None
     snapshots: Path | None = None
     bounds: Bounds = field(default_factory=Bounds)
+
+
+@dataclass(frozen=True)
+class SamplerPlan:
+    """What a sampler needs to work. The samplers of a cluster get it on their machines.
+
+    Attributes:
+        url: the server's address.
+        token: the server's access token.
+        surrogate: name of the surrogate.
+        environment: name of the environment, such as a Gymnasium id or ``package.module:factory``; its modules must be
+            importable on the machines.
+        spec: a specification that replaces the environment's own; None keeps the own one.
+        step_limit: seconds that one real step may take.
+        settings: settings of the sampler.
+        fallback: program of the fallback that the specification's limits name, as NAME=package.module:function.
+        version: version of surrogym, which must be the same on all machines.
+    """
+
+    url: str
+    token: str | None = field(repr=False)
+    surrogate: str
+    environment: str
+    spec: EnvironmentSpec | None
+    step_limit: float
+    settings: SamplerSettings
+    fallback: str | None = None
+    version: str = field(default_factory=lambda: version("surrogym"))
 
 
 @dataclass(frozen=True)

@@ -1,13 +1,30 @@
-"""Description of a query in lines of text: the state where it begins, and a bar for the size of each action."""
+"""Descriptions of queries in lines of text: where a query begins and a bar for the size of each action, and the outcome
+of a query."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
+from surrogym_sampler.queries.settings import Outcome
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import Query, QueryView
 
 BARS = "▁▂▃▄▅▆▇█"  # bars for the values of an action entry, from the lowest to the highest
+
+
+@dataclass(frozen=True)
+class Line:
+    """A line of output about one answered or failed query."""
+
+    text: str
+    is_error: bool
+
+
+def line_of(query: Query, outcome: Outcome, error: str) -> str:
+    """Return a line of output about the outcome of a query; ``error`` is empty if there was none."""
+    asked = f", {len(query.actions)} steps" if query.kind == "rollout" else ""
+    return f"query {query.id} ({query.purpose}{asked}) {outcome}{': ' if error else ''}{error}"
 
 
 def words_of_query(spec: EnvironmentSpec, query: Query | QueryView) -> list[str]:

@@ -1,11 +1,16 @@
-"""The evidence that a policy's card has for its real return: the promise (a predicted interval) and the audit (real
-steps)."""
+"""The evidence for a policy's real return: the promise (a predicted interval) and the audit (real steps) of its card,
+and its real episodes."""
 
 from __future__ import annotations
+
+from typing import TYPE_CHECKING
 
 from pydantic import BaseModel, ConfigDict
 
 from surrogym_shared.kinds import Side
+
+if TYPE_CHECKING:
+    from surrogym_shared.wire import EvaluationView, PolicyView
 
 
 class FallbackShare(BaseModel):
@@ -108,3 +113,10 @@ class Audit(BaseModel):
     before: Promise
     after: Promise
     range_left: RangeLeft | None = None
+
+
+def chosen_real(policy: PolicyView) -> EvaluationView | None:
+    """Return the newest evaluation of the policy in the surrogate's own environment: from the declared starts, or else
+    from other ones; None if there is none."""
+    own = [one for one in policy.evaluations if one.controller == "policy" and one.own]
+    return next((one for one in reversed(own) if one.declared), own[-1] if own else None)

@@ -44,8 +44,8 @@ from surrogym_shared.wire import (
     SurrogateView,
 )
 from surrogym_shared.words import counted
-from surrogym_trainer.report.coverage import Cut
-from surrogym_trainer.report.figures import WIDTH, svg, with_unit
+from surrogym_trainer.coverage import Cut
+from surrogym_trainer.figures import WIDTH, svg, with_unit
 from surrogym_trainer.report.html import bullets, moving, on_screen, paragraph, picture, section, table
 from surrogym_trainer.report.known import PREFERRED, Known
 

@@ -22,8 +22,9 @@ from surrogym_shared.wire import (
     SampleView,
     SurrogateView,
 )
+from surrogym_trainer.coverage import Cut, cuts
 from surrogym_trainer.policies.controller_check import StoredCheck, UnusableCheck, read_check
-from surrogym_trainer.report.coverage import Cut, cuts
+from surrogym_trainer.policies.evidence import chosen_real
 
 PREFERRED = "production"
 VIDEOS: dict[PolicyForm, str] = {"mp4": "video/mp4", "gif": "image/gif"}
@@ -148,13 +149,6 @@ def cuts_of(api: Api, known: Known) -> tuple[list[Cut], str]:
         return cuts(known.view, partial(api.query_uncertainty, known.view.name)), ""
     except NotInstalled as error:
         return [], str(error)
-
-
-def chosen_real(policy: PolicyView) -> EvaluationView | None:
-    """Return the newest evaluation of the policy in the surrogate's own environment: from the declared starts, or else
-    from other ones; None if there is none."""
-    own = [one for one in policy.evaluations if one.controller == "policy" and one.own]
-    return next((one for one in reversed(own) if one.declared), own[-1] if own else None)
 
 
 def chosen_without(policy: PolicyDetail, real: EvaluationView | None) -> EvaluationView | None:

@@ -20,10 +20,10 @@ from surrogym_client.surrogates.waiting import IN_WORDS
 from surrogym_shared.limits import words_of_steps
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import ModelView, OutputFidelity, Phase, SampleView, SurrogateView
+from surrogym_trainer.coverage import Cut, coverage_of
+from surrogym_trainer.figures import draw_coverage, draw_fidelity, draw_maps, draw_samples, svg
 from surrogym_trainer.policies.controller_check import StoredCheck
-from surrogym_trainer.report.coverage import Cut, coverage_of
 from surrogym_trainer.report.decision import decision
-from surrogym_trainer.report.figures import draw_coverage, draw_fidelity, draw_maps, draw_samples, svg
 from surrogym_trainer.report.html import document, picture, rows, section, table
 from surrogym_trainer.report.known import Known
 

@@ -188,8 +188,8 @@ def _import_log(context: typer.Context, file: Path, log: OfLogs, wait: float, se
 
 def _draw(log: ReadLog, file: Path) -> None:
     """Draw to a file how much of the sampling range a log covers."""
-    from surrogym_trainer.report.coverage import coverage_of
-    from surrogym_trainer.report.figures import draw_coverage
+    from surrogym_trainer.coverage import coverage_of
+    from surrogym_trainer.figures import draw_coverage
 
     draw_coverage(coverage_of(log.spec, log.steps.q, log.steps.u)).savefig(file, dpi=150)
 
@@ -250,7 +250,7 @@ def _as_json(imported: Imported, view: SurrogateView | None) -> dict[str, Any]:
 def _covered(log: ReadLog) -> dict[str, float]:
     """Return how much of the sampling range a log covers, for each pair of coordinates or action entries: the share of
     the cells of a grid in which the log has steps."""
-    from surrogym_trainer.report.coverage import coverage_of
+    from surrogym_trainer.coverage import coverage_of
 
     coverage = coverage_of(log.spec, log.steps.q, log.steps.u)
     return {" by ".join(coverage.names[i] for i in pair): coverage.share(pair) for pair in coverage.counts}
@@ -258,7 +258,7 @@ def _covered(log: ReadLog) -> dict[str, float]:
 
 def _words(file: Path, imported: Imported, view: SurrogateView | None) -> list[str]:
     from surrogym_shared.words import counted, has
-    from surrogym_trainer.report.coverage import coverage_of
+    from surrogym_trainer.coverage import coverage_of
 
     log = imported.log
     lines = [f"{file}: {counted(len(log.table), 'row')}, {counted(len(log.steps), 'step')}"]

@@ -47,7 +47,7 @@ def _table(rows: Sequence[tuple[str, PolicyView]]) -> str:
 
 
 def _row(name: str, policy: PolicyView) -> tuple[str, ...]:
-    from surrogym_trainer.report.known import chosen_real
+    from surrogym_trainer.policies.evidence import chosen_real
 
     real = chosen_real(policy)
     promise, trusted = policy.promise, {True: "yes", False: "no", None: "not judged"}[policy.trusted]

@@ -29,8 +29,8 @@ from surrogym.cli.sampling_on_ray import RayOptions
 
 if TYPE_CHECKING:
     from surrogym_client.transport.api import Api
-    from surrogym_sampler.queries.on_ray import Line, SamplerPlan
-    from surrogym_sampler.queries.settings import Outcome, SamplerReport, SamplerSettings
+    from surrogym_sampler.queries.settings import Outcome, SamplerPlan, SamplerReport, SamplerSettings
+    from surrogym_sampler.queries.words import Line
     from surrogym_shared.spec import EnvironmentSpec
     from surrogym_shared.wire import Phase, Query, SurrogateView
 
@@ -139,8 +139,7 @@ def command(
     Example: surrogym sample cart --env cart:Cart --on-ray 32 --ray-resources CPU=2 --runtime-env env.yaml
     """
     from surrogym_client.runtime.lifetime import exit_with_parent as watch_parent
-    from surrogym_sampler.queries.on_ray import SamplerPlan
-    from surrogym_sampler.queries.settings import SamplerSettings, worker_name
+    from surrogym_sampler.queries.settings import SamplerPlan, SamplerSettings, worker_name
     from surrogym_sampler.queries.snapshots import Bounds
 
     cluster.require_fit(worker_limits=once or max_queries is not None)
@@ -208,7 +207,7 @@ def _sample_here(
 ) -> None:
     from surrogym_client.runtime.lifetime import terminations
     from surrogym_sampler.original.loading import for_queries
-    from surrogym_sampler.queries.on_ray import Line, line_of
+    from surrogym_sampler.queries.words import Line, line_of
     from surrogym_sampler.queries.worker import Sampler
     from surrogym_shared.terminal import on_interrupt, say
 

@@ -18,7 +18,7 @@ from matplotlib.ticker import MaxNLocator
 
 from surrogym_shared.spec import Coordinate, limits
 from surrogym_shared.wire import ModelView, OutputFidelity, SampleView, SurrogateView
-from surrogym_trainer.report.coverage import Coverage, Cut, columns_shown, pairs
+from surrogym_trainer.coverage import Coverage, Cut, columns_shown, pairs
 
 COLOURS = {"logged": "#8c8c8c", "initial": "#4c72b0", "adaptive": "#dd8452", "manual": "#55a868", "audit": "#c44e52"}
 WIDTH = 6.0  # width of a figure in inches
