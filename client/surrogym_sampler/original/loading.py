@@ -260,7 +260,7 @@ class Respecified:
 
     def __init__(self, environment: object, spec: EnvironmentSpec) -> None:
         self._spec = spec
-        self.wrapped = environment  # ``priors.calibration`` finds the environment among the attributes
+        self.wrapped = environment  # ``priors.calibration`` reads this attribute
         for name in ATTRIBUTES:
             if hasattr(environment, name):
                 setattr(self, name, getattr(environment, name))
