@@ -58,6 +58,15 @@ def read_entries(zipped: Path | bytes, limit: int) -> dict[str, bytes]:
         return {entry.filename: _content(archive, entry) for entry in archive.infolist()}
 
 
+def has_entry(path: Path, name: str) -> bool:
+    """Whether a file is a zip file with an entry of this name."""
+    try:
+        with zipfile.ZipFile(path) as file:
+            return name in file.namelist()
+    except (OSError, zipfile.BadZipFile):
+        return False
+
+
 def stored(entries: Mapping[str, bytes]) -> bytes:
     """Return an uncompressed zip file with these entries, given as contents by name."""
     file = io.BytesIO()

@@ -150,11 +150,9 @@ class Network:
     @staticmethod
     def is_at(path: Path) -> bool:
         """Whether a file is a zip file with the header that ``save`` writes."""
-        try:
-            with zipfile.ZipFile(path) as file:
-                return HEAD in file.namelist()
-        except (OSError, zipfile.BadZipFile):
-            return False
+        from surrogym_shared.archives import has_entry
+
+        return has_entry(path, HEAD)
 
 
 def forward(layers: Sequence[Layer], activation: Activation, x: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:

@@ -11,7 +11,7 @@ from typing import Literal, Self
 from pydantic import BaseModel, ValidationError
 
 from surrogym_client.environments.file_factories import open_file
-from surrogym_shared.archives import read_entries
+from surrogym_shared.archives import has_entry, read_entries
 from surrogym_shared.faults import first_fault
 from surrogym_shared.port import PlanningPort
 from surrogym_shared.surrogate_file import MAX_FILE_BYTES, PLANNER_HEAD
@@ -58,11 +58,7 @@ class PlannerFile:
     @staticmethod
     def is_at(path: Path) -> bool:
         """Whether a file is a zip file with the header that ``save`` writes."""
-        try:
-            with zipfile.ZipFile(path) as file:
-                return PLANNER_HEAD in file.namelist()
-        except (OSError, zipfile.BadZipFile):
-            return False
+        return has_entry(path, PLANNER_HEAD)
 
     def acting(self) -> Predict:
         """Return the planner as a function from observations to actions. This computes its values, in some seconds.
