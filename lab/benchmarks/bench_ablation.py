@@ -59,7 +59,7 @@ from surrogym_sampler.original import RealStep, make
 from surrogym_sampler.original.describing import describe
 from surrogym_sampler.original.rollouts import answering
 from surrogym_server.convert import definition_from_spec
-from surrogym_server.environment.definition import REWARD, EnvironmentDefinition, wrap
+from surrogym_server.environment.definition import EnvironmentDefinition, wrap
 from surrogym_server.environment.distributions import scaling
 from surrogym_server.environment.features import FeatureMap
 from surrogym_server.environment.samples import Samples
@@ -71,7 +71,7 @@ from surrogym_server.models.gaussian_process.prediction.several import Functions
 from surrogym_server.sampling import design, judging
 from surrogym_server.sampling.latin_hypercube import going_on, random_points
 from surrogym_server.sampling.rollouts import random_sequences
-from surrogym_shared.spec import Bounds, DeclaredReward, Design, DiscreteAction, EnvironmentSpec, Reward
+from surrogym_shared.spec import REWARD, Bounds, DeclaredReward, Design, DiscreteAction, EnvironmentSpec, Reward
 
 SIZES, MANY, BUDGET = (20, 40, 100), (400, 2_300), 100
 UNSEEN, UNSEEN_SEED, LONGEST = 500, 4_099, 50  # unseen steps, and the longest of their rollouts

@@ -56,7 +56,7 @@ from torch import Tensor
 from support.models import gaussian_processes
 from surrogym.demo.tasks import TASKS as DEMOS
 from surrogym_sampler.original import make
-from surrogym_server.environment.definition import REWARD, EnvironmentDefinition
+from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.features import features
 from surrogym_server.environment.samples import Samples, increments
 from surrogym_server.errors import NumericalFailure
@@ -65,6 +65,7 @@ from surrogym_server.gp.search import Evidence, minimum
 from surrogym_server.models.gaussian_process.feature_maps import CENTRED
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 from surrogym_server.plugins import Choice
+from surrogym_shared.spec import REWARD
 
 MOVED = 0.9  # correlation of a coordinate's change with another coordinate, by which the two are mirrored together
 MOST_GROUPS = 8

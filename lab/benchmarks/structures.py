@@ -14,7 +14,7 @@ from torch import Tensor
 
 from support.real_steps import arrays, join
 from surrogym_server.convert import definition_from_spec
-from surrogym_server.environment.definition import REWARD, EnvironmentDefinition, wrap
+from surrogym_server.environment.definition import EnvironmentDefinition, wrap
 from surrogym_server.environment.features import encode, features, leading
 from surrogym_server.environment.samples import Samples, increments
 from surrogym_server.gp import FitOptions, Fitted, Reflection, condition, fit
@@ -27,7 +27,7 @@ from surrogym_server.sampling.design import advance, initial_queries
 from surrogym_server.sampling.latin_hypercube import going_on, latin_hypercube, random_points
 from surrogym_server.sampling.prequential import half_width
 from surrogym_server.sampling.state import DesignState, Request
-from surrogym_shared.spec import Design, Reward
+from surrogym_shared.spec import REWARD, Design, Reward
 
 UNSEEN, UNSEEN_SEED, BUDGET = 500, 99, 100
 CHOSEN = 3.0  # nats of evidence by which a structure other than fewer inputs must win

@@ -11,6 +11,8 @@ from pydantic import Field
 SHOWN = 40  # a message shows at most this many characters of a wrong value
 # A specification may have numbers up to this size, and ranges down to this width, so that products of them stay finite.
 LARGEST, NARROWEST = 1e12, 1e-12
+# Largest absolute value of a number in a sample; with larger ones a variance overflows, and no fit is possible.
+MAX_MEASURED = 1e30
 RESOLUTION = 1e-9  # smallest width of a range, as a share of its larger end: below it, rounding errors dominate
 
 Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST, allow_inf_nan=False, strict=True)]

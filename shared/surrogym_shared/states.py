@@ -1,6 +1,6 @@
 """Types of the phases of a design, of the purposes of queries and samples, and of kinds and statuses."""
 
-from typing import Literal
+from typing import Literal, get_args
 
 Phase = Literal["collecting", "fitting", "sampling", "ready", "over_budget", "unsure", "from_log", "failed"]
 """Phase of a design of queries."""
@@ -17,6 +17,12 @@ Purpose = Literal["initial", "adaptive", "manual", "audit"]
 
 SamplePurpose = Literal["initial", "adaptive", "manual", "audit", "logged"]
 """Why the real step of a sample was taken: the purpose of its query, or ``logged``."""
+
+# Purposes of real steps, by which the ledger counts them.
+PURPOSES: tuple[str, ...] = (*get_args(SamplePurpose), "evaluation")
+# All audits (tests of trained policies) of a surrogate may take this many real steps even if its budget is smaller:
+# three audits of 40 steps.
+LEAST_AUDITED = 128
 
 QueryKind = Literal["step", "rollout"]
 QueryStatus = Literal["pending", "leased", "answered", "set_aside", "refused"]

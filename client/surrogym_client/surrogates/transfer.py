@@ -11,11 +11,11 @@ import numpy as np
 
 from surrogym_client.errors import SpecConflict, SurrogymClientError
 from surrogym_client.transport.api import Api
+from surrogym_shared.states import PURPOSES
 from surrogym_shared.surrogate_file import RealSamples, SurrogateFile
 from surrogym_shared.wire import NewSample, SurrogateView
 
 BATCH = 1_024  # largest number of samples in one request
-PURPOSES = ("initial", "adaptive", "manual", "audit", "logged", "evaluation")
 
 
 class NotImportable(SurrogymClientError):

@@ -76,6 +76,10 @@ class Retries:
             delay = min(self.longest_delay, delay * self.factor)
 
 
+ONE_ATTEMPT = Retries(seconds=0)  # for requests that are repeated later anyway
+AWAY = (ServerUnreachable, Unavailable)  # errors after which a later attempt may succeed
+
+
 class Connection:
     """Sends requests to one server. It is safe to share between threads, and a pickled copy opens its own connection.
 

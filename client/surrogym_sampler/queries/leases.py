@@ -8,13 +8,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Self
 
-from surrogym_client.errors import ServerUnreachable, SurrogymClientError, Unavailable
+from surrogym_client.errors import SurrogymClientError
 from surrogym_client.transport.api import Api
-from surrogym_client.transport.connection import Retries
+from surrogym_client.transport.connection import AWAY, ONE_ATTEMPT
 from surrogym_shared.wire import Query
 
-AWAY = (ServerUnreachable, Unavailable)
-ONE_ATTEMPT = Retries(seconds=0)  # no retries, for renewals and early claims, which are repeated later anyway
 NEARLY_OVER = 0.1  # a lease counts as nearly over if at most this share of it is left
 
 

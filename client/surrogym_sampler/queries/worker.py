@@ -14,7 +14,7 @@ import numpy as np
 from surrogym_client.errors import InvalidInput, LeaseExpired, NotThere
 from surrogym_client.surrogates.waiting import ENDED
 from surrogym_client.transport.api import Api
-from surrogym_client.transport.connection import Retries
+from surrogym_client.transport.connection import AWAY, ONE_ATTEMPT, Retries
 from surrogym_sampler.original.errors import QueryRefused, SnapshotGone, StepFailed, StepRefused, message_of
 from surrogym_sampler.original.protocol import (
     Environment,
@@ -23,7 +23,7 @@ from surrogym_sampler.original.protocol import (
 )
 from surrogym_sampler.original.rollouts import answering
 from surrogym_sampler.queries.failures import Failures, Violations
-from surrogym_sampler.queries.leases import AWAY, ONE_ATTEMPT, LeaseEnded, Leases
+from surrogym_sampler.queries.leases import LeaseEnded, Leases
 from surrogym_sampler.queries.pipeline import Pipeline
 from surrogym_sampler.queries.query_limits import check_environment, check_query
 from surrogym_sampler.queries.returning import Returning, snapshots_of

@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from surrogym_shared import wire
+from surrogym_shared.checks import MAX_MEASURED
 from surrogym_shared.logs.drafting import wrapped
-from surrogym_shared.logs.table import MAX_MEASURED
 from surrogym_shared.logs.writing import EVALUATED, npz_of_steps
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import NewSample

@@ -16,6 +16,7 @@ from surrogym_client.transport.api import Api
 from surrogym_sampler.original.actions import decode_actions
 from surrogym_sampler.original.protocol import LONGEST_EPISODE
 from surrogym_shared.port import SurrogatePort
+from surrogym_shared.states import LEAST_AUDITED
 from surrogym_shared.wire import QueryView, SampleView, SurrogateView
 from surrogym_trainer.evaluation.audit import (
     AUDIT_STEPS,
@@ -43,9 +44,6 @@ from surrogym_trainer.evaluation.systematic import Inputs
 from surrogym_trainer.policies.evidence import Audit, Promise
 from surrogym_trainer.policies.predict import Predict
 
-# all audits (real steps that test the model) of a surrogate together may take this number of real steps, or as many as
-# its budget if that is larger
-LEAST_AUDITED = 128
 MOST_AUDITS = 3  # largest number of audits in one training
 WAY_LANES = 16  # an audit takes real steps at states from this number of virtual episodes of the policy
 # at most this number of steps of each virtual episode is compared with the log from which the model was learned

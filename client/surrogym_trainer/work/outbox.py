@@ -11,8 +11,9 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from surrogym_client.errors import LeaseExpired, ServerUnreachable, SurrogymClientError, Unavailable
+from surrogym_client.errors import LeaseExpired, SurrogymClientError
 from surrogym_client.transport.api import Api
+from surrogym_client.transport.connection import AWAY
 from surrogym_shared import wire
 from surrogym_shared.faults import first_fault
 from surrogym_trainer.policies.card import UnusablePolicy
@@ -21,7 +22,6 @@ from surrogym_trainer.policies.pushing import push
 ENDING = ".waiting.json"
 REFUSED = ".refused.json"
 MAX_BYTES = 64 * 1024 * 1024
-AWAY = (ServerUnreachable, Unavailable)
 FILE_NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,199}$"  # pattern of the name of a policy's file, without a folder
 VIDEO_NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,195}\.(mp4|gif)$"
 

@@ -10,16 +10,14 @@ from dataclasses import dataclass, field, replace
 from types import TracebackType
 from typing import Self
 
-from surrogym_client.errors import ServerUnreachable, SurrogymClientError, Unavailable
+from surrogym_client.errors import SurrogymClientError
 from surrogym_client.transport.api import Api
-from surrogym_client.transport.connection import Retries
+from surrogym_client.transport.connection import AWAY, ONE_ATTEMPT
 from surrogym_shared import wire
 from surrogym_trainer.policies.pushing import thinned
 from surrogym_trainer.training import TrainProgress
 from surrogym_trainer.training.settings import ProgressEstimate
 
-AWAY = (ServerUnreachable, Unavailable)
-ONE_ATTEMPT = Retries(seconds=0)  # no retries, because the next report repeats a failed one
 REPORT_SECONDS = 1.0  # seconds between two reports of a running job
 
 

@@ -12,11 +12,12 @@ from surrogym_client.errors import SurrogymClientError
 from surrogym_client.runtime.versions import missing
 from surrogym_client.transport import HttpSurrogate
 from surrogym_client.transport.api import Api
+from surrogym_client.transport.connection import AWAY
 from surrogym_sampler.original.errors import OriginalError
 from surrogym_sampler.queries.settings import worker_name
 from surrogym_sampler.queries.worker import PATIENCE
 from surrogym_shared import wire
-from surrogym_trainer.work.outbox import AWAY, Outbox, Waiting, in_one_line
+from surrogym_trainer.work.outbox import Outbox, Waiting, in_one_line
 from surrogym_trainer.work.reporter import Reporter, Stand
 from surrogym_trainer.work.tasks import Environment, Gathered, run_episodes, train
 from surrogym_trainer.work.words import words_of_task

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, get_args
 
 from fastapi import APIRouter, Request
 from fastapi.responses import Response
@@ -28,6 +28,7 @@ from surrogym_server.engine.tallies import Durations
 from surrogym_server.services.metrics import ProcessMetrics
 from surrogym_server.storage.records import SurrogateSummary
 from surrogym_shared.codes import Code
+from surrogym_shared.states import PURPOSES, QueryStatus
 
 router = APIRouter(tags=["service"], route_class=DoorRoute)
 
@@ -100,8 +101,7 @@ def _durations(name: str, text: str, durations: Durations) -> Metric:
 
 Series = Iterable[tuple[str, float]]  # pairs of a label's value and the metric's value
 
-PURPOSES = ("initial", "adaptive", "manual", "audit", "logged", "evaluation")
-STATUSES = ("pending", "leased", "answered", "set_aside", "refused")
+STATUSES = get_args(QueryStatus)
 
 
 @dataclass(frozen=True)

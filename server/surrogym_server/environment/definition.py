@@ -28,6 +28,7 @@ from surrogym_shared.kinds import RewardTiming
 from surrogym_shared.presets import InputProbability, Moves, Stopping, Tolerance
 from surrogym_shared.rates import Rate
 from surrogym_shared.spec import (
+    REWARD,
     Action,
     Coordinate,
     DeclaredReward,
@@ -38,7 +39,6 @@ from surrogym_shared.spec import (
     limits,
 )
 
-REWARD = "reward"
 REACH = 1e6  # a prediction without a bound is clipped at this many widths of the sampling range beyond that range
 SCALING_POINTS = 4_096  # mean and standard deviation of the observation are computed from this many sampled states
 Array = NDArray[np.float64]

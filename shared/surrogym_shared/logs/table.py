@@ -14,6 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from surrogym_shared.checks import MAX_MEASURED
+
 
 class UnusableLog(ValueError):
     """A log, its mapping or its columns can't be used. The message says what was expected and what came."""
@@ -32,7 +34,6 @@ DATES, DURATIONS = "M", "m"  # letters for the kinds of NumPy's types datetime64
 NO_NUMBERS = {DATES: "dates", DURATIONS: "durations", "c": "complex numbers", "V": "records"}
 FEWEST_STAMPS = 3  # a column with fewer numbers is not recognised as time stamps such as 20240331001500
 MOST_STAMPS = 0.9  # a column has time stamps if more than this share of its numbers can be read as dates
-MAX_MEASURED = 1e30  # largest absolute value of a number in a log, as in requests to the server
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from surrogym_shared.lazy import on_first_use
 from surrogym_shared.spec.actions import Action, BoxAction, DiscreteAction, MultiDiscreteAction
-from surrogym_shared.spec.base import MAX_DIMENSIONS, MAX_ROLLOUT_QUERY, ends_of
+from surrogym_shared.spec.base import MAX_DIMENSIONS, MAX_ROLLOUT_QUERY, REWARD, ends_of
 from surrogym_shared.spec.coordinates import Bounds, Coordinate, Fixed, Lag, Normal, Uniform, limits
 from surrogym_shared.spec.environment import Access, AcquisitionChoice, Choice, Design, EnvironmentSpec, ModelChoice
 from surrogym_shared.spec.rewards import DeclaredReward, Quantity, Reward, RewardTerm, Success
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 __all__ = [
     "MAX_DIMENSIONS",
     "MAX_ROLLOUT_QUERY",
+    "REWARD",
     "Access",
     "AcquisitionChoice",
     "Action",

@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from surrogym_shared.checks import MAX_MEASURED as MAX_MEASURED
 from surrogym_shared.fail_fast import FailFast
 from surrogym_shared.kinds import AutoresetMode as AutoresetMode
 from surrogym_shared.kinds import Variant as Variant
@@ -25,8 +26,6 @@ MAX_CLAIM = 256
 MAX_BATCH = 65_536
 MAX_IMAGINED = 500  # largest number of steps of an imagined (virtual) episode
 MAX_DRAWS = 64
-# Largest absolute value of a number in a sample; with larger ones a variance overflows, and no fit is possible.
-MAX_MEASURED = 1e30
 
 Role = Literal["read", "train", "sample", "admin"]
 

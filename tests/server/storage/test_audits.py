@@ -11,7 +11,7 @@ from support.queries import steps
 from surrogym_server.errors import BeyondBudget
 from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import NewSample
-from surrogym_server.storage.sql.queries import LEAST_AUDITED
+from surrogym_shared.states import LEAST_AUDITED
 
 Make = Callable[..., str]
 FOUR = steps(np.zeros((4, 2)), np.zeros((4, 1)))

@@ -55,7 +55,7 @@ from surrogym_server.storage.sql.rows import (
 )
 from surrogym_server.storage.sql.tables import leases, queries, requests, samples, snapshots, surrogates
 from surrogym_shared.nouns import Query, Vector
-from surrogym_shared.states import Purpose, QueryStatus
+from surrogym_shared.states import LEAST_AUDITED, Purpose, QueryStatus
 
 CONTENT = [getattr(queries.c, name) for name in ("coordinates", "action", "steps", "snapshot")]
 STATE = [getattr(queries.c, name) for name in ("id", "purpose", "status", "round", "attempts", "sampler", "error")]
@@ -73,9 +73,6 @@ OLDEST_FREE: sa.Select[Any] = (
     .limit(sa.bindparam("most", type_=sa.Integer()))
     .with_for_update(skip_locked=True)
 )
-# All audits (tests of trained policies) of a surrogate may take this many real steps even if its budget is smaller:
-# three audits of 40 steps.
-LEAST_AUDITED = 128
 
 
 class SqlQueries(port.Queries):

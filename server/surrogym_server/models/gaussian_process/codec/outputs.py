@@ -10,7 +10,7 @@ from typing import Any, get_args
 import torch
 from torch import Tensor
 
-from surrogym_server.environment.definition import REWARD, EnvironmentDefinition
+from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.features import Encoding, FeatureMap, Parity, State, encode, features
 from surrogym_server.errors import InvalidInput
 from surrogym_server.gp import Hyperparameters, LeftOut, Posterior, Sparse
@@ -18,6 +18,7 @@ from surrogym_server.models.gaussian_process.feature_maps import reflection
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 from surrogym_server.models.gaussian_process.prediction.warp import Warp
 from surrogym_server.tensors import STEEPEST
+from surrogym_shared.spec import REWARD
 
 KNOWN_MAPS = frozenset(
     FeatureMap(state, action, lead, after, parity=parity)

@@ -14,13 +14,13 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from surrogym_server.environment.definition import REWARD
 from surrogym_server.environment.features import FeatureMap
 from surrogym_server.environment.samples import Samples
 from surrogym_server.models.gaussian_process.learning.output_learner import CONSTANT, OutputLearner
 from surrogym_server.models.gaussian_process.learning.region import learn_region
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 from surrogym_server.models.gaussian_process.prediction.regions import Jump, Region
+from surrogym_shared.spec import REWARD
 
 EDGE = "reward edge"
 MAX_JUMPS = 3

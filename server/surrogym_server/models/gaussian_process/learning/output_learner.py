@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from surrogym_server.environment.definition import REWARD, EnvironmentDefinition
+from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.features import FeatureMap
 from surrogym_server.gp import Censored, FitOptions, Fitted, Posterior, Selection, fit, loses_nothing, spread, subsets
 from surrogym_server.models.gaussian_process.feature_maps import reflection
@@ -18,6 +18,7 @@ from surrogym_server.models.gaussian_process.prediction.output_model import Outp
 from surrogym_server.models.gaussian_process.prediction.warp import PEAK_NOISE
 from surrogym_server.models.gaussian_process.settings import Settings
 from surrogym_server.models.port import Warm
+from surrogym_shared.spec import REWARD
 
 # Prior log odds of four kinds of feature maps (encodings of state and action). A map that reads the lead (next value of
 # a leading coordinate) is likelier, because it is also right where a limit cuts a step off. A map that reads nothing

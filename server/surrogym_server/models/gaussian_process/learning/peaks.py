@@ -18,12 +18,12 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from surrogym_server.environment.definition import REWARD
 from surrogym_server.environment.features import FeatureMap
 from surrogym_server.gp import condition_many
 from surrogym_server.models.gaussian_process.learning.output_learner import PEAK, OutputLearner
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 from surrogym_server.models.gaussian_process.prediction.warp import Warp
+from surrogym_shared.spec import REWARD
 
 # The height of a reward is its distance from the base, the reward far from the peak. The greatest height is compared
 # with this quantile of the heights above 0.

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from surrogym_server.environment.declared_reward import RewardFunction
-from surrogym_server.environment.definition import REWARD, EnvironmentDefinition
+from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.features import FeatureMap, encode
 from surrogym_server.environment.samples import Samples
 from surrogym_server.models.gaussian_process.feature_maps import reward_candidates
@@ -19,6 +19,7 @@ from surrogym_server.models.gaussian_process.learning.peaks import with_peak
 from surrogym_server.models.gaussian_process.learning.prior import Known, beside
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 from surrogym_server.models.gaussian_process.prediction.regions import Jump, jumped
+from surrogym_shared.spec import REWARD
 
 FEW = 2  # if there are fewer non-terminating steps than this, the reward is learned from terminating steps too
 
