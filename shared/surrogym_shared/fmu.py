@@ -18,7 +18,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 from surrogym_shared.c_compiler import CannotCompile, c_compiler, compile_c
@@ -26,7 +26,7 @@ from surrogym_shared.checks import require, require_unique
 
 Kind = Literal["Float64", "Int32", "Boolean"]
 Causality = Literal["input", "output", "parameter"]
-KINDS: tuple[Kind, ...] = ("Float64", "Int32", "Boolean")
+KINDS: tuple[Kind, ...] = get_args(Kind)
 NEVER, AT_START, ALWAYS = range(3)  # when a simulator may set a variable: never, before the simulation, always
 TIME = "time"  # name of the independent variable, which every FMU has
 

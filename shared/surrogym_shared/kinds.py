@@ -10,6 +10,8 @@ Relation = Literal["<", "<=", ">", ">="]  # relation of the two sides of an ineq
 RewardShape = Literal["one", "linear", "absolute", "square", "bump", "ball"]
 # Whether a reward depends on the state before or after the step. ``auto``: the data decide.
 RewardTiming = Literal["before", "after", "auto"]
+# Where a query may begin: at any state, at a reset or a state that was saved, or at a reset only.
+Access = Literal["any", "snapshot", "reset"]
 Side = Literal["lower", "upper"]  # lower or upper end of a range
 
 Variant = Literal["deterministic", "probabilistic", "pathwise"]

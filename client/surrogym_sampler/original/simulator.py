@@ -49,6 +49,10 @@ class Variable:
     def limited(self) -> bool:
         return self.low is not None and self.high is not None
 
+    @property
+    def mechanical(self) -> bool:
+        return self.motion in ("slide", "turn", "speed")
+
 
 @dataclass(frozen=True)
 class Taken:

@@ -9,11 +9,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from surrogym_shared.kinds import Access
 from surrogym_shared.lazy import on_first_use
 from surrogym_shared.spec.actions import Action, BoxAction, DiscreteAction, MultiDiscreteAction
 from surrogym_shared.spec.base import MAX_DIMENSIONS, MAX_ROLLOUT_QUERY, REWARD, ends_of
 from surrogym_shared.spec.coordinates import Bounds, Coordinate, Fixed, Lag, Normal, Uniform, limits
-from surrogym_shared.spec.environment import Access, AcquisitionChoice, Choice, Design, EnvironmentSpec, ModelChoice
+from surrogym_shared.spec.environment import AcquisitionChoice, Choice, Design, EnvironmentSpec, ModelChoice
 from surrogym_shared.spec.rewards import DeclaredReward, Quantity, Reward, RewardTerm, Success
 from surrogym_shared.spec.safety import Limit, Limits
 from surrogym_shared.spec.terms import AllOf, Inequality, ObservationEntry, Part, Term

@@ -9,6 +9,7 @@ from typing import Annotated, Literal, Self
 from pydantic import BeforeValidator, Field, StrictBool, StrictFloat, StrictInt, StrictStr, model_validator
 
 from surrogym_shared.checks import SHOWN, Number, Positive, require, require_known, require_unique
+from surrogym_shared.kinds import Access
 from surrogym_shared.patterns import VISIBLE
 from surrogym_shared.presets import PRESETS, Preset, PresetName, Tolerance
 from surrogym_shared.spec.actions import Action, BoxAction
@@ -17,8 +18,6 @@ from surrogym_shared.spec.coordinates import Coordinate, StartDistribution, limi
 from surrogym_shared.spec.rewards import AnyReward, DeclaredReward, Reward, Success
 from surrogym_shared.spec.safety import Limits
 from surrogym_shared.spec.terms import AllOf, ObservationEntry, Term, Termination
-
-Access = Literal["any", "snapshot", "reset"]
 
 
 def _require_setting(value: object) -> object:

@@ -10,6 +10,7 @@ import typer
 
 from surrogym.cli.options import ExitWithParent, Quiet, require_known
 from surrogym.demo.tasks import TASKS
+from surrogym_shared.kinds import Access
 
 if TYPE_CHECKING:
     from surrogym.demo.run import Begin, S
@@ -31,9 +32,7 @@ Algorithm = Annotated[
         show_default=False,
     ),
 ]
-Access = Annotated[
-    Literal["any", "snapshot", "reset"], typer.Option(help="Where a query may begin, as in surrogym register.")
-]
+AccessOption = Annotated[Access, typer.Option(help="Where a query may begin, as in surrogym register.")]
 
 
 def command(
@@ -47,7 +46,7 @@ def command(
     budget: Budget = None,
     steps: Steps = None,
     algorithm: Algorithm = None,
-    access: Access = "any",
+    access: AccessOption = "any",
     episodes: Annotated[int, typer.Option(min=1, help="Number of real episodes of the evaluation.")] = 100,
     pictures: Annotated[bool, typer.Option(help="Draw pictures of the run.")] = True,
     keep: Annotated[bool, typer.Option("--keep", help="Keep the server running until Ctrl-C.")] = False,

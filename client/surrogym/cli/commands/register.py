@@ -8,7 +8,7 @@ import shlex
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -21,6 +21,7 @@ from surrogym.cli.options import (
     read_spec_file,
     read_tolerances,
 )
+from surrogym_shared.kinds import Access
 from surrogym_shared.presets import PresetName
 
 if TYPE_CHECKING:
@@ -73,7 +74,7 @@ class DesignChoices:
         ),
     ] = None
     access: Annotated[
-        Literal["any", "snapshot", "reset"] | None,
+        Access | None,
         typer.Option(
             help="Where a query may begin. any: at any state, to which the environment is set. snapshot: at a state "
             "that was visited and saved, or at a reset. reset: at a reset only. [default: from the specification]"

@@ -196,7 +196,7 @@ def _leaving(counted: Counted, seen: Seen, rng: np.random.Generator) -> float:
     """
     simulator = counted.simulator
     limited = [i for i, v in enumerate(simulator.variables) if v.motion == "other" and v.limited]
-    mechanical = any(v.motion in ("slide", "turn", "speed") for v in simulator.variables)
+    mechanical = any(v.mechanical for v in simulator.variables)
     if mechanical or not limited:
         return 0.0
     low, high = np.array([(simulator.variables[i].low, simulator.variables[i].high) for i in limited], float).T

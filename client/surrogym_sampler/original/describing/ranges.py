@@ -73,7 +73,7 @@ class Ranges:
     def _is_constant(self, index: int) -> bool:
         """Return whether a variable is constant in every episode and may differ between episodes."""
         variable, seen = self._simulator.variables[index], self._seen
-        if variable.motion in ("slide", "turn", "speed"):
+        if variable.mechanical:
             return False
         moved = (seen.states[:, index] != seen.next_states[:, index]).any()
         return variable.motion == "held" or not moved
