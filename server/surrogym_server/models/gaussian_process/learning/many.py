@@ -67,10 +67,11 @@ class ManySamples(ABC):
             NumericalFailure: no jitter makes the covariance of the points positive definite.
         """
 
+    @abstractmethod
     def fewer_inputs(
         self, x: Tensor, y: Tensor, options: FitOptions, posterior: Posterior, may: Tensor, odds: float
     ) -> Fewer | None:
-        """Leave out inputs of a process that has inducing points. By default nothing is left out.
+        """Leave out inputs of a process that has inducing points.
 
         Args:
             x, y: all of the process's points, (n, d) and (n,).
@@ -82,8 +83,6 @@ class ManySamples(ABC):
         Returns:
             The process with fewer inputs, or None if all are kept.
         """
-        del x, y, options, posterior, may, odds
-        return None
 
 
 class BySubsets(ManySamples):
