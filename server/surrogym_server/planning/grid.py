@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +14,9 @@ from surrogym_server.models.abilities import ArraySteps, GridPolicy
 from surrogym_shared.spec import BoxAction, DiscreteAction
 
 Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
 
+MOST_COORDINATES = 4
 NODES = 100_000  # largest number of nodes of a grid
 MOST_ALONG = 201  # largest number of nodes along one coordinate
 LEVELS = {1: 5, 2: 3, 3: 3}  # number of values of each entry that value iteration tries, by the number of entries
@@ -24,40 +28,77 @@ DISCOUNTING = 0.04
 ROWS = 4_096  # number of steps that are predicted at once
 
 
-def solve(steps: ArraySteps, terminal_reward: float, time_limit: int) -> GridPolicy:
-    """Compute the best policy on a grid by value iteration.
+@dataclass(frozen=True)
+class GridModel:
+    """Predicted steps from the S nodes of a grid over the sampling range, with each of A actions.
 
-    Args:
-        steps: the model's compiled steps.
-        terminal_reward: reward that steps that end the episode pay in addition.
-        time_limit: largest number of steps in an episode.
+    ``compiled.grid`` explains grids.
     """
-    from surrogym_server.compiled.grid import choose, sweep
 
-    definition = steps.definition
-    grid = _grid(definition)
-    action = definition.action
-    assert isinstance(action, BoxAction | DiscreteAction)
-    actions, levels = _actions(action)
-    q_next, reward = _transitions(steps, _nodes(*grid[:3]), actions, terminal_reward)
-    discount = 1 - DISCOUNTING / time_limit
-    values, best = np.zeros(len(reward)), np.zeros(len(reward), dtype=np.int64)
-    for number in range(SWEEPS):
-        choosing = number % SWEEPS_PER_CHOICE == 0
-        change = sweep(*grid, q_next, reward, discount, choosing, number % 2 == 0, values, best)
-        if choosing and change <= CHANGE * np.ptp(values):
-            break
-    table = np.empty((len(reward), actions.shape[1]))
-    choose(*grid, q_next, reward, discount, values, levels, table)
-    choices = 0 if len(levels) else len(actions)
-    return GridPolicy(grid, values, table, discount, choices, actions.min(0), actions.max(0))
+    grid: tuple[Floats, Floats, NDArray[np.int64], NDArray[np.bool_]]  # low, cell, count, cyclic, (C,) each
+    actions: Floats  # (A, F)
+    levels: Floats  # (F, L) values of each entry of a continuous action; (0, 0) for discrete ones
+    q_next: Singles  # (S, A, C) state after the step; not a number where the episode ended
+    reward: Singles  # (S, A) reward of the step
+
+    @classmethod
+    def of(cls, steps: ArraySteps, terminal_reward: float, nodes: int = NODES) -> Self:
+        """Predict the steps.
+
+        Args:
+            steps: the model's compiled steps.
+            terminal_reward: reward that steps that end the episode pay in addition.
+            nodes: largest number of nodes.
+        """
+        action = steps.definition.action
+        assert isinstance(action, BoxAction | DiscreteAction)
+        grid, (actions, levels) = _grid(steps.definition, nodes), _actions(action)
+        return cls(grid, actions, levels, *_transitions(steps, _nodes(*grid[:3]), actions, terminal_reward))
+
+    def policy(self, discount: float, reward: Singles | None = None) -> GridPolicy:
+        """Return the best policy by value iteration, for other rewards (S, A) than the model's if they are given."""
+        from surrogym_server.compiled.grid import choose, sweep
+
+        paid = self.reward if reward is None else reward
+        values, best = np.zeros(len(paid)), np.zeros(len(paid), dtype=np.int64)
+        for number in range(SWEEPS):
+            choosing = number % SWEEPS_PER_CHOICE == 0
+            change = sweep(*self.grid, self.q_next, paid, discount, choosing, number % 2 == 0, values, best)
+            if choosing and change <= CHANGE * np.ptp(values):
+                break
+        table = np.empty((len(paid), self.actions.shape[1]))
+        choose(*self.grid, self.q_next, paid, discount, values, self.levels, table)
+        choices = 0 if len(self.levels) else len(self.actions)
+        return GridPolicy(self.grid, values, table, discount, choices, self.actions.min(0), self.actions.max(0))
 
 
-def _grid(definition: EnvironmentDefinition) -> tuple[Floats, Floats, NDArray[np.int64], NDArray[np.bool_]]:
-    """Return low, cell, count and cyclic, (C,) each, of a grid over the sampling range (see ``compiled.grid``)."""
+def solve(steps: ArraySteps, terminal_reward: float, time_limit: int) -> GridPolicy:
+    """Return the policy with the highest return on a grid, for episodes of at most ``time_limit`` steps.
+    ``terminal_reward`` is what steps that end the episode pay in addition."""
+    return GridModel.of(steps, terminal_reward).policy(discount_of(time_limit))
+
+
+def discount_of(time_limit: int) -> float:
+    """Return the discount for episodes of at most ``time_limit`` steps."""
+    return 1 - DISCOUNTING / time_limit
+
+
+def unfit(definition: EnvironmentDefinition) -> str | None:
+    """Return what a grid needs and the environment lacks, in words; None if nothing is missing."""
+    action, coordinates = definition.action, len(definition.coordinates)
+    if coordinates > MOST_COORDINATES:
+        return f"at most {MOST_COORDINATES} coordinates, got {coordinates}"
+    if isinstance(action, DiscreteAction) or (isinstance(action, BoxAction) and action.size in LEVELS):
+        return None
+    return "one discrete action, or at most three continuous ones"
+
+
+def _grid(definition: EnvironmentDefinition, nodes: int) -> tuple[Floats, Floats, NDArray[np.int64], NDArray[np.bool_]]:
+    """Return low, cell, count and cyclic, (C,) each, of a grid over the sampling range (see ``compiled.grid``), with at
+    most so many nodes."""
     low, high = (ends.cpu().numpy() for ends in definition.sampled)
     cyclic = np.array([c.kind == "angle" for c in definition.coordinates])
-    along = min(int(NODES ** (1 / len(low))), MOST_ALONG)
+    along = min(int(nodes ** (1 / len(low))), MOST_ALONG)
     # An odd number of nodes has one in the middle of the range. The ends of an angle's range are the same node.
     count = np.where(cyclic, along, along - 1 + along % 2).astype(np.int64)
     return low.copy(), (high - low) / np.where(cyclic, count, count - 1), count, cyclic
@@ -78,9 +119,7 @@ def _actions(action: BoxAction | DiscreteAction) -> tuple[Floats, Floats]:
     return np.array(list(itertools.product(*levels))), np.ascontiguousarray(levels)
 
 
-def _transitions(
-    steps: ArraySteps, nodes: Floats, actions: Floats, terminal_reward: float
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _transitions(steps: ArraySteps, nodes: Floats, actions: Floats, terminal_reward: float) -> tuple[Singles, Singles]:
     """Return the states (S, A, C) after one step from each of the nodes (S, C) with each of the actions (A, F), and its
     rewards (S, A). The states are not a number where the episode ended."""
     count = len(actions)

@@ -14,12 +14,11 @@ from surrogym_server.environment.observation_inverse import ObservationInverse
 from surrogym_server.errors import InvalidInput
 from surrogym_server.models.abilities import CompiledSteps, GridPolicy, PlannedActions, offers
 from surrogym_server.models.port import DynamicsModel
-from surrogym_server.planning.grid import LEVELS, solve
-from surrogym_shared.spec import BoxAction, DiscreteAction
+from surrogym_server.planning.grid import solve, unfit
+from surrogym_shared.spec import BoxAction
 
 Floats = NDArray[np.float64]
 
-MOST_COORDINATES = 4
 MOST_HORIZON = 200
 LONGEST_EPISODE = 1_000  # number of steps of an episode that has no time limit
 ROUNDS, ROLLOUTS, ELITE = 2, 24, 4
@@ -64,10 +63,9 @@ def _inverse(definition: EnvironmentDefinition) -> ObservationInverse:
     """Return the function that computes coordinates from observations, or raise ``InvalidInput`` with the reason why
     the environment does not allow planning."""
     action, names = definition.action, [c.name for c in definition.coordinates]
+    lacking = unfit(definition)
     asked: dict[str, bool] = {
-        f"at most {MOST_COORDINATES} coordinates, got {len(names)}": len(names) <= MOST_COORDINATES,
-        "one discrete action, or at most three continuous ones": isinstance(action, DiscreteAction)
-        or (isinstance(action, BoxAction) and action.size in LEVELS),
+        lacking or "": lacking is None,
         "an action without bins": not (isinstance(action, BoxAction) and action.bins),
         "an action without rate": not definition.rates,
         "no declared limits": definition.limits is None,

@@ -40,6 +40,7 @@ from surrogym_server.sampling.rules import ROLLOUT_RULES, STEP_RULES
 from surrogym_server.sampling.seeds import generator_for
 from surrogym_server.sampling.state import Conditions, DesignState, Request
 from surrogym_server.sampling.tolerances import frozen_tolerances
+from surrogym_server.sampling.way_to_end import way_to_end
 from surrogym_shared.nouns import Query
 from surrogym_shared.states import Verdict
 
@@ -125,10 +126,15 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
     verdict = verdict_with_history(judgement, state, request, conditions)
 
     # Not in the paper: if the environment has snapshots, a design about to be ready first takes an excursion: an action
-    # sequence beyond the sampled states that tests the model. If it may take no steps for it, it ends not ready.
+    # sequence beyond the sampled states that tests the model. If it may take no steps for it, it ends not ready. If the
+    # environment can only be reset, the design first takes a sequence to a declared end of the episode that no sample
+    # has shown, as long as the rest of the budget is enough to reach it.
     testing = verdict == "ready" and _lacks_excursion(definition, conditions, state)
     if testing and takes_no_more_steps(state, request, conditions):
         verdict, testing = "unsure", False
+    if verdict == "ready" and not testing and state.ended_as != "ready":
+        room, rng = request.budget - conditions.cost, generator_for(definition, f"end {state.round}")
+        testing = way_to_end(fit.model, samples, room, rng) is not None
     tested_at = state.tested_at if verdict == "ready" else 0
     continues = verdict == "continue" or testing
 

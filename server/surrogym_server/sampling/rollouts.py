@@ -55,6 +55,7 @@ class Aim:
     states: Tensor | None = None  # (v, C) states that policies visited; steps count more where these are dense
     ending: bool = False  # whether to prefer sequences that may show an unknown termination or jump of the reward
     ended: bool = False  # whether a sample has ended an episode; if so, a declared termination need not be searched for
+    tried: Sequences | None = None  # (k, T, F) sequences after a reset that a search tries beside random ones
 
 
 @dataclass(frozen=True)
@@ -108,9 +109,9 @@ def plan_round(
 def plan_rollout(model: DynamicsModel, aim: Aim, rng: np.random.Generator) -> Query:
     """Plan the action sequence with the highest value per expected real step, from a reset or from a snapshot.
 
-    The search first compares random sequences of at most ``aim.longest`` actions, then variations of the best ones.
+    The search first compares random sequences and those of ``aim.tried``, then variations of the best ones.
     """
-    return best_rollout(model.definition, partial(_worth, model, aim), aim.longest, aim.snapshots, rng)
+    return best_rollout(model.definition, partial(_worth, model, aim), aim.longest, aim.snapshots, rng, aim.tried)
 
 
 def best_rollout(
@@ -119,11 +120,13 @@ def best_rollout(
     longest: int,
     snapshots: Mapping[str, Vector],
     rng: np.random.Generator,
+    tried: Sequences | None = None,
 ) -> Query:
     """Search for the sequence of at most ``longest`` actions that has the highest value by the function ``worth``. It
-    begins at a reset or at one of the ``snapshots``."""
+    begins at a reset or at one of the ``snapshots``. Sequences after a reset to begin the search with, ``tried``, have
+    ``longest`` actions or more."""
     starts = start_points(definition, STARTS, rng)[None]
-    actions, _, value = _search(definition, worth, longest, starts, POPULATION, rng)
+    actions, _, value = _search(definition, worth, longest, starts, POPULATION, rng, tried)
     if snapshots:
         origins = torch.tensor(list(snapshots.values()), dtype=torch.float64)[:, None]
         others, place, value_from_snapshot = _search(definition, worth, longest, origins, POPULATION * STARTS, rng)
@@ -139,14 +142,19 @@ def _search(
     origins: Tensor,
     population: int,
     rng: np.random.Generator,
+    tried: Sequences | None = None,
 ) -> tuple[NDArray[np.float64], int, float]:
     """Search for the sequence of actions (T, F) with the highest value by the function ``worth``, from any of k
     origins. Each origin consists of s equally likely states; ``origins`` is (k, s, C).
 
     ``longest`` is the greatest number of actions, and ``population`` the number of sequences that are compared at once.
-    Return the sequence, the index of its origin, and its value.
+    ``tried`` (b, longest or more, F) take the place of at most half of the first random sequences. Return the sequence,
+    the index of its origin, and its value.
     """
     sequences = random_sequences(definition, population, longest, rng)
+    if tried is not None:
+        first = tried[: population // 2, :longest]
+        sequences[: len(first)] = first
     places = np.resize(rng.permutation(len(origins)), population)
     elite = population * ELITE // POPULATION
     value, length = worth(origins[places], sequences)
@@ -285,7 +293,15 @@ def _endings(model: DynamicsModel, aim: Aim, paths: Paths) -> Tensor:
     q, q_next = paths.q.flatten(0, 1), paths.q_next.flatten(0, 1)
     doubt = in_doubt(model, q_next).maximum(edge_in_doubt(model, q, q_next)).reshape(paths.running.shape)
     wrong = (doubt * paths.running).cummax(1).values
-    return wrong if aim.ended or model.definition.learns_termination else wrong.maximum(paths.ended)
+    if aim.ended or model.definition.learns_termination:
+        return wrong
+    return wrong.maximum(paths.ended)
+
+
+def predictability(paths: Paths) -> Tensor:
+    """Return how well each step of each path can be predicted, (b, T): 1 at the start, less the more variance its
+    earlier steps add up to."""
+    return (-0.5 * paths.drift).exp()
 
 
 def _weights(definition: EnvironmentDefinition, aim: Aim, paths: Paths) -> Tensor:
@@ -294,7 +310,7 @@ def _weights(definition: EnvironmentDefinition, aim: Aim, paths: Paths) -> Tenso
     If sequences may begin at snapshots, the weight also has the square root of the sampling density at the state as a
     factor. Otherwise sequences could lead farther and farther away, to states that hardly matter for the confidence.
     """
-    weight = paths.running * definition.in_range(paths.q) * definition.known(paths.q) * (-0.5 * paths.drift).exp()
+    weight = paths.running * definition.in_range(paths.q) * definition.known(paths.q) * predictability(paths)
     if aim.snapshots:
         columns = zip(definition.coordinates, paths.q.unbind(-1), strict=True)
         weight = weight * (0.5 * torch.stack([log_density(c.sampling, q) for c, q in columns]).sum(0)).exp()

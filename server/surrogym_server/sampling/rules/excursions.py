@@ -13,7 +13,7 @@ def take_excursion(round: Round) -> tuple[Query, ...] | None:
     """Return an excursion (an action sequence that leads far away from all samples) as the next query. Return None if
     the model need not be tested by an excursion, and () if no budget is left for an excursion, or if queries are still
     open, among which may be an excursion."""
-    if not round.testing:
+    if not round.testing or not round.definition.snapshots:
         return None
     if not round.room or round.request.open:
         return ()

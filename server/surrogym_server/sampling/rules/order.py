@@ -1,5 +1,6 @@
 """Order of the rules. The first rule that applies chooses the real steps that a round requests."""
 
+from surrogym_server.sampling.rules.ends import seek_end
 from surrogym_server.sampling.rules.excursions import take_excursion
 from surrogym_server.sampling.rules.initial import complete_initial_rollouts
 from surrogym_server.sampling.rules.past import see_the_past
@@ -12,4 +13,4 @@ from surrogym_server.sampling.rules.valued import ask_best_candidates
 STEP_RULES: tuple[Rule, ...] = (repeat_steps, ask_best_candidates)
 
 # Rules for an environment that can only begin at resets or snapshots, whose queries are action sequences.
-ROLLOUT_RULES: tuple[Rule, ...] = (take_excursion, see_the_past, complete_initial_rollouts, plan_rollouts)
+ROLLOUT_RULES: tuple[Rule, ...] = (take_excursion, see_the_past, complete_initial_rollouts, seek_end, plan_rollouts)

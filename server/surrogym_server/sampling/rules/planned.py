@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from surrogym_server.sampling.rollouts import Aim, plan_round
+from surrogym_server.planning.sequences import policy_sequences
+from surrogym_server.sampling.rollouts import STARTS, Aim, plan_round, start_points
 from surrogym_server.sampling.round import Round
 from surrogym_shared.nouns import Query
 
@@ -15,19 +16,26 @@ def plan_rollouts(round: Round) -> tuple[Query, ...]:
     confidence index is below the target.
 
     The value of a sequence is summed over these outputs. Sequences are not chosen from the candidates of single steps.
-    If some of those are reserved, the first sequence should show an end of an episode or a jump of the reward.
+    If some of those are reserved, the first sequence should show an end of an episode or a jump of the reward. The
+    search tries what policies on a coarse grid would do, if the model and the environment allow a grid.
     """
     request, judgement = round.request, round.judgement
+    steps = min(round.room, steps_of_a_round(round)) if round.continues else request.extra
+    longest = min(steps, round.definition.max_rollout or 1)
+    tried = None
+    if steps:
+        starts = start_points(round.definition, STARTS, round.generator())
+        tried = policy_sequences(round.model, starts, longest, seek_end=False)
     aim = Aim(
         columns=round.outputs,
         tolerances=judgement.widened_tolerances,
-        longest=round.definition.max_rollout or 1,
+        longest=longest,
         snapshots=request.snapshots,
         states=request.states,
         ending=judgement.candidates.reserved is not None,
         ended=bool(round.samples.terminated.any()),
+        tried=tried,
     )
-    steps = min(round.room, steps_of_a_round(round)) if round.continues else request.extra
     return tuple(plan_round(round.model, aim, steps, request.unanswered, round.generator()))
 
 
