@@ -34,7 +34,7 @@ def way_to_end(model: DynamicsModel, samples: Samples, room: int, rng: np.random
     """
     definition = model.definition
     longest = min(definition.max_rollout or 0, room)
-    if not longest or definition.snapshots or definition.learns_termination or bool(samples.terminated.any()):
+    if longest < 1 or definition.snapshots or definition.learns_termination or bool(samples.terminated.any()):
         return None
     tried = policy_sequences(model, start_points(definition, STARTS, rng), longest, seek_end=True)
     if tried is None:
