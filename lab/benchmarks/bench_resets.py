@@ -45,19 +45,20 @@ def main() -> None:
     made.add_argument("--tasks", nargs="+", default=tuple(BUDGETS), choices=tuple(BUDGETS))
     made.add_argument("--seeds", nargs="+", type=int, required=True)
     made.add_argument("--episodes", type=int, default=100)
+    made.add_argument("--budget", type=int, help="largest number of real steps, instead of the task's")
     made.add_argument("--rounds", action="store_true", help="returns after each round of a design")
     made.add_argument("--out", type=Path, default=OUT)
     options = made.parse_args()
     for task in options.tasks:
         for seed in options.seeds:
-            for row in _run(task, seed, options.episodes, rounds=options.rounds):
+            for row in _run(task, seed, options.budget or BUDGETS[task], options.episodes, rounds=options.rounds):
                 print(json.dumps(row), flush=True)
                 _append(options.out / "resets.csv", row)
 
 
-def _run(task: str, seed: int, episodes: int, *, rounds: bool) -> list[dict[str, object]]:
+def _run(task: str, seed: int, budget: int, episodes: int, *, rounds: bool) -> list[dict[str, object]]:
     environment, begun = TASKS[task].environment, time.process_time()
-    machine = original.make(environment, access="reset", seed=seed, budget=BUDGETS[task])
+    machine = original.make(environment, access="reset", seed=seed, budget=budget)
     design, starts, rows = surrogym.Design(machine.spec()), np.random.default_rng(seed), []
     resets, known = 0, 0
 

@@ -16,14 +16,15 @@ def plan_rollouts(round: Round) -> tuple[Query, ...]:
     confidence index is below the target.
 
     The value of a sequence is summed over these outputs. Sequences are not chosen from the candidates of single steps.
-    If some of those are reserved, the first sequence should show an end of an episode or a jump of the reward. The
-    search tries what policies on a coarse grid would do, if the model and the environment allow a grid.
+    If some of those are reserved, the first sequence should show an end of an episode or a jump of the reward. If
+    the environment can only be reset, the search tries what the best policy on a coarse grid would do, as long as the
+    model and the environment allow a grid.
     """
     request, judgement = round.request, round.judgement
     steps = min(round.room, steps_of_a_round(round)) if round.continues else request.extra
     longest = min(steps, round.definition.max_rollout or 1)
     tried = None
-    if steps:
+    if steps and not round.definition.snapshots:
         starts = start_points(round.definition, STARTS, round.generator())
         tried = policy_sequences(round.model, starts, longest, seek_end=False)
     aim = Aim(
