@@ -1,8 +1,8 @@
 """Real steps of environments that can only be reset: designs within a budget, and returns of planners on their models.
 
 Each run makes a design by resets alone, with the budget of its task, and no earlier data. A planner acts on the model
-that it ends with (``surrogym train --algorithm planner``), in 100 real episodes, from which nothing is learned. Prints
-one line for each run and appends it to ``resets.csv``. With ``--rounds``, a line for each round of the design instead,
+that it ends with (``surrogym train --algorithm planner``), in 100 real episodes, from which nothing is learned. The targets
+are those of the demo, without its second evaluation. Prints one line for each run and appends it to ``resets.csv``. With ``--rounds``, a line for each round of the design instead,
 with the returns of ten real episodes: a curve.
 
     python lab/benchmarks/bench_resets.py --seeds 9903 9904 9905 9906 9907 --tasks pendulum cartpole
@@ -14,17 +14,18 @@ import argparse
 import csv
 import json
 import time
+from dataclasses import replace
 from pathlib import Path
 
-import gymnasium
 import numpy as np
 from common import OUT
-from numpy.typing import NDArray
 
 import surrogym
-from surrogym.demo.tasks import TASKS
+from surrogym.demo.tasks import TASKS, Outcome
 from surrogym_sampler import original
+from surrogym_sampler.original.episodes import GymnasiumEpisode
 from surrogym_server.local import LocalSurrogate
+from surrogym_trainer.evaluation.evaluator import EvaluationSettings, evaluate
 
 # largest number of real steps of a design, by task
 BUDGETS = {
@@ -36,7 +37,6 @@ BUDGETS = {
     "acrobot": 120,
     "invertedpendulum": 30,
 }
-FIRST_EPISODE = 10_000  # reset seed of the first real episode
 HORIZON = 20
 
 
@@ -64,9 +64,8 @@ def _run(task: str, seed: int, budget: int, episodes: int, *, rounds: bool) -> l
 
     def row(count: int) -> dict[str, object]:
         taken = time.process_time() - begun
-        returns = _returns(environment, design.surrogate(), seed, count)
+        earned = _earned(task, design.surrogate(), seed, count)
         facts = {"task": task, "seed": seed, "steps": design.steps, "resets": resets, "phase": design.phase}
-        earned = {"mean": round(float(returns.mean()), 2), "least": round(float(returns.min()), 2)}
         index = round(design.fidelity["confidence_index"], 4)
         return facts | {"confidence_index": index} | earned | {"episodes": count, "cpu_seconds": round(taken, 1)}
 
@@ -86,18 +85,15 @@ def _run(task: str, seed: int, budget: int, episodes: int, *, rounds: bool) -> l
     return [*rows, row(10 if rounds else episodes)]
 
 
-def _returns(environment: str, surrogate: LocalSurrogate, seed: int, episodes: int) -> NDArray[np.float64]:
-    """Return the returns (episodes,) of a planner in the original environment."""
-    planner, env, returns = surrogate.planner(HORIZON, seed), gymnasium.make(environment), np.zeros(episodes)
-    for episode in range(episodes):
-        observation, ended = env.reset(seed=FIRST_EPISODE + episode)[0], False
-        while not ended:
-            action = planner(np.asarray(observation, dtype=np.float64)[None])[0]
-            observation, reward, terminated, truncated, _ = env.step(action)
-            returns[episode] += float(reward)
-            ended = terminated or truncated
-    env.close()
-    return returns
+def _earned(task: str, surrogate: LocalSurrogate, seed: int, episodes: int) -> dict[str, object]:
+    """Return what a planner earns in the original environment, and whether this reaches the task's target."""
+    spec = surrogate.spec()
+    real = evaluate(surrogate.planner(HORIZON, seed), lambda: GymnasiumEpisode(spec), EvaluationSettings(episodes))
+    mean, least = float(real.returns.mean()), float(real.returns.min())
+    success = None if real.success is None else float(real.success.mean())
+    target = replace(TASKS[task].target, also_success=None)
+    reached = target.reached(Outcome(mean, least, success))
+    return {"mean": round(mean, 2), "least": round(least, 2), "success": success, "reached": reached}
 
 
 def _append(path: Path, row: dict[str, object]) -> None:
