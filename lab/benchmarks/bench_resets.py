@@ -1,9 +1,9 @@
 """Real steps of environments that can only be reset: designs within a budget, and returns of planners on their models.
 
 Each run makes a design by resets alone, with the budget of its task, and no earlier data. A planner acts on the model
-that it ends with (``surrogym train --algorithm planner``), in 100 real episodes, from which nothing is learned. The targets
-are those of the demo, without its second evaluation. Prints one line for each run and appends it to ``resets.csv``. With ``--rounds``, a line for each round of the design instead,
-with the returns of ten real episodes: a curve.
+that it ends with (``surrogym train --algorithm planner``), in 100 real episodes, from which nothing is learned. The
+targets are those of the demo, without its second evaluation. Prints one line for each run, and appends it to
+``resets.csv``. With ``--rounds`` there is a line for each round of the design, with the returns of ten real episodes.
 
     python lab/benchmarks/bench_resets.py --seeds 9903 9904 9905 9906 9907 --tasks pendulum cartpole
 """
@@ -24,6 +24,7 @@ import surrogym
 from surrogym.demo.tasks import TASKS, Outcome
 from surrogym_sampler import original
 from surrogym_sampler.original.episodes import GymnasiumEpisode
+from surrogym_sampler.original.protocol import RolloutEnvironment
 from surrogym_server.local import LocalSurrogate
 from surrogym_trainer.evaluation.evaluator import EvaluationSettings, evaluate
 
@@ -59,6 +60,7 @@ def main() -> None:
 def _run(task: str, seed: int, budget: int, episodes: int, *, rounds: bool) -> list[dict[str, object]]:
     environment, begun = TASKS[task].environment, time.process_time()
     machine = original.make(environment, access="reset", seed=seed, budget=budget)
+    assert isinstance(machine, RolloutEnvironment)
     design, starts, rows = surrogym.Design(machine.spec()), np.random.default_rng(seed), []
     resets, known = 0, 0
 
