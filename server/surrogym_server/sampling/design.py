@@ -133,7 +133,7 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
     if testing and takes_no_more_steps(state, request, conditions):
         verdict, testing = "unsure", False
     if verdict == "ready" and not testing and state.ended_as != "ready":
-        room, rng = request.budget - conditions.cost, generator_for(definition, f"end {state.round}")
+        room, rng = request.budget - request.cost(len(samples)), generator_for(definition, f"end {state.round}")
         testing = way_to_end(fit.model, samples, room, rng) is not None
     tested_at = state.tested_at if verdict == "ready" else 0
     continues = verdict == "continue" or testing
