@@ -15,6 +15,7 @@ import csv
 import json
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -23,10 +24,11 @@ from common import OUT
 import surrogym
 from surrogym.demo.tasks import TASKS, Outcome
 from surrogym_sampler import original
-from surrogym_sampler.original.episodes import GymnasiumEpisode
+from surrogym_sampler.original.episodes import open_episode
 from surrogym_sampler.original.protocol import RolloutEnvironment
 from surrogym_server.local import LocalSurrogate
 from surrogym_trainer.evaluation.evaluator import EvaluationSettings, evaluate
+from surrogym_trainer.training.planner import Planner
 
 # largest number of real steps of a design, by task
 BUDGETS = {
@@ -38,7 +40,6 @@ BUDGETS = {
     "acrobot": 120,
     "invertedpendulum": 30,
 }
-HORIZON = 20
 
 
 def main() -> None:
@@ -89,8 +90,9 @@ def _run(task: str, seed: int, budget: int, episodes: int, *, rounds: bool) -> l
 
 def _earned(task: str, surrogate: LocalSurrogate, seed: int, episodes: int) -> dict[str, object]:
     """Return what a planner earns in the original environment, and whether this reaches the task's target."""
-    spec = surrogate.spec()
-    real = evaluate(surrogate.planner(HORIZON, seed), lambda: GymnasiumEpisode(spec), EvaluationSettings(episodes))
+    spec, settings = surrogate.spec(), EvaluationSettings(episodes)
+    planner, name = surrogate.planner(Planner.horizon, seed), spec.environment or task
+    real = evaluate(planner, lambda: open_episode(name, spec, partial(original.make, name, spec=spec)), settings)
     mean, least = float(real.returns.mean()), float(real.returns.min())
     success = None if real.success is None else float(real.success.mean())
     target = replace(TASKS[task].target, also_success=None)

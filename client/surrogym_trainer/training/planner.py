@@ -19,7 +19,7 @@ from surrogym_trainer.training.settings import TrainProgress
 class Planner(PolicySearch):
     """A policy that plans each action by rollouts of the model. Nothing is trained."""
 
-    horizon: int = 20  # number of steps of each planned rollout
+    horizon: int = 12  # number of steps of each planned rollout
 
     suggested_steps = 1
     resumable = False  # it computes its values anew from the latest model

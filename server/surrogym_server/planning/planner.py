@@ -21,7 +21,7 @@ Floats = NDArray[np.float64]
 
 MOST_HORIZON = 200
 LONGEST_EPISODE = 1_000  # number of steps of an episode that has no time limit
-ROUNDS, ROLLOUTS, ELITE = 2, 24, 4
+ROUNDS, ROLLOUTS, ELITE = 3, 24, 4
 SPREAD = 0.3  # standard deviation of the changes of a continuous action, as a share of half its range
 NARROWING = 0.5  # factor of this standard deviation from one round to the next
 COLOUR = 0.8  # correlation of the changes of two steps in a row
