@@ -46,7 +46,8 @@ def way_to_end(model: DynamicsModel, samples: Samples, room: int, rng: np.random
         count, lanes = starts.shape[:2]
         actions = torch.from_numpy(sequences).repeat_interleave(lanes, 0)
         paths = predict_paths(model, starts.flatten(0, 1), actions)
-        ended = paths.ended * (predictability(paths) > RELIABLE)
+        # A path that comes too close to a declared limit does not run on to the end.
+        ended = (paths.ended * paths.running).cummax(1).values * (predictability(paths) > RELIABLE)
         share, cost = (x.reshape(count, lanes, -1).mean(1) for x in (ended, paths.running.cumsum(1)))
         likely = max(likely, float(share.max()))
         best = (torch.where(share >= LIKELY, share, 0.0) / cost).max(1)

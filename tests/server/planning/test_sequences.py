@@ -93,6 +93,15 @@ def test_an_end_at_the_end_of_a_path_that_can_not_be_predicted_is_not_sought(cli
     assert way_to_end(climbing, begun, LENGTH, np.random.default_rng(0)) is None
 
 
+def test_an_end_beyond_a_declared_limit_is_not_sought(climbing, begun, monkeypatch):
+    def limited(*arguments: Any) -> Paths:
+        paths = predict_paths(*arguments)
+        return replace(paths, running=paths.running * (paths.q[..., 0] < 0.3).cummin(1).values)
+
+    monkeypatch.setattr("surrogym_server.sampling.way_to_end.predict_paths", limited)
+    assert way_to_end(climbing, begun, LENGTH, np.random.default_rng(0)) is None
+
+
 def test_a_design_by_resets_reaches_a_far_goal_before_it_is_ready(spec):
     """A car that has to swing to and fro for some 70 steps. Seed 0 of the resets."""
     design, machine = Design(spec, budget=400), GymnasiumEnvironment(spec)
