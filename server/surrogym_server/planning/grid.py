@@ -25,6 +25,7 @@ SWEEPS_PER_CHOICE = 5  # the best actions are chosen again in one of this number
 CHANGE = 1e-3  # value iteration stops once no value changes by more than this share of the range of the values
 # one minus the discount, as a share of one step of an episode, so that an episode's last reward counts almost in full
 DISCOUNTING = 0.04
+LONGEST_EPISODE = 1_000  # number of steps of an episode that has no time limit
 ROWS = 4_096  # number of steps that are predicted at once
 
 
@@ -72,15 +73,15 @@ class GridModel:
         return GridPolicy(self.grid, values, table, discount, choices, self.actions.min(0), self.actions.max(0))
 
 
-def solve(steps: ArraySteps, terminal_reward: float, time_limit: int) -> GridPolicy:
-    """Return the policy with the highest return on a grid, for episodes of at most ``time_limit`` steps.
-    ``terminal_reward`` is what steps that end the episode pay in addition."""
+def solve(steps: ArraySteps, terminal_reward: float, time_limit: int | None) -> GridPolicy:
+    """Return the policy with the highest return on a grid, for episodes of at most ``time_limit`` steps, if they have a
+    limit. ``terminal_reward`` is what steps that end the episode pay in addition."""
     return GridModel.of(steps, terminal_reward).policy(discount_of(time_limit))
 
 
-def discount_of(time_limit: int) -> float:
-    """Return the discount for episodes of at most ``time_limit`` steps."""
-    return 1 - DISCOUNTING / time_limit
+def discount_of(time_limit: int | None) -> float:
+    """Return the discount for episodes of at most ``time_limit`` steps, if they have a limit."""
+    return 1 - DISCOUNTING / (time_limit or LONGEST_EPISODE)
 
 
 def unfit(definition: EnvironmentDefinition) -> str | None:

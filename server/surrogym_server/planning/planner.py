@@ -20,7 +20,6 @@ from surrogym_shared.spec import BoxAction
 Floats = NDArray[np.float64]
 
 MOST_HORIZON = 200
-LONGEST_EPISODE = 1_000  # number of steps of an episode that has no time limit
 ROUNDS, ROLLOUTS, ELITE = 3, 24, 4
 SPREAD = 0.3  # standard deviation of the changes of a continuous action, as a share of half its range
 NARROWING = 0.5  # factor of this standard deviation from one round to the next
@@ -54,8 +53,7 @@ def planner_of(model: DynamicsModel, horizon: int, seed: int = 0) -> Planner:
             "expected a model of Gaussian processes without a prior, with compiled steps, because a planner rolls it "
             "out in compiled code: train a policy"
         )
-    limit = definition.time_limit or LONGEST_EPISODE
-    policy = solve(steps, model.terminal_reward, limit)
+    policy = solve(steps, model.terminal_reward, definition.time_limit)
     return Planner(definition, inverse, able, policy, horizon, seed)
 
 

@@ -20,7 +20,6 @@ from surrogym_server.planning.grid import GridModel, discount_of, unfit
 Floats = NDArray[np.float64]
 
 NODES = 20_000  # largest number of nodes of the coarse grid
-LONGEST_EPISODE = 1_000  # number of steps of an episode that has no time limit
 SEEKING = 0.995  # discount of the policy that seeks the end of the episode
 
 
@@ -37,7 +36,7 @@ def policy_sequences(model: DynamicsModel, starts: Tensor, length: int, *, seek_
     if steps is None:
         return None
     on_grid = GridModel.of(steps, model.terminal_reward, NODES)
-    policies = [on_grid.policy(discount_of(definition.time_limit or LONGEST_EPISODE))]
+    policies = [on_grid.policy(discount_of(definition.time_limit))]
     if seek_end:
         ends = np.isnan(on_grid.q_next[:, :, 0]).astype(np.float32)
         policies.insert(0, on_grid.policy(SEEKING, ends))
