@@ -18,10 +18,12 @@ import pytest
 from support.noting import until
 from support.programs import FALLS_BACK, HANGS, KEEPS_LIMITS, NOTES_ITSELF, UNTERMINABLE, left_behind, program
 from surrogym_sampler import original
+from surrogym_sampler.original.classic import cartpole
 from surrogym_sampler.original.errors import EnvironmentDied, StepFailed, StepTimedOut, UnknownEnvironment
 from surrogym_sampler.original.executables.messages import CHECK, decode
 from surrogym_sampler.original.executables.program import Program
 from surrogym_sampler.original.loading import is_known
+from surrogym_shared.spec import with_history
 
 SHELL = Path(__file__).parents[2] / "examples" / "executables" / "rail.sh"
 MOODY = """
@@ -45,10 +47,10 @@ for line in sys.stdin:
 """
 
 
-def moody(mood: str, version: int = 1, step_limit: float = 30.0):
+def moody(mood: str, version: int = 1, step_limit: float = 30.0, spec=None):
     """A program that does ``mood`` at action 1."""
     code = MOODY.replace("MOOD", f"if asked['action'] == [1]: {mood}").replace("VERSION", str(version))
-    return original.make(f"exec:{shlex.join([sys.executable, '-c', code])}", step_limit=step_limit)
+    return original.make(f"exec:{shlex.join([sys.executable, '-c', code])}", step_limit=step_limit, spec=spec)
 
 
 def test_an_environment_program_written_in_shell_returns_the_exact_next_states():
@@ -159,6 +161,22 @@ def test_a_large_snapshot_of_an_environment_program_is_restored():
     try:
         plant.begin()
         assert plant.restore(plant.save())[0] == 2**20
+    finally:
+        plant.close()
+
+
+def test_lags_are_computed_for_a_program_that_declares_none():
+    largest = {"x": 2.0, "velocity": 1.0, "pole": 1.0, "omega": 1.0}
+    spec = with_history(cartpole().model_copy(update={"query": "rollout"}), changes=1, actions=1, largest=largest)
+    plant = moody("result['state'] = [0.5, 0, 0, 0]", spec=spec)
+    try:
+        assert plant.begin(0).tolist() == [0.0] * 9
+        assert plant.act(np.ones(1)).next_coordinates.tolist() == [0.5, 0, 0, 0, 0.5, 0, 0, 0, 1]
+        saved = plant.save()
+        assert plant.act(np.zeros(1)).next_coordinates.tolist() == [0, 0, 0, 0, -0.5, 0, 0, 0, 0]
+        assert plant.restore(saved).tolist() == [2**20, 0, 0, 0, 0.5, 0, 0, 0, 1]
+        with pytest.raises(StepFailed, match="expected a snapshot of at least 72 bytes"):
+            plant.restore(b"short")
     finally:
         plant.close()
 

@@ -1,12 +1,14 @@
 """An original environment that is a program, which answers each line of JSON with a line of JSON.
 
-Shapes: C coordinates, F action entries.
+Shapes: C coordinates, R of them measured and not lags, F action entries.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
+
+import numpy as np
 
 from surrogym_sampler.original.errors import MORE_TIME, EnvironmentDied, StepFailed, StepTimedOut, UnknownEnvironment
 from surrogym_sampler.original.executables.messages import (
@@ -21,6 +23,7 @@ from surrogym_sampler.original.executables.messages import (
 )
 from surrogym_sampler.original.executables.program import Program
 from surrogym_sampler.original.gymnasium import wrapped
+from surrogym_sampler.original.lags import begun, followed, placed, read_names
 from surrogym_sampler.original.limits import rest_seconds
 from surrogym_sampler.original.protocol import Array, RealStep
 from surrogym_shared.spec import EnvironmentSpec
@@ -35,6 +38,9 @@ class Executable:
     If the program dies, hangs or prints something other than an answer, the query fails, and the next query starts it
     once more.
 
+    A program may answer the R measured coordinates alone: if the specification to use adds lags to those that the
+    program declares, the lags are computed here.
+
     Args:
         program: the started program.
         own: the specification that the program declares.
@@ -48,6 +54,9 @@ class Executable:
         self._spec = spec
         self._step_limit = step_limit
         self._at: Array | None = None
+        # number of bytes that precede the program's in a snapshot: the coordinates, if lags are computed here
+        measured_alone = own.coordinate_names == read_names(spec) and own.coordinate_names != spec.coordinate_names
+        self._prefix = 8 * len(spec.coordinates) if measured_alone else 0
 
     def spec(self) -> EnvironmentSpec:
         return self._spec
@@ -56,7 +65,8 @@ class Executable:
         """Reset the program, and return the start coordinates (C,)."""
         self._at = None
         self._revive()
-        self._at = self._state(self._ask("reset", self._deadline(), seed=seed))
+        reply = self._ask("reset", self._deadline(), seed=seed)
+        self._at = begun(self._spec, self._read(reply)) if self._prefix else self._state(reply)
         return self._at
 
     def act(self, action: Array) -> RealStep:
@@ -82,14 +92,31 @@ class Executable:
 
     def save(self) -> bytes:
         """Return the program's snapshot of the current state: the text of its answer, as bytes."""
-        return text(self._ask("save", self._deadline()), "snapshot").encode()
+        snapshot = text(self._ask("save", self._deadline()), "snapshot").encode()
+        if not self._prefix:
+            return snapshot
+        if self._at is None:
+            raise StepFailed(
+                "expected a running episode, because a snapshot contains its earlier values (lags), got none: reset "
+                "the environment first"
+            )
+        return self._at.astype("<f8").tobytes() + snapshot
 
     def restore(self, snapshot: bytes) -> Array:
         """Let the program return to a snapshot, and return the coordinates (C,) there."""
         self._at = None
         self._revive()
-        reply = self._ask("restore", self._deadline(), snapshot=snapshot.decode(errors="replace"))
-        self._at = self._state(reply)
+        if len(snapshot) < self._prefix:
+            raise StepFailed(
+                f"expected a snapshot of at least {self._prefix} bytes, the size of the coordinates in it, got "
+                f"{len(snapshot)} bytes: delete the snapshots of this environment"
+            )
+        own = snapshot[self._prefix :].decode(errors="replace")
+        reply = self._ask("restore", self._deadline(), snapshot=own)
+        if self._prefix:
+            self._at = placed(self._spec, self._read(reply), np.frombuffer(snapshot[: self._prefix], dtype="<f8"))
+        else:
+            self._at = self._state(reply)
         return self._at
 
     def close(self) -> None:
@@ -99,10 +126,15 @@ class Executable:
     def _stepped(self, before: Array, action: Array, deadline: float) -> RealStep:
         sent = action_entries(self._spec.action, action)
         reply = self._ask("step", deadline, action=sent)
+        taken = numbers(reply if "action" in reply else {"action": sent}, "action", len(sent))
+        if self._prefix:
+            reached = followed(self._spec, before, taken, self._read(reply))
+        else:
+            reached = self._state(reply)
         return RealStep(
             coordinates=before,
-            action=numbers(reply if "action" in reply else {"action": sent}, "action", len(sent)),
-            next_coordinates=self._state(reply),
+            action=taken,
+            next_coordinates=reached,
             reward=number(reply, "reward"),
             terminated=truth(reply, "terminated"),
             truncated=truth(reply, "truncated"),
@@ -110,6 +142,9 @@ class Executable:
 
     def _state(self, reply: dict[str, object]) -> Array:
         return wrapped(self._spec, numbers(reply, "state", len(self._spec.coordinates)))
+
+    def _read(self, reply: dict[str, object]) -> Array:
+        return numbers(reply, "state", len(read_names(self._spec)))
 
     def _revive(self) -> None:
         """Start the program again if it has ended. Only the first request of a query may do so, because later requests
