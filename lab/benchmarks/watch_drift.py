@@ -7,16 +7,22 @@ same as on a server, in this process. Fouling takes 0.1 % of the actuator at eac
 A change shows only where it moves a state by more than its noise: a pendulum at rest does not feel its friction. So the
 steps are counted from the change, and those of them at which it shows.
 
+With ``--oracle``, a detector that knows both plants and the noise reads the same streams: CUSUM of the true
+log-likelihood ratio of each step, which gives an alarm at the logarithm of 10,000, so that false alarms are as seldom
+(Lorden 1971). It bounds what any detector can find. It knows when fouling began, too. Rewards have no noise, and would
+show a change at once: their noise is taken to be the smallest that the watcher's detector knows, a tenth of the
+tolerance.
+
 Run it by::
 
-    python lab/benchmarks/watch_drift.py --first-seed 460 --seeds 3
+    python lab/benchmarks/watch_drift.py --first-seed 460 --seeds 3 --oracle
 """
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple, cast
@@ -40,6 +46,7 @@ from surrogym_server.sampling.uncertainty import query_uncertainty
 from surrogym_shared.spec import Design
 from surrogym_shared.wire import SurrogateView
 from surrogym_trainer.evaluation.comparing import StepOfEpisode
+from surrogym_trainer.watching.detector import NEGLIGIBLE
 from surrogym_trainer.watching.watcher import BATCH, Alarm, Watcher
 
 HEALTHY = 7_000  # steps of the unchanged plant, for each plant and seed
@@ -47,6 +54,7 @@ BEFORE = 200  # steps before a change, and up to one episode more
 AFTER = 400
 AIM = 30  # steps
 EPISODES = 50  # of a mean return
+FOUND_BY = ("steps", "oracle")  # fields of a row
 FALSE_ALARM_STEPS = 10_000  # as `surrogym watch` has it
 Change = Callable[[Machine, int], dict[str, float]]  # the plant, steps since the change: parameters
 
@@ -80,11 +88,13 @@ class Row:
     output: str
     region: str
     lost: float | None  # share of the controller's gain that the fouling has cost at the alarm
+    oracle: int | None = None  # steps from the change up to the alarm of a detector that knows both plants
 
 
 class Stream(NamedTuple):
     steps: list[StepOfEpisode]
     showing: list[bool]  # whether the change moves a state by more than its noise
+    ratios: list[float]  # log-likelihood of each step in the changed plant, minus that in the healthy plant
 
 
 class Served:
@@ -114,6 +124,7 @@ class Case(NamedTuple):
     served: Served
     view: SurrogateView
     act: Callable[[Array], Array]
+    reward_noise: float  # standard deviation of the reward that an oracle takes
 
     def watcher(self) -> Watcher:
         return Watcher(cast(Api, self.served), self.view, FALSE_ALARM_STEPS)
@@ -131,7 +142,8 @@ def fitted(machine: Machine, seed: int) -> Case:
         for name, tolerance, one in zip(definition.outputs, made.tolerances, made.confidences, strict=True)
     ]
     view = SimpleNamespace(name="plant", spec=spec, model_version=1, fidelity=SimpleNamespace(outputs=outputs))
-    return Case(machine, Served(made), cast(SurrogateView, view), controller(machine))
+    least = NEGLIGIBLE * dict(zip(definition.outputs, made.tolerances, strict=True))["reward"]
+    return Case(machine, Served(made), cast(SurrogateView, view), controller(machine), least)
 
 
 def controller(machine: Machine) -> Callable[[Array], Array]:
@@ -166,7 +178,7 @@ def stream_of(case: Case, change: Change | None, at: int, count: int, seed: int)
     machine, rng = case.machine, np.random.default_rng([seed, 5])
     low, high = np.array(list(machine.start.values())).T
     spans = np.array([end - begin for begin, end in machine.ranges.values()])
-    found, showing, q, t, before = [], [], None, 0, np.zeros((1, machine.actions))
+    found, showing, ratios, q, t, before = [], [], [], None, 0, np.zeros((1, machine.actions))
     for i in range(count):
         if q is None:
             q, t, before = rng.uniform(low, high)[None], 0, np.zeros((1, machine.actions))
@@ -177,11 +189,53 @@ def stream_of(case: Case, change: Change | None, at: int, count: int, seed: int)
         shift = new.get("shift", 0.0) * np.eye(len(low))[0]
         moved = machine.formula(q - shift, taken, parameters)[0] + shift - machine.formula(q, u, machine.real)[0]
         showing.append(bool((np.abs(moved) > machine.noise * spans).any()))
+        if change is not None:
+            ratios.append(log_ratio(case, change(machine, max(i - at, 0)), (q, u, before), q_next, reward))
         state, action, following = (tuple(one[0].tolist()) for one in (q, u, q_next))
         found.append(StepOfEpisode(0, i, state, action, following, float(reward[0]), terminated=False))
         t, before = t + 1, u
         q = None if over[0] or t == machine.time_limit else q_next
-    return Stream(found, showing)
+    return Stream(found, showing, ratios)
+
+
+def log_ratio(
+    case: Case, new: Mapping[str, float], step: tuple[Array, Array, Array], q_next: Array, reward: Array
+) -> float:
+    """Log-likelihood ratio of one step, of a changed plant to the healthy one.
+
+    Args:
+        case: the plant.
+        new: parameters of the changed plant.
+        step: state (1, C), action (1, F) and the action before (1, F).
+        q_next: next state (1, C).
+        reward: (1,).
+    """
+    machine, (q, u, before) = case.machine, step
+    spans = np.array([high - low for low, high in machine.ranges.values()])
+    scale = np.append(machine.noise * spans, case.reward_noise)
+    shift = new.get("shift", 0.0) * np.eye(q.shape[1])[0]
+    healthy = machine.formula(q, u, machine.real)
+    changed = machine.formula(q - shift, before if new.get("delay") else u, {**machine.real, **new})
+
+    def squares(moved: Array, paid: Array) -> float:
+        off = (q_next - moved)[0]
+        turns = np.array([name in machine.angles for name in machine.ranges])
+        off = np.where(turns, (off + np.pi) % (2 * np.pi) - np.pi, off)
+        return float(((np.append(off, reward - paid) / scale) ** 2).sum())
+
+    return (squares(*healthy) - squares(changed[0] + shift, changed[1])) / 2
+
+
+def oracle_steps(stream: Stream, at: int) -> int | None:
+    """Steps from the change up to the alarm of CUSUM, which begins again after each false alarm before the change."""
+    total = 0.0
+    for i, ratio in enumerate(stream.ratios):
+        total = max(total, 0.0) + ratio
+        if total >= np.log(FALSE_ALARM_STEPS):
+            if i >= at:
+                return i + 1 - at
+            total = 0.0
+    return None
 
 
 def first_alarm(watcher: Watcher, steps: Sequence[StepOfEpisode]) -> Alarm | None:
@@ -199,16 +253,17 @@ def rows_of(case: Case, seed: int) -> Iterator[Row]:
             own = seed + 1_000 * (number + 1)
             at = 0 if at_once else BEFORE + int(np.random.default_rng(own).integers(case.machine.time_limit))
             stream = stream_of(case, change, at, at + AFTER, own)
+            oracle = oracle_steps(stream, at)
             alarm = first_alarm(case.watcher(), stream.steps)
             if alarm is None or alarm.line < at:
                 early = "" if alarm is None else "a false alarm before"
-                yield Row(case.machine.name, name, seed, at_once, None, None, early, "", None)
+                yield Row(case.machine.name, name, seed, at_once, None, None, early, "", None, oracle)
                 continue
             end = alarm.line + 1
             shown = sum(stream.showing[at:end])
             lost = lost_share(case, change(case.machine, end - at), seed) if name == "slow fouling" else None
             where = "" if alarm.region is None else alarm.region.words()
-            yield Row(case.machine.name, name, seed, at_once, end - at, shown, alarm.output, where, lost)
+            yield Row(case.machine.name, name, seed, at_once, end - at, shown, alarm.output, where, lost, oracle)
 
 
 def lost_share(case: Case, parameters: dict[str, float], seed: int) -> float:
@@ -239,17 +294,22 @@ def false_alarms(case: Case, seed: int, count: int) -> list[str]:
     return found
 
 
-def table(rows: Sequence[Row]) -> str:
-    lines = [
-        f"| plant | change | runs | found within {AIM} | steps: median, most | of these show it | "
-        "changed before: within, median |",
-        "|---|---|---|---|---|---|---|",
+def table(rows: Sequence[Row], *, oracle: bool) -> str:
+    head = [
+        *("plant", "change", "runs", f"found within {AIM}", "steps: median, most", "of these show it"),
+        "changed before: within, median, most",
+        *(["oracle: within, median, most", "oracle, changed before"] if oracle else []),
     ]
+    lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
     for plant, change in dict.fromkeys((row.plant, row.change) for row in rows):
         own = [row for row in rows if (row.plant, row.change) == (plant, change)]
         later, at_once = [one for one in own if not one.at_once], [one for one in own if one.at_once]
         cells = [plant, change, str(len(later)), _within(later), _steps(later), _shown(later)]
-        lines.append(f"| {' | '.join(cells)} | {_within(at_once)}, {_steps(at_once)} |")
+        cells.append(f"{_within(at_once)}, {_steps(at_once)}")
+        for some in (later, at_once) if oracle else ():
+            known = [replace(row, steps=row.oracle) for row in some]
+            cells.append(f"{_within(known)}, {_steps(known)}")
+        lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
@@ -271,6 +331,7 @@ def main() -> None:
     made = parser(__doc__)
     made.add_argument("--first-seed", type=int, default=400)
     made.add_argument("--seeds", type=int, default=3)
+    made.add_argument("--oracle", action="store_true", help="show what a detector finds that knows both plants")
     options = started(made)
     rows: list[Row] = []
     wrong: dict[str, list[str]] = {}
@@ -282,7 +343,9 @@ def main() -> None:
             wrong[f"{machine.name} {seed}"] = false_alarms(case, seed, steps)
             print(f"{machine.name} {seed}: {len(wrong[f'{machine.name} {seed}'])} false alarms in {steps} steps")
     lost = [row.lost for row in rows if row.lost is not None]
-    print(table(rows))
+    print(table(rows, oracle=options.oracle))
+    within = {name: sum((getattr(row, name) or AFTER) <= AIM for row in rows if not row.at_once) for name in FOUND_BY}
+    print(f"found within {AIM} steps of {sum(not row.at_once for row in rows)}: {within}")
     print(f"false alarms: {sum(map(len, wrong.values()))} in {steps * len(wrong)} healthy steps")
     print(f"gain lost by fouling at the alarm: median {np.median(lost):.1%}, most {max(lost):.1%}")
     write(options.out, "watch-drift", {"rows": [asdict(row) for row in rows], "false_alarms": wrong, "steps": steps})
