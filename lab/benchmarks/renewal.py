@@ -8,9 +8,12 @@ in the changed plant, and real returns there, means of 200 episodes:
 
 - old: of the policy of the plant before its change;
 - fresh: of a policy trained in the fresh model;
-- renewed: of a policy trained in a model whose prior is the old one, with a quarter of the fresh design's real steps.
+- renewed: of a policy trained in a model whose prior is the old one, with a quarter of the fresh design's real steps;
+- tuned: of a policy trained in the same model, beginning with the old policy's network.
 
-``share`` is how much of the fresh policy's gain over the old policy's plant without an action the renewed one has.
+``renewed_steps`` and ``tuned_steps`` are the virtual steps of the last two trainings, and ``renewed_reached`` and
+``tuned_reached`` those of them after which the imagined return had 95 % of the gain over no action that the better one
+of the two has at last. ``share`` is how much of the fresh policy's gain over no action the renewed one has.
 Rows are saved in ``--out``/renewal.csv, so that the same command continues after Ctrl-C.
 """
 
@@ -22,7 +25,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, NamedTuple
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 
@@ -34,7 +37,7 @@ import surrogym
 from support.levitation import LEVITATION, PENDULUM, TANKS, Plant, real_returns
 from surrogym_lab.reproduce.rows import read_records, write_records
 from surrogym_trainer.policies import load_policy
-from surrogym_trainer.training import TrainSettings, train
+from surrogym_trainer.training import TrainProgress, TrainSettings, train
 
 CHANGES = {
     "levitation": (LEVITATION, {"mass": 1.3}),
@@ -43,6 +46,7 @@ CHANGES = {
 }
 EPISODES = 200
 SEARCH = "FASTPPO"
+ENOUGH = 0.95  # of the gain, up to which a training counts as having reached it
 FEWEST = 4  # real steps of a renewal
 
 
@@ -58,6 +62,11 @@ class Row:
     old: float
     fresh: float
     renewed: float
+    tuned: float
+    renewed_steps: int
+    tuned_steps: int
+    renewed_reached: int
+    tuned_reached: int
 
     @property
     def share(self) -> float:
@@ -98,8 +107,14 @@ def run(plant: str, seed: int) -> Row:
     budget = max(FEWEST, fresh.steps // 4)
     renewed = design(machine, changed, seed + 1_000, budget, old.to_file())
     idle = value(lambda shown: np.zeros((len(shown), machine.actions)))
-    values = (value(policy(one, seed)) for one in (old, fresh, renewed))
-    return Row(plant, seed, fresh.steps, renewed.steps, idle, *values)
+    with TemporaryDirectory() as folder:
+        trained = [policy(one, seed, Path(folder) / f"{i}.zip") for i, one in enumerate((old, fresh, renewed))]
+        trained.append(policy(renewed, seed, Path(folder) / "tuned.zip", trained[0].path))
+        values = [value(load_policy(one.path, SEARCH)) for one in trained]
+    aim = idle + ENOUGH * (max(one.curve[-1][1] for one in trained[2:]) - idle)
+    steps = [one.curve[-1][0] for one in trained[2:]]
+    reached = [next((at for at, found in one.curve if found >= aim), -1) for one in trained[2:]]
+    return Row(plant, seed, fresh.steps, renewed.steps, idle, *values, *steps, *reached)
 
 
 def design(machine: Any, parameters: Mapping[str, float], seed: int, budget: int, prior: Any = None) -> surrogym.Design:
@@ -112,11 +127,23 @@ def design(machine: Any, parameters: Mapping[str, float], seed: int, budget: int
     return made
 
 
-def policy(learned: surrogym.Design, seed: int) -> Any:
-    """Train a policy in a model."""
-    with TemporaryDirectory() as folder:
-        result = train(learned.surrogate(), Path(folder) / "policy", TrainSettings(algorithm=SEARCH, seed=seed))
-        return load_policy(result.path, SEARCH)
+class Trained(NamedTuple):
+    """A trained policy."""
+
+    path: Path
+    curve: list[tuple[int, float]]  # virtual steps so far, best imagined return so far
+
+
+def policy(learned: surrogym.Design, seed: int, path: Path, start: Path | None = None) -> Trained:
+    """Train a policy in a model, from the network of another policy if one is given."""
+    curve: list[tuple[int, float]] = []
+
+    def record(now: TrainProgress) -> None:
+        if now.imagined_return is not None:
+            curve.append((now.steps, max(now.imagined_return, curve[-1][1] if curve else -np.inf)))
+
+    train(learned.surrogate(), path, TrainSettings(algorithm=SEARCH, seed=seed, start_from=start), record)
+    return Trained(path, curve)
 
 
 if __name__ == "__main__":

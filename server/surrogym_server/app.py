@@ -49,6 +49,7 @@ from surrogym_server.features.jobs import FEATURE as jobs
 from surrogym_server.features.policies import FEATURE as policies
 from surrogym_server.features.priors import FEATURE as priors
 from surrogym_server.features.ray.pool import CLUSTER as ray
+from surrogym_server.features.watching import FEATURE as watching
 from surrogym_server.file_permissions import keep_private
 from surrogym_server.models.registry import MODELS
 from surrogym_server.sampling.acquisition import ACQUISITIONS
@@ -75,6 +76,7 @@ FEATURES: tuple[Feature, ...] = (
     policies,
     jobs,
     priors,
+    watching,
 )
 # Clusters of machines that can run sessions and fits, by the value of the setting ``engine`` that chooses each.
 CLUSTERS: dict[str, Cluster] = {

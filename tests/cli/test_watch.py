@@ -6,6 +6,7 @@ import json
 import threading
 import time
 from collections.abc import Callable, Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,8 @@ from support.server import ServerProcess
 from support.tank import HEADING, lines, watched_tank, write
 from surrogym_client.errors import ServerUnreachable
 from surrogym_client.transport import Api
+from surrogym_client.transport.steps import StepCalls
+from surrogym_shared.wire.watching import MachineStep
 
 Watch = Callable[..., Said]
 
@@ -184,6 +187,35 @@ def test_the_watch_command_reads_a_log_from_standard_input(
         said = watch("-")
     assert said.code == 1
     assert "got none" in said.err
+
+
+def test_the_watch_command_finds_drift_in_steps_that_the_machine_posts(
+    on_server: Watch, server_process: ServerProcess, policy: Callable[[], Any], tank: str, tmp_path: Path
+):
+    """The same as in a log of these steps. They are posted in batches, one of them twice, and no model learns them."""
+    ledger = policy()[1]
+    options = ("--policy", "production", "--json")
+    said = on_server("watch", tank, *options)
+    assert said.code == 1
+    assert f"/v1/surrogates/{tank}/steps" in said.err
+    rows = lines(300, seed=11, worn_from=150)
+    cells = [[float(cell) for cell in row.split(",")] for row in rows]
+    steps = [
+        MachineStep(coordinates=[q], action=[u], next_coordinates=[after[1]], reward=paid)
+        for (_, q, u, paid), after in pairwise(cells)
+    ]
+    with Api(server_process.url) as api:
+        calls, machine = StepCalls(api.connection), api.surrogate(tank).spec.environment
+        for first in (0, 60, 60, 120, 180, 240):
+            calls.add(tank, machine, "pump", first, steps[first : first + 60], period=1.0)
+    posted = on_server("watch", tank, *options, "--follow")
+    logged = on_server("watch", tank, str(write(tmp_path / "log.csv", rows)), *options)
+    assert (posted.code, logged.code) == (1, 1)
+    assert posted.json["compared"] == logged.json["compared"]
+    assert posted.json["drift"] == {**logged.json["drift"], "line": logged.json["drift"]["line"] - 2}
+    assert policy()[1] == ledger
+    words = on_server("watch", tank, "--policy", "production")
+    assert f"found in step {posted.json['drift']['line']}" in words.out
 
 
 def test_the_watch_command_with_follow_refuses_a_log_that_became_shorter(

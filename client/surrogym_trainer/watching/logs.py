@@ -15,18 +15,17 @@ from surrogym_sampler.logs.reading import format_of
 from surrogym_shared.logs.checking import check_log
 from surrogym_shared.logs.columns import LogMapping
 from surrogym_shared.logs.roles import read_roles
-from surrogym_shared.logs.rows import BEYOND
+from surrogym_shared.logs.rows import OFF_PERIOD
 from surrogym_shared.logs.table import Ints
 from surrogym_shared.logs.text import decoded, table_of_text
 from surrogym_shared.logs.transitions import TooFewSteps
-from surrogym_shared.spec import EnvironmentSpec, limits
+from surrogym_shared.spec import EnvironmentSpec
 from surrogym_trainer.evaluation.comparing import StepOfEpisode
 
 LOOK_SECONDS = 1.0  # seconds between two reads of a log that grows
 LATEST = 1_000  # if a growing log has twice as many rows, all but this number of latest rows are dropped
 CHUNK = 2**20  # largest number of bytes that one read takes from a stream
 UNITS = (1.0, 1e3, 1e6, 1e9)  # the clock of a log may count seconds, or this number of units in a second
-OFF = 0.1  # a log is refused if the interval between its rows differs from the sampling period by more than this share
 
 Mapping_ = Path | Mapping[str, Any] | None
 
@@ -48,20 +47,6 @@ def steps_after(log: ReadLog, line: int) -> list[StepOfEpisode]:
         for i in range(len(steps))
         if lines[i] > line
     ]
-
-
-def impossible(spec: EnvironmentSpec, step: StepOfEpisode) -> str | None:
-    """Return a sentence about the coordinate of a step that is so far outside its range that its unit or measurement
-    must be wrong; None if no coordinate is."""
-    for number, coordinate in enumerate(spec.coordinates):
-        low, high = limits(coordinate.sampling)
-        if coordinate.kind == "angle" or low == high:
-            continue
-        far = BEYOND * (high - low)
-        for value in (step.coordinates[number], step.next_coordinates[number]):
-            if not low - far <= value <= high + far:
-                return f"{coordinate.name}: expected a value near its range of {low:.4g} to {high:.4g}, got {value:.6g}"
-    return None
 
 
 def read_once(path: Path, mapping: Mapping_, spec: EnvironmentSpec) -> ReadLog:
@@ -169,7 +154,7 @@ def _checked(log: ReadLog, spec: EnvironmentSpec) -> ReadLog:
     period, interval = spec.sampling_period, log.steps.interval
     if period is None or interval is None or log.roles.time is None:
         return log
-    if not any(abs(interval / (unit * period) - 1) <= OFF for unit in UNITS):
+    if not any(abs(interval / (unit * period) - 1) <= OFF_PERIOD for unit in UNITS):
         raise UnusableLog(
             f"expected a step every {period:g} s, the sampling_period of the specification, got one every "
             f"{interval:g} in the column {log.roles.time!r}: record the log at this period"

@@ -3,7 +3,7 @@ lie outside the ranges of a specification, or that seem to be in another unit.""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -143,6 +143,7 @@ def _action_limits(roles: Roles, spec: EnvironmentSpec | None) -> Ends:
 
 
 BEYOND = 20.0  # a log is refused if half of a column lies this many widths of the coordinate's range outside the range
+OFF_PERIOD = 0.1  # steps are refused if their interval differs from the sampling period by more than this share
 NARROW = 0.25  # if a log covers less than this share of a coordinate's range, the report notes it
 MOST_OUTSIDE = 0.1  # if more than this share of a log's rows lies outside a coordinate's range, the report notes it
 FEWEST = 8  # if the surrogate has fewer rewards of real steps, the rewards of a log are not compared with them
@@ -179,6 +180,19 @@ def require_units(q: Floats, spec: EnvironmentSpec, which: str = "") -> None:
                 f"{half}, outside its sampling range of {low:.4g} to {high:.4g}: {unit}. If the values are right, "
                 "widen the sampling range in a new specification (--spec)"
             )
+
+
+def impossible(spec: EnvironmentSpec, state: Sequence[float]) -> str | None:
+    """Return a sentence about the coordinate of a state (C,) that is so far outside its range that its unit or
+    measurement must be wrong; None if no coordinate is."""
+    for coordinate, value in zip(spec.coordinates, state, strict=True):
+        low, high = limits(coordinate.sampling)
+        if coordinate.kind == "angle" or low == high:
+            continue
+        far = BEYOND * (high - low)
+        if not low - far <= value <= high + far:
+            return f"{coordinate.name}: expected a value near its range of {low:.4g} to {high:.4g}, got {value:.6g}"
+    return None
 
 
 def unit_notes(q: Floats, spec: EnvironmentSpec) -> list[str]:

@@ -1,4 +1,4 @@
-"""``surrogym watch``: compare a log of real steps with the model, and withdraw a promise if the plant has changed."""
+"""``surrogym watch``: compare real steps with the model, and withdraw a promise if the plant has changed."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ from surrogym.cli.options import names_of_surrogates
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from surrogym_client.transport import Api
     from surrogym_shared.logs.checking import ReadLog
     from surrogym_shared.spec import EnvironmentSpec
     from surrogym_shared.terminal import Update
-    from surrogym_shared.wire import PolicyView
+    from surrogym_shared.wire import PolicyView, SurrogateView
     from surrogym_trainer.evaluation.comparing import StepOfEpisode
     from surrogym_trainer.watching.watcher import Alarm, Watcher
 
@@ -29,35 +30,39 @@ def command(
     context: typer.Context,
     surrogate: Annotated[str, typer.Argument(help="Name of the surrogate.", autocompletion=names_of_surrogates)],
     log: Annotated[
-        Path,
+        Path | None,
         typer.Argument(
             help="Log of real steps: CSV, NPZ, Parquet, HDF5 or a Minari data set; - reads lines of CSV from standard "
-            "input."
+            "input. [default: the steps that the machine posts to the server]",
+            show_default=False,
         ),
-    ],
-    policy: Annotated[
-        str, typer.Option(help="Policy whose promise depends on the machine: a version, an alias, or latest.")
-    ],
+    ] = None,
     mapping: Annotated[
         Path | None, typer.Option("--map", help="JSON or TOML file that says what each column of the log means.")
     ] = None,
     follow: Annotated[
-        bool, typer.Option("--follow", "-f", help="Continue with lines that are added to the log, until Ctrl-C.")
+        bool, typer.Option("--follow", "-f", help="Continue with steps that are added, until Ctrl-C.")
     ] = False,
     false_alarm_steps: Annotated[
         float, typer.Option(min=100, help="Average number of real steps up to a false alarm, at least.")
     ] = 10_000,
     *,
+    policy: Annotated[
+        str, typer.Option(help="Policy whose promise depends on the machine: a version, an alias, or latest.")
+    ],
     service: Service,
     output: Output,
 ) -> None:
-    """Find out whether the machine has changed, from a log.
+    """Find out whether the machine has changed.
 
-    Each step is compared with the model's prediction. No model learns from it. If the machine has changed, the command
-    says which output differs, by how much and where, and ends with exit status 1. The policy's promised return is
-    not trusted from then on. The model should fit the machine at first: surrogym audit tests that.
+    The steps come from a log, or from the machine, which posts them to the server. Each step is compared with the
+    model's prediction. No model learns from it. If the machine has changed, the command says which output differs, by
+    how much and where, and ends with exit status 1. The policy's promised return is not trusted from then on. The model
+    should fit the machine at first: surrogym audit tests that.
 
     Example: surrogym watch pendulum log.csv --policy production --follow
+
+    Example: surrogym watch pendulum --policy production --follow
     """
     from surrogym.cli.errors import CommandError
     from surrogym_shared.terminal import on_interrupt, progress
@@ -66,23 +71,20 @@ def command(
     with service.connect(context) as api:
         view, version = api.surrogate(surrogate), api.policies.get(surrogate, policy.rpartition("@")[2]).version
         if view.fidelity is None:
-            raise CommandError(f"{surrogate!r} has no model yet to compare the log with: let a sampler run first")
+            raise CommandError(f"{surrogate!r} has no model yet to compare the steps with: let a sampler run first")
         watcher, seen = Watcher(api, view, false_alarm_steps), _Seen()
         with (
             on_interrupt(lambda: f"interrupted; no drift in {watcher.compared} real steps"),
             progress("watch", quiet=output.quiet) as update,
         ):
-            for read in _logs(log, mapping, view.spec, follow=follow):
-                seen.add(read)
+            for _ in _readings(api, view, seen, log, mapping, follow=follow):
                 if (alarm := _watched(watcher, seen.steps, update, len(seen.rejected))) is not None:
                     break
             else:
                 alarm = None
         if not watcher.compared + watcher.left_out:
-            raise CommandError(
-                f"expected real steps in {log}, got none: give a log with two or more rows of an episode"
-            )
-        stored = None if alarm is None else _withdrawn(watcher, version, alarm)
+            raise CommandError(_words_of_none(view, log))
+        stored = None if alarm is None else _withdrawn(watcher, version, alarm, seen.place)
     named = f"{surrogate}@{version}"
     result = {
         "policy": named,
@@ -100,6 +102,32 @@ def command(
         raise typer.Exit(1)
 
 
+def _readings(
+    api: Api, view: SurrogateView, seen: _Seen, log: Path | None, mapping: Path | None, *, follow: bool
+) -> Iterator[None]:
+    """Read real steps from a log, or those that the machine posts, into ``seen``. Yields after each reading."""
+    from surrogym_trainer.watching.streams import posted
+
+    if log is None:
+        for steps in posted(api, view.name, follow=follow):
+            seen.steps, seen.place = steps, "step"
+            yield
+        return
+    for read in _logs(log, mapping, view.spec, follow=follow):
+        seen.add(read)
+        yield
+
+
+def _words_of_none(view: SurrogateView, log: Path | None) -> str:
+    """Return the error message that there are no real steps."""
+    if log is not None:
+        return f"expected real steps in {log}, got none: give a log with two or more rows of an episode"
+    return (
+        f"expected real steps that the machine has posted to {view.name!r}, got none: post them to "
+        f"/v1/surrogates/{view.name}/steps, or give a log"
+    )
+
+
 def _logs(log: Path, mapping: Path | None, spec: EnvironmentSpec, *, follow: bool) -> Iterator[ReadLog]:
     """Yield the log once. With ``follow``, or from standard input, yield its latest rows each time it has grown."""
     from surrogym_trainer.watching.logs import chunks_of_file, chunks_of_stream, read_growing, read_once
@@ -112,22 +140,27 @@ def _logs(log: Path, mapping: Path | None, spec: EnvironmentSpec, *, follow: boo
 
 
 class _Seen:
-    """Rows of a log that is read repeatedly: the usable steps of the last reading, and all unusable rows so far."""
+    """Real steps that are read repeatedly: the usable steps of the last reading, and all unusable rows so far."""
 
     def __init__(self) -> None:
         self.steps: list[StepOfEpisode] = []  # usable steps that the last reading of the log added
         self.rejected: dict[int, str] = {}  # for each unusable row so far, the reason, by the row's line number
         self.notes: tuple[str, ...] = ()
+        self.place = "line"  # what the number of a step counts
         self._line = 0
 
     def add(self, read: ReadLog) -> None:
         """Add a reading of the log. Rows that earlier readings had are left out."""
+        from surrogym_shared.logs.rows import impossible
         from surrogym_shared.words import has
-        from surrogym_trainer.watching.logs import impossible, steps_after
+        from surrogym_trainer.watching.logs import steps_after
 
         new = steps_after(read, self._line)
         self._line = max([self._line, *(step.number for step in new)])
-        faults = {step.number: reason for step in new if (reason := impossible(read.spec, step)) is not None}
+        spec, faults = read.spec, {}
+        for step in new:
+            if reason := impossible(spec, step.coordinates) or impossible(spec, step.next_coordinates):
+                faults[step.number] = reason
         self.steps = [step for step in new if step.number not in faults]
         self.rejected.update({**dict(read.rejected), **faults})
         ends = f"{has(read.steps.ends, 'row')} no next state, at the end of an episode or before a gap"
@@ -146,7 +179,7 @@ def _watched(watcher: Watcher, steps: list[StepOfEpisode], update: Update, rejec
     return None
 
 
-def _withdrawn(watcher: Watcher, version: int, alarm: Alarm) -> PolicyView:
+def _withdrawn(watcher: Watcher, version: int, alarm: Alarm, place: str) -> PolicyView:
     """Report a drift to the server, after which the policy's promised return is not trusted. If the report fails, print
     the drift, and raise the error."""
     from surrogym_client.errors import SurrogymClientError
@@ -155,7 +188,7 @@ def _withdrawn(watcher: Watcher, version: int, alarm: Alarm) -> PolicyView:
     try:
         return watcher.withdraw(version, alarm)
     except SurrogymClientError:
-        say(f"drift, found in line {alarm.line}, but not reported to the server: {alarm.words()}")
+        say(f"drift, found in {place} {alarm.line}, but not reported to the server: {alarm.words()}")
         raise
 
 
@@ -170,9 +203,11 @@ def _words(seen: _Seen, watcher: Watcher, alarm: Alarm | None, named: str) -> li
         lines.append(f"{counted(watcher.left_out, 'step')} left out, in which a constant changed or a lag is not known")
     if alarm is None:
         return [*lines, f"no drift in {counted(watcher.compared, 'real step')}"]
-    found = f"drift, found in line {alarm.line} after {counted(alarm.compared, 'real step')}: {alarm.words()}"
+    found = f"drift, found in {seen.place} {alarm.line} after {counted(alarm.compared, 'real step')}: {alarm.words()}"
     if alarm.from_the_start:
-        found += "; it is there from the start, so the log may be of another machine, or the model was never right here"
+        found += (
+            "; it is there from the start, so the steps may be of another machine, or the model was never right here"
+        )
     return [
         *lines,
         found,
