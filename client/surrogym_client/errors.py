@@ -3,7 +3,8 @@
 SurrogymClientError
 ├── ServerUnreachable       no answer within the retry budget; the last request may have been carried out
 │   └── RequestTimeout      the server took the request and did not answer in time
-├── UnusableToken           the file that should hold the token can't be used; nothing was sent
+├── UnusableToken           the token, or the file that should hold it, can't be used; nothing was sent
+├── UnusableCertificates    the file of trusted certificates can't be used; nothing was sent
 ├── ProtocolMismatch        the answer does not follow this version of the protocol
 └── ProblemError            the server refused; ``problem`` is its body, and nothing was changed
     ├── InvalidInput        the request can't be used: wrong route, field, shape, type or range
@@ -67,7 +68,13 @@ class RequestTimeout(ServerUnreachable):
 
 
 class UnusableToken(SurrogymClientError):
-    """The token file can't be read, or does not contain a token. Check its path, and its only line."""
+    """The token can't be sent, or its file can't be read or has no token. Check the token, or its file's only line."""
+
+
+class UnusableCertificates(SurrogymClientError):
+    """The file of trusted certificates, ``SSL_CERT_FILE``, can't be used. Correct its path, or unset the variable."""
+
+    way_out = "correct the path, or unset SSL_CERT_FILE"
 
 
 class ProtocolMismatch(SurrogymClientError):

@@ -15,6 +15,7 @@ from surrogym_server.errors import InvalidInput
 from surrogym_server.logs import LogFormat
 from surrogym_server.storage.records import Synchronous
 from surrogym_shared.faults import first_fault
+from surrogym_shared.patterns import IN_WORDS, TOKEN
 from surrogym_shared.secret_files import parse_token, tokens_in
 from surrogym_shared.wire import MAX_LANES, Role
 
@@ -146,6 +147,8 @@ class Settings(BaseModel):
                 f"expected tokens of at least {MIN_TOKEN_LENGTH} characters, got one of {len(short[0])}: choose longer "
                 "tokens"
             )
+        if not all(re.fullmatch(TOKEN, token) for token in self.tokens):
+            raise ValueError(f"expected tokens of {IN_WORDS[TOKEN]}, got one with others: no header can contain it")
         if not (self.tokens or self.insecure or self.loopback):
             raise ValueError(
                 f"host {self.host} can be reached from other machines: expected a token, got none: set SURROGYM_TOKEN, "

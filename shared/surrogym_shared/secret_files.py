@@ -9,6 +9,7 @@ from typing import get_args
 
 from surrogym_shared.wire import Role
 
+MAX_BYTES = 64 * 2**10  # largest size of a file of tokens
 OTHERS = stat.S_IRGRP | stat.S_IROTH
 
 
@@ -31,9 +32,17 @@ def tokens_in(path: Path) -> dict[str, Role]:
 
     Raises:
         OSError: the file can't be read.
-        ValueError: the file has no token, or an unknown role; the message contains no token.
+        ValueError: the file has no token, an unknown role, or too many bytes; the message contains no token.
     """
-    lines = [line.strip() for line in path.read_text(encoding="utf-8").splitlines()]
+    with path.open("rb") as file:
+        content = file.read(MAX_BYTES + 1)
+    if len(content) > MAX_BYTES:
+        raise ValueError(f"expected at most {MAX_BYTES} bytes, got more: is this another file?")
+    try:
+        text = content.decode()
+    except UnicodeDecodeError:
+        raise ValueError("expected UTF-8, got other bytes: is this another file?") from None
+    lines = [line.strip() for line in text.splitlines()]
     if not any(lines):
         raise ValueError("expected lines of the form role:token, got an empty file: write a line such as sample:TOKEN")
     return dict(parse_token(line) for line in lines if line)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import re
+import subprocess
+import sys
 
 import pytest
 
@@ -130,3 +132,11 @@ def test_the_status_command_with_watch_fits_a_narrow_terminal_and_ends_with_ctrl
     assert [line for line in lines if len(line) > 60] == []
     assert "Traceback" not in terminal.shown
     assert {f"output               {name}" for name in ("theta", "speed", "reward")} <= set(lines)
+
+
+@pytest.mark.parametrize("closed", ["<&-", ">&-", "2>&-"])
+def test_a_command_with_a_closed_standard_stream_ends_as_usual(on_server, server_process, name, closed):
+    on_server("register", "Pendulum-v1", "--name", name)
+    script = f'"{sys.executable}" -m surrogym status --server {server_process.url} {closed}'
+    ended = subprocess.run(["sh", "-c", script], capture_output=True, text=True, check=False)
+    assert (ended.returncode, ended.stderr) == (0, "")

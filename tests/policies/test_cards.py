@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from surrogym_trainer.policies.card import PolicyCard, UnusablePolicy, require_card_or_none, write_card
+from surrogym_trainer.policies.card import PolicyCard, UnusablePolicy, require_place, write_card
 
 
 @pytest.mark.parametrize("content", ["{}", '{"model": "cstr"}', "[1, 2]", "3", "level, valve", ""])
@@ -14,12 +14,17 @@ def test_writing_a_policy_description_never_replaces_an_unrelated_file(content: 
     other = tmp_path / "tank.json"
     other.write_text(content)
     with pytest.raises(UnusablePolicy, match=r"tank\.json, which is not a card: choose another name"):
-        require_card_or_none(tmp_path / "tank.zip")
+        require_place(tmp_path / "tank.zip")
     assert other.read_text() == content
 
 
 def test_writing_a_policy_description_replaces_an_earlier_one(tmp_path: Path) -> None:
     policy = tmp_path / "tank.zip"
-    require_card_or_none(policy)
+    require_place(policy)
     write_card(policy, PolicyCard())
-    require_card_or_none(policy)
+    require_place(policy)
+
+
+def test_a_folder_is_refused_as_the_file_of_a_policy(tmp_path: Path) -> None:
+    with pytest.raises(UnusablePolicy, match=r"expected a file for the policy, got the folder .*: add a file name"):
+        require_place(tmp_path)

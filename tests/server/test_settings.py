@@ -87,6 +87,13 @@ def test_the_error_for_an_invalid_token_does_not_print_it():
     assert "secret" not in str(refusal.value)
 
 
+@pytest.mark.parametrize("token", ["geheimnis-ü", "a-secret\there", "a-secret\x7f"])
+def test_a_token_that_no_header_can_contain_is_refused(token: str):
+    with pytest.raises(InvalidInput, match="expected tokens of letters, digits and signs of ASCII") as refusal:
+        read_settings({"SURROGYM_TOKEN": token})
+    assert token not in str(refusal.value)
+
+
 def test_the_error_for_a_token_containing_a_colon_does_not_print_it():
     with pytest.raises(InvalidInput) as refusal:
         read_settings({"SURROGYM_TOKENS": "secret-half:other-half"})

@@ -148,6 +148,7 @@ def test_the_token_can_be_read_from_a_file(monkeypatch: pytest.MonkeyPatch, tmp_
         (None, "can't be read: No such file or directory"),
         ("", "expected lines of the form role:token, got an empty file"),
         ("read:one-secret\ntrain:two-secret", "expected one token, got 2"),
+        ("a-secret\n" + "x" * 2**17, "expected at most 65536 bytes, got more"),
         ("king:a-secret", "a token's role: expected one of read, train, sample, admin before the colon, got another"),
     ],
 )
@@ -203,3 +204,18 @@ def test_a_server_address_with_a_password_is_refused_without_showing_it():
     with pytest.raises(errors.ServerUnreachable, match="without user and password") as refused:
         Connection("http://bob:hunter2@127.0.0.1:1", None)
     assert "hunter2" not in str(refused.value)
+
+
+@pytest.mark.parametrize("token", ["a-secret\nX: y", "a-secret\t", "geheim-ü", "a-secret ", "a\udcffsecret"])
+def test_a_token_that_no_header_can_contain_is_refused_without_showing_it(token: str):
+    with pytest.raises(errors.UnusableToken, match="a token: expected letters, digits and signs of ASCII") as refusal:
+        Connection("http://127.0.0.1:1", token)
+    assert "secret" not in str(refusal.value)
+    assert "geheim" not in str(refusal.value)
+
+
+def test_an_unusable_file_of_certificates_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    for file, reason in ((tmp_path / "missing.pem", "No such file"), (Path(__file__), "no certificate")):
+        monkeypatch.setenv("SSL_CERT_FILE", str(file))
+        with pytest.raises(errors.UnusableCertificates, match=rf"SSL_CERT_FILE: expected .*{file.name}.*{reason}"):
+            Connection("http://127.0.0.1:1")

@@ -7,6 +7,7 @@ section of their own. An error names the replacement of a command or an option t
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
@@ -159,6 +160,7 @@ def run(built: Callable[[], typer.Typer], name: str, arguments: Sequence[str] | 
         name: name of the program in messages.
         arguments: arguments of the program; None takes those of this process.
     """
+    _open_closed_streams()
     try:
         built()(args=None if arguments is None else list(arguments), prog_name=name)
     except KeyboardInterrupt:
@@ -169,6 +171,14 @@ def run(built: Callable[[], typer.Typer], name: str, arguments: Sequence[str] | 
             raise
         say(f"error: {message}")
         sys.exit(1)
+
+
+def _open_closed_streams() -> None:
+    """Open the null device in place of each standard stream that was closed before this process started (``>&-``),
+    because Python has None there."""
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, mode))  # noqa: SIM115, it stays open until the process ends
 
 
 def build() -> typer.Typer:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import random
+import re
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -22,11 +23,13 @@ from surrogym_client.errors import (
     ServerUnreachable,
     SurrogymClientError,
     Unavailable,
+    UnusableCertificates,
     UnusableToken,
     error_from_problem,
 )
 from surrogym_client.transport.stream import Stream, StreamUnavailable
 from surrogym_shared.codes import Problem
+from surrogym_shared.patterns import IN_WORDS, TOKEN
 
 T = TypeVar("T")
 
@@ -91,7 +94,8 @@ class Connection:
 
     Raises:
         ServerUnreachable: ``url`` is not a valid address.
-        UnusableToken: the token file can't be used.
+        UnusableToken: the token file can't be used, or no header can contain the token.
+        UnusableCertificates: the file ``SSL_CERT_FILE`` can't be used.
     """
 
     def __init__(
@@ -104,7 +108,7 @@ class Connection:
         self.url = _checked(url or os.environ.get(URL_VARIABLE) or DEFAULT_URL)
         self.timeouts = timeouts or Timeouts()
         self.retries = retries or Retries()
-        self._token = token if token is not None else _token_of_environment()
+        self._token = _sendable(token if token is not None else _token_of_environment())
         self._client = _new_client(self.url, self._token)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -275,6 +279,13 @@ def _token_of_environment() -> str | None:
     return os.environ.get(TOKEN_VARIABLE) or (token_in(Path(file)) if file else None)
 
 
+def _sendable(token: str | None) -> str | None:
+    """Return a token that a header can contain. Else raise an error that does not show the token."""
+    if token and not re.fullmatch(TOKEN, token):
+        raise UnusableToken(f"a token: expected {IN_WORDS[TOKEN]}, got other characters: correct it where you set it")
+    return token
+
+
 def _checked(url: str) -> str:
     try:
         parsed = httpx.URL(url)
@@ -292,7 +303,14 @@ def _checked(url: str) -> str:
 def _new_client(url: str, token: str | None) -> httpx.Client:
     headers = {"Authorization": f"Bearer {token}"} if token else {}
     limits = httpx.Limits(keepalive_expiry=_KEEPALIVE_SECONDS)
-    trusted = httpx.create_ssl_context()  # reads SSL_CERT_FILE also for loopback hosts, for which trust_env is false
+    try:
+        # reads SSL_CERT_FILE also for loopback hosts, for which trust_env is false
+        trusted = httpx.create_ssl_context()
+    except OSError as error:
+        file = os.environ.get("SSL_CERT_FILE")
+        raise UnusableCertificates(
+            f"SSL_CERT_FILE: expected a file of trusted certificates in PEM, got {file!r}: {error.strerror or error}"
+        ) from error
     return httpx.Client(headers=headers, limits=limits, verify=trusted, trust_env=not _is_loopback(url))
 
 

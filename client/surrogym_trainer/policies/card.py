@@ -80,12 +80,15 @@ def card_path(policy: Path) -> Path:
     return policy.with_suffix(".json")
 
 
-def require_card_or_none(policy: Path) -> None:
-    """Raise an error if the card of a policy would replace another kind of file, such as a specification.
+def require_place(policy: Path) -> None:
+    """Raise an error if a policy can't be written to a file, or if its card would replace another kind of file, such as
+    a specification.
 
     Raises:
-        UnusablePolicy: a JSON file with the card's name exists and is not a card.
+        UnusablePolicy: the file is a folder, or a JSON file with the card's name exists and is not a card.
     """
+    if policy.is_dir():
+        raise UnusablePolicy(f"expected a file for the policy, got the folder {policy}: add a file name")
     path = card_path(policy)
     if not path.exists():
         return

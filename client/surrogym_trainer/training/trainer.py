@@ -8,7 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from surrogym_shared.port import SurrogatePort
-from surrogym_trainer.policies.card import card_path, require_card_or_none
+from surrogym_trainer.policies.card import card_path, require_place
 from surrogym_trainer.training.search import (
     Found,
     Progress,
@@ -43,7 +43,7 @@ def train(
             of file.
         TrainingInterrupted: Ctrl-C was pressed; the policy with the best imagined return so far is saved.
     """
-    require_card_or_none(out)
+    require_place(out)
     settings = with_algorithm(settings or TrainSettings(), port.spec())
     search = search_for(settings)
     if search.tracked:

@@ -116,11 +116,11 @@ def get(
     Example: surrogym policy get pendulum@production --out policy.zip
     """
     from surrogym_client.errors import UnknownPolicy
-    from surrogym_trainer.policies.card import require_card_or_none, write_card
+    from surrogym_trainer.policies.card import require_place, write_card
 
     name, which = parsed(policy)
     form: Any = out.suffix.lower().removeprefix(".")
-    require_card_or_none(out)
+    require_place(out)
     with service.connect(context) as api:
         found, card = stored_card(api, name, which)
         try:
