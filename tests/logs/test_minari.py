@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -15,6 +16,7 @@ from surrogym_sampler.logs import UnusableLog, read_log
 
 minari = pytest.importorskip("minari")
 h5py = pytest.importorskip("h5py")
+serialize_space = pytest.importorskip("minari.serialization").serialize_space
 
 STEPS = 20
 NAME = "forged/made-v0"
@@ -66,6 +68,11 @@ def shifted(file: Any) -> None:
     replaced("rewards", np.zeros(STEPS + 1), "episode_1")(file)
 
 
+def without_ids(file: Any) -> None:
+    """Both episodes have the same id, so that they were taken for one."""
+    file["episode_1"].attrs["id"] = 0
+
+
 def huge(file: Any) -> None:
     """24 GB of zeros in a few bytes."""
     replaced("rewards", None)(file)
@@ -78,7 +85,10 @@ def huge(file: Any) -> None:
         (replaced("rewards", None), "an episode that can't be read"),
         (replaced("observations", None), "an episode that can't be read"),
         (replaced("observations", np.zeros((STEPS + 1, 3), np.float32)), "an episode that can't be read"),
-        (without_an_episode, "an episode that can't be read"),
+        (without_an_episode, "expected 2 episodes in .*, as its metadata say, got 1"),
+        (replaced("rewards", np.zeros(STEPS, [("a", "f8"), ("b", "i4")])), "an episode that can't be read"),
+        (replaced("rewards", np.array([b"1.0"] * STEPS)), "an episode that can't be read"),
+        (replaced("actions", np.ones((STEPS, 1)) * 1j), "an episode that can't be read"),
         (replaced("actions", np.zeros((STEPS - 1, 1))), "in episode 0"),
         (shifted, "in episode 0"),
         (huge, "at most"),
@@ -92,3 +102,33 @@ def test_a_forged_minari_data_set_is_refused_in_a_sentence(main_file: Path, chan
         change(file)
     with pytest.raises(UnusableLog, match=says):
         read_log(NAME)
+
+
+def test_episodes_of_one_id_remain_two(main_file: Path):
+    with h5py.File(main_file, "a") as file:
+        without_ids(file)
+    assert len(set(read_log(NAME).table.columns["episode"])) == 2
+
+
+@pytest.mark.parametrize(
+    ("metadata", "says"),
+    [
+        ({"total_episodes": 10**9}, "expected at most .* rows"),
+        ({"total_episodes": 1}, "expected 1 episodes in .*, as its metadata say, got 2"),
+        ({"total_episodes": "many"}, "with its number of episodes, got others"),
+        ({"action_space": '{"type": "os.system"}'}, "metadata that can't be read"),
+        ({"action_space": None}, "metadata that can't be read"),
+        ({"data_format": "pickle"}, "metadata that can't be read"),
+        ({"action_space": serialize_space(gymnasium.spaces.Box(-1, 1, (3,)))}, "an episode that can't be read"),
+        ("[1]", "with its number of episodes, got others"),
+        ("[" * 100_000, "with its number of episodes, got others"),
+        ("x" * 2**25, "expected metadata of at most 16,777,216 bytes"),
+    ],
+)
+def test_forged_metadata_of_a_minari_data_set_are_refused_in_a_sentence(main_file: Path, metadata: Any, says: str):
+    """Tracebacks, minutes for a thousand million episodes, and actions of another width than declared."""
+    file = main_file.with_name("metadata.json")
+    forged = metadata if isinstance(metadata, str) else json.dumps({**json.loads(file.read_text()), **metadata})
+    file.write_text(forged)
+    with pytest.raises(UnusableLog, match=says):
+        read_log(main_file.parent.parent)

@@ -268,3 +268,10 @@ def test_any_environment_error_becomes_text_that_can_be_sent(error: Exception, s
     for described in (sentence(error), sentence(StepFailed(str(error))) if error.args else said):
         assert said.partition(": ")[2] in described
         described.encode()
+
+
+def test_a_very_long_environment_error_is_cut():
+    """Three megabytes were printed for each query."""
+    said = sentence(ValueError("y" * 3_000_000))
+    assert said.endswith("y ... (of 3000000 characters)")
+    assert len(said) < 2_100

@@ -36,6 +36,8 @@ class Moody:
             os._exit(7)
         if mood == 4:
             sys.exit("the licence has expired")
+        if mood == 5:
+            raise KeyboardInterrupt
         return RealStep(coordinates, action, coordinates, reward=float(os.getpid()))
 
     def close(self):
@@ -79,7 +81,9 @@ def test_an_error_in_an_isolated_environment_fails_one_step_only(moody):
     assert step(moody, 0).reward == child
 
 
-@pytest.mark.parametrize(("mood", "error"), [(2, StepTimedOut), (3, EnvironmentDied), (4, EnvironmentDied)])
+@pytest.mark.parametrize(
+    ("mood", "error"), [(2, StepTimedOut), (3, EnvironmentDied), (4, EnvironmentDied), (5, EnvironmentDied)]
+)
 def test_an_isolated_environment_that_hangs_or_dies_is_replaced(moody, mood, error):
     child = int(step(moody, 0).reward)
     with pytest.raises(error):
@@ -94,6 +98,13 @@ def test_an_isolated_environment_that_calls_exit_reports_the_reason_and_is_close
         with pytest.raises(EnvironmentDied, match=r"during step_from: SystemExit: the licence has expired \(test_iso"):
             step(environment, 4)
         assert (tmp_path / "closed").exists()
+
+
+def test_an_isolated_environment_that_raises_keyboard_interrupt_reports_the_line(moody, capfd):
+    """A traceback was printed, and only an exit code reported."""
+    with pytest.raises(EnvironmentDied, match=r"during step_from: KeyboardInterrupt \(test_isolated.py"):
+        step(moody, 5)
+    assert "Traceback" not in capfd.readouterr().err
 
 
 def test_an_environment_factory_that_calls_exit_reports_the_reason():

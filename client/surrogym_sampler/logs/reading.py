@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from math import prod
 from pathlib import Path
@@ -21,6 +22,9 @@ from surrogym_shared.words import listed
 MINARI_FILE = "main_data.hdf5"  # file of a Minari data set that contains its arrays
 Format = Literal["csv", "npz", "parquet", "hdf5", "minari", "surrogate"]
 
+# what a file that is damaged or forged makes a reader of another library raise
+UNREADABLE = (LookupError, ValueError, AssertionError, TypeError, AttributeError, RuntimeError, OSError)
+MOST_METADATA = 16 * 2**20  # largest size of the metadata of a Minari data set, in bytes
 MOST_BYTES = 1024**3  # largest total size of the arrays of a log, in bytes
 HDF5 = b"\x89HDF\r\n\x1a\n"
 # First entry of a zip file that is not an NPZ, and what the file is.
@@ -254,34 +258,58 @@ def read_minari(path: Path) -> Table:
     """Read all episodes of the Minari data set with this name or in this folder. Its observations and actions must be
     vectors."""
     minari = _minari()
+    _require_metadata(path)
     try:
         data = minari.MinariDataset(path / "data") if path.is_dir() else minari.load_dataset(str(path))
-    except (ValueError, KeyError, AssertionError) as error:
+        observations, actions = data.observation_space, data.action_space
+    except UNREADABLE as error:
         raise UnusableLog(
-            f"expected a Minari data set in {path}, got one that can't be read: {error}; record it again"
+            f"expected a Minari data set in {path}, got one with metadata that can't be read "
+            f"({type(error).__name__}: {_line(error)}): record it again"
         ) from error
-    width = _width(path, data.observation_space)
-    spaces = _declared(path, data.action_space)
-    episodes = _episodes(path, data, width)
+    width, spaces = _width(path, observations), _declared(path, actions)
+    episodes = _episodes(path, data, (width, prod(actions.shape)))
     return replace(
         table_of_arrays(path, {name: np.concatenate([e[name] for e in episodes]) for name in episodes[0]}), **spaces
     )
 
 
-def _episodes(path: Path, data: Any, width: int) -> list[dict[str, Cells]]:
+def _require_metadata(path: Path) -> None:
+    """Raise ``UnusableLog`` if the metadata of a Minari data set are too large, or promise more episodes than rows may
+    be read: Minari lists the episodes in memory when it opens a data set."""
+    from minari.storage.local import get_dataset_path
+
+    file = (path if path.is_dir() else get_dataset_path(str(path))) / "data" / "metadata.json"
+    if not file.is_file():
+        return
+    if (size := file.stat().st_size) > MOST_METADATA:
+        raise UnusableLog(
+            f"expected metadata of at most {MOST_METADATA:,} bytes in {file}, got {size:,}: record the data set again"
+        )
+    try:
+        episodes = int(json.loads(file.read_bytes())["total_episodes"])
+    except UNREADABLE as error:
+        raise UnusableLog(
+            f"expected the metadata of a Minari data set in {file}, with its number of episodes, got others: record "
+            "the data set again"
+        ) from error
+    require_sizes(file, episodes, episodes)
+
+
+def _episodes(path: Path, data: Any, widths: tuple[int, int]) -> list[dict[str, Cells]]:
     """Return the arrays of each episode by name, after a check of their total size.
 
     Args:
         path: the data set, for messages.
         data: the opened data set.
-        width: number of entries of an observation.
+        widths: number of entries of an observation and of an action.
     """
     try:
         _require_minari(path, data)
-        episodes = [_of_episode(episode, width) for episode in data.iterate_episodes()]
+        episodes = [_of_episode(n, episode, widths) for n, episode in enumerate(data.iterate_episodes())]
     except UnusableLog:
         raise
-    except (LookupError, ValueError, AssertionError, TypeError, AttributeError, RuntimeError, OSError) as error:
+    except UNREADABLE as error:
         raise UnusableLog(
             f"expected a Minari data set in {path}, got one with an episode that can't be read: record it again"
         ) from error
@@ -299,18 +327,23 @@ def _episodes(path: Path, data: Any, width: int) -> list[dict[str, Cells]]:
     return episodes
 
 
-def _of_episode(episode: Any, width: int) -> dict[str, Cells]:
-    seen = np.asarray(episode.observations)
-    if prod(seen.shape[1:]) != width:
-        raise ValueError(f"expected observations of {width} numbers, got an array of shape {seen.shape}")
+def _of_episode(number: int, episode: Any, widths: tuple[int, int]) -> dict[str, Cells]:
+    seen, actions = np.asarray(episode.observations), _rows(np.asarray(episode.actions))
+    width = widths[0]
+    if (prod(seen.shape[1:]), prod(actions.shape[1:])) != widths:
+        raise ValueError(
+            f"expected observations and actions of {widths} numbers, got arrays of shapes {seen.shape}, {actions.shape}"
+        )
+    if any(np.asarray(one).dtype.kind not in "fiub" for one in (episode.rewards, seen, actions)):
+        raise TypeError("expected numbers")
     return {
         "observations": seen[:-1].reshape(-1, width),
-        "actions": _rows(np.asarray(episode.actions)),
+        "actions": actions,
         "next_observations": seen[1:].reshape(-1, width),
         "reward": np.asarray(episode.rewards),
         "terminated": np.asarray(episode.terminations),
         "truncated": np.asarray(episode.truncations),
-        "episode": np.full(len(episode.rewards), episode.id),
+        "episode": np.full(len(episode.rewards), number),  # not its id, which two episodes may share
     }
 
 
@@ -325,6 +358,11 @@ def _require_minari(path: Path, data: Any) -> None:
 
     sizes: list[int] = []
     with h5py.File(file, "r") as opened:
+        if len(opened) != data.total_episodes:
+            raise UnusableLog(
+                f"expected {data.total_episodes} episodes in {file}, as its metadata say, got {len(opened)}: record "
+                "them again"
+            )
         opened.visititems(lambda _, one: sizes.append(one.size) if isinstance(one, h5py.Dataset) else None)
     require_sizes(path, max(sizes, default=0), sum(sizes))
 

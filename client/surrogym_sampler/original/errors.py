@@ -27,6 +27,7 @@ import traceback
 MORE_TIME = "a larger --step-limit gives it more time"
 # Errors of a user's environment that are caught. KeyboardInterrupt is not: the user pressed Ctrl-C.
 RAISED = (Exception, SystemExit)
+LONGEST = 2_000  # characters of a foreign exception's message that are reported
 
 
 class OriginalError(Exception):
@@ -121,12 +122,14 @@ class RequestRefused(StepFailed):
 
 
 def message_of(error: BaseException) -> str:
-    """Return the message of a foreign exception, as text that can be sent and printed. Never raises, even if the
-    exception's own code does."""
+    """Return the message of a foreign exception, as text that can be sent and printed, and at most ``LONGEST``
+    characters of it. Never raises, even if the exception's own code does."""
     try:
         said = str(error)
     except RAISED as failed:
         return f"its message can't be read, because of {type(failed).__name__}"
+    if len(said) > LONGEST:
+        said = f"{said[:LONGEST]} ... (of {len(said)} characters)"
     return said.encode(errors="backslashreplace").decode()
 
 

@@ -261,8 +261,8 @@ def _serve(pipe: Connection, factory: Factory, step_limit: float, fallback: str 
 
 
 def _serve_one(pipe: Connection, environment: Environment, working: _Ending) -> str:
-    """Answer one request, and return its method. Raises ``SystemExit`` if the environment's code called
-    ``sys.exit``."""
+    """Answer one request, and return its method. Raises ``SystemExit`` if the environment's code called ``sys.exit``
+    or raised ``KeyboardInterrupt``."""
     number, method, arguments = pipe.recv()
     with working:
         ok, value = _answer(environment, method, arguments)
@@ -274,7 +274,7 @@ def _serve_one(pipe: Connection, environment: Environment, working: _Ending) -> 
 
 def _answer(environment: Environment, method: str, arguments: tuple[Any, ...]) -> tuple[bool | None, Any]:
     """Call a method of the environment, and return the answer (ok, value). ``ok`` is None if the method called
-    ``sys.exit``, False if it raised an error."""
+    ``sys.exit`` or raised ``KeyboardInterrupt`` (Ctrl-C does not reach this process), False if it raised an error."""
     try:
         value = getattr(environment, method)(*arguments)
         return True, value.model_dump() if isinstance(value, EnvironmentSpec) else value
@@ -282,7 +282,7 @@ def _answer(environment: Environment, method: str, arguments: tuple[Any, ...]) -
         return False, StepRefused(str(refused))
     except Exception as error:
         return False, sentence(error)
-    except SystemExit as error:
+    except (SystemExit, KeyboardInterrupt, GeneratorExit) as error:
         return None, sentence(error)
 
 
