@@ -307,6 +307,7 @@ class EvaluationView(Reply):
         description="whether the mean return is at least the lower end of the policy's promise; null without a "
         "promise, with fewer than 30 episodes, or if the environment or the starts are other ones"
     )
+    pushed_by: str | None = Field(default=None, description="who stored it, as for a policy")
 
 
 class EvaluationDetail(EvaluationView):

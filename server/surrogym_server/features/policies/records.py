@@ -15,7 +15,8 @@ from surrogym_shared.wire import FEWEST_TO_JUDGE
 
 MAX_POLICIES = 200  # largest number of policies of a surrogate
 MAX_EVALUATIONS = 100  # largest number of evaluations and reports of drift of a policy
-PUSHED_BY = "pushed_by"  # key in a card: role and fingerprint of the token that stored the policy
+# key in a card, or in the summary of an evaluation or a drift: role and fingerprint of the token that stored it
+PUSHED_BY = "pushed_by"
 DRIFT = "drift"  # key in the summary of a report of drift; summaries of episodes don't have it
 
 

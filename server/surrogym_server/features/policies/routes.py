@@ -183,11 +183,15 @@ def file(name: str, which: Which, form: PolicyForm, policies: Policies) -> Respo
     responses=documented(*THERE, Code.TOO_LARGE),
 )
 def evaluate(
-    name: str, version: Version, body: Annotated[AddEvaluation, example(EVALUATION_EXAMPLE)], policies: Policies
+    name: str,
+    version: Version,
+    body: Annotated[AddEvaluation, example(EVALUATION_EXAMPLE)],
+    request: Request,
+    policies: Policies,
 ) -> EvaluationView:
     """Report real episodes of a policy, once for each idempotency key. Their real steps are reported separately, by
     ``POST .../ledger``."""
-    return evaluation_view(*policies.evaluate(name, version, body))
+    return evaluation_view(*policies.evaluate(name, version, body, holder(request.scope)))
 
 
 @router.post(
@@ -198,12 +202,16 @@ def evaluate(
     responses=documented(*THERE),
 )
 def report_drift(
-    name: str, version: Version, body: Annotated[AddDrift, example(DRIFT_EXAMPLE)], policies: Policies
+    name: str,
+    version: Version,
+    body: Annotated[AddDrift, example(DRIFT_EXAMPLE)],
+    request: Request,
+    policies: Policies,
 ) -> PolicyView:
     """Report that real steps no longer agree with the model (drift), once for each idempotency key. The policy's
     promise is then not trusted until a later evaluation confirms it."""
     drift = body.model_dump(mode="json", exclude={"idempotency_key"})
-    return policy_view(policies.report_drift(name, version, drift, body.idempotency_key))
+    return policy_view(policies.report_drift(name, version, drift, body.idempotency_key, holder(request.scope)))
 
 
 @router.get(

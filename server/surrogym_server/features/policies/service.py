@@ -185,8 +185,11 @@ class PolicyService:
             )
         return record.version, self._content(file.blob, file.digest, f"the {form} file of {place}")
 
-    def evaluate(self, name: str, version: int, episodes: AddEvaluation) -> tuple[PolicyRecord, EvaluationRecord]:
-        """Store real episodes of a policy, once for each idempotency key. Return the policy and the evaluation.
+    def evaluate(
+        self, name: str, version: int, episodes: AddEvaluation, by: str
+    ) -> tuple[PolicyRecord, EvaluationRecord]:
+        """Store real episodes of a policy, once for each idempotency key. Return the policy and the evaluation. ``by``
+        is the token that sent them.
 
         Raises:
             InvalidInput: the lists have different lengths, or a trace does not fit the specification.
@@ -197,17 +200,17 @@ class PolicyService:
         content = json.dumps(episodewise, separators=(",", ":")).encode()
         digest = hashlib.sha256(content).hexdigest()
         blob = self._blobs.put(content)
-        summary = {**_summary(episodes), "own": self._is_own(name, episodes.environment)}
+        summary = {**_summary(episodes), "own": self._is_own(name, episodes.environment), PUSHED_BY: by}
         new = NewEvaluation(episodes.idempotency_key, summary, len(content), digest, blob)
         with self._removed_if_refused(blob):
             stored, created, freed = self._policies.evaluate(name, version, new, self._most_bytes)
         self._changed(name, freed if created else (blob,))
         return self._policies.get(name, str(version)), stored
 
-    def report_drift(self, name: str, version: int, drift: JSON, key: str) -> PolicyRecord:
-        """Store a report of drift, once for each idempotency key, and return the policy, whose promise is then not
-        trusted."""
-        new = NewEvaluation(f"{DRIFT} {key}", {DRIFT: drift})
+    def report_drift(self, name: str, version: int, drift: JSON, key: str, by: str) -> PolicyRecord:
+        """Store a report of drift from the token ``by``, once for each idempotency key, and return the policy, whose
+        promise is then not trusted."""
+        new = NewEvaluation(f"{DRIFT} {key}", {DRIFT: drift, PUSHED_BY: by})
         _, created, freed = self._policies.evaluate(name, version, new, self._most_bytes)
         if created:
             self._changed(name, freed)

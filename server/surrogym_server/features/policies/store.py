@@ -396,16 +396,16 @@ def _displaced(summaries: Mapping[int, JSON]) -> list[int]:
     """Return the ids of a policy's evaluations to remove, so that ``MAX_EVALUATIONS`` remain.
 
     There are three kinds: reports of drift, evaluations that can judge the policy's promise (interval of its return),
-    and others. The oldest of the most frequent kind is removed first, so that many evaluations of one kind do not
-    displace those of another.
+    and others. The oldest of the most frequent pair of kind and token is removed first, so that many evaluations of one
+    kind do not displace those of another, and a token that stores very many displaces its own.
 
     Args:
         summaries: summaries of the evaluations by id, oldest first.
     """
-    kinds: defaultdict[tuple[bool, bool], deque[int]] = defaultdict(deque)
+    kinds: defaultdict[tuple[bool, bool, str | None], deque[int]] = defaultdict(deque)
     for id, summary in summaries.items():
         drift = DRIFT in summary
-        kinds[drift, not drift and judges(summary)].append(id)
+        kinds[drift, not drift and judges(summary), summary.get(PUSHED_BY)].append(id)
     beyond = max(0, len(summaries) - MAX_EVALUATIONS)
     return [max(kinds.values(), key=len).popleft() for _ in range(beyond)]
 

@@ -80,8 +80,8 @@ def test_an_evaluation_whose_commit_acknowledgement_was_lost_is_stored_once(
     with monkeypatch.context() as patched:
         lost_at_commit(patched, "evaluate")
         with pytest.raises(Unavailable, match="connection was lost"):
-            policies.evaluate(NAME, 1, EPISODES)
-    _, stored = policies.evaluate(NAME, 1, EPISODES)
+            policies.evaluate(NAME, 1, EPISODES, "anybody")
+    _, stored = policies.evaluate(NAME, 1, EPISODES, "anybody")
     assert policies.episodes(NAME, "1", stored.id)[2:] == (
         {"returns": [-1.0], "lengths": [3], "success": None, "traces": []},
         None,

@@ -151,6 +151,22 @@ def test_many_other_evaluations_never_displace_one_that_decides_trust(
     assert [one.summary for one in policy.drifts] == [drift]
 
 
+def test_many_evaluations_of_one_sender_do_not_displace_those_of_others(
+    stored: Stored, make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A hundred kept promises of one token removed the broken one that another had found."""
+    name = make()
+    version, _ = pushed(stored, name, b"one")
+    judging = EPISODES | {"declared": True, "own": True}
+    broken, kept = judging | {"mean": -900, PUSHED_BY: "train a"}, judging | {PUSHED_BY: "train b"}
+    evaluated(stored, name, version, "broken", summary=broken)
+    monkeypatch.setattr("surrogym_server.features.policies.store.MAX_EVALUATIONS", 5)
+    for key in range(9):
+        evaluated(stored, name, version, str(key), summary=kept)
+    (policy,) = stored.policies.list(name)
+    assert [one.summary for one in policy.evaluations] == [broken, kept, kept, kept, kept]
+
+
 def test_beyond_the_size_limit_the_oldest_policy_files_without_alias_are_deleted(stored: Stored, make: Make) -> None:
     name = make()
     versions = [pushed(stored, name, bytes([number]) * 100, most=350)[0] for number in range(3)]
