@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from support.rail import SPEC
-from surrogym.cli.commands.sample import _environment
+from surrogym.cli.commands.sample import environment_of
 from surrogym.cli.errors import CommandError
 
 
@@ -22,5 +22,5 @@ from surrogym.cli.errors import CommandError
 def test_the_refusal_to_open_a_surrogates_environment_names_the_option_that_allows_it(name: str, expected: str) -> None:
     """For a file of pc-gym it named every option but the one that is needed."""
     with pytest.raises(CommandError) as refused:
-        _environment(None, None, SPEC.model_copy(update={"environment": name}))
+        environment_of(None, None, SPEC.model_copy(update={"environment": name}))
     assert str(refused.value).endswith(expected)

@@ -23,6 +23,7 @@ ELSEWHERE = {
     "policy alias": "test_commands.py",
     "prior": "test_prior.py",
     "watch": "test_watch.py",
+    "renew": "test_renew.py",
     "policy delete": "test_commands.py",
     "policy get": "test_commands.py",
     "policy push": "test_commands.py",

@@ -85,7 +85,7 @@ OTHERWISE = {
     "docs/how-to/fmus.md": "tests/original/test_fmus.py builds its FMUs, tests/deployment writes a twin",
     "docs/how-to/executables.md": "tests/original/test_executables.py runs its program",
     "docs/how-to/deploy.md": "tests/deployment runs its commands and compiles its controllers",
-    "docs/how-to/drift.md": "tests/cli/test_watch.py runs the command",
+    "docs/how-to/drift.md": "tests/cli/test_watch.py and test_renew.py run the commands",
     "docs/how-to/controller-c.md": "tests/deployment compiles its program and runs the vectors",
     "docs/how-to/priors.md": "tests/docs/test_how_to.py runs its programs, tests/cli/test_prior.py the command",
     "docs/how-to/history.md": "tests/docs/test_how_to.py runs its programs",

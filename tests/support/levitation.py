@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -159,3 +159,27 @@ class Heavy(Levitation):
     """The same with a ball that is 30 % heavier."""
 
     mass = 1.3
+
+
+class Swing(Plant):
+    """The pendulum that is swung up."""
+
+    mass = 1.0
+
+    def __init__(self) -> None:
+        super().__init__(PENDULUM, {**PENDULUM.real, "mass": self.mass})
+
+
+class HeavySwing(Swing):
+    """The same with a pendulum that is 30 % heavier."""
+
+    mass = 1.3
+
+
+class TiredSwing(HeavySwing):
+    """The same, which is worth less the longer an episode lasts. Single steps do not show it."""
+
+    def step_from(self, coordinates: Array, action: Array) -> RealStep:
+        goes_on = self._reached is not None and np.array_equal(self._reached, coordinates)
+        moved = super().step_from(coordinates, action)
+        return replace(moved, reward=moved.reward - 0.5) if goes_on else moved

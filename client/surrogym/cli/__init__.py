@@ -28,7 +28,7 @@ GROUPS: Mapping[str, tuple[str, ...]] = {
     "After": (
         *("report", "policies", "policy", "improve", "change", "export", "import", "export-policy", "deploy", "delete"),
     ),
-    "Operate": ("watch", "work", "jobs", "conformance"),
+    "Operate": ("watch", "renew", "work", "jobs", "conformance"),
 }
 REST = "More"  # heading, in the help, over the commands that belong to no group, such as those of other packages
 ADVANCED: Mapping[str, frozenset[str]] = {  # for each command, the options for experts, which its help lists last
@@ -122,6 +122,7 @@ COMMANDS = (
     "audit",
     "evaluate",
     "watch",
+    "renew",
     "policies",
     "policy",
     "status",

@@ -99,7 +99,7 @@ def command(
             found = hand_over(subject, asked, lambda view: update(None, words_of_audit(view)))
         else:
             opener = opener_for_policy(env, read_spec(spec), card, fallback, quiet=output.quiet)
-            found = _by_episodes(subject, env, opener, EvaluationSettings(episodes, seed), quiet=output.quiet)
+            found = by_episodes(subject, env, opener, EvaluationSettings(episodes, seed), quiet=output.quiet)
     if found.audit is None:
         raise CommandError(_not_made(view, found.reason))
     noted = card.model_copy(update={"surrogate": name, "spec": card.spec or view.spec, **vars(found)})
@@ -109,7 +109,7 @@ def command(
     output.give(result, lambda: words_of_handover(found))
 
 
-def _by_episodes(
+def by_episodes(
     subject: Subject, env: str, opener: Callable[[], Episode], settings: EvaluationSettings, *, quiet: bool
 ) -> Handover:
     """Audit a policy by whole episodes in an environment. The largest number of real steps is printed before the first

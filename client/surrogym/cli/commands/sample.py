@@ -163,7 +163,7 @@ def command(
             return
         if _without_queries(view, output, until_done=until_done):
             return
-        name, replaced = _environment(_named(env, program), read_spec(spec), view.spec)
+        name, replaced = environment_of(_named(env, program), read_spec(spec), view.spec)
         plan = SamplerPlan(
             api.url, service.token_for(context), surrogate, name, replaced, step_limit, settings, fallback
         )
@@ -291,7 +291,7 @@ def _named(env: str | None, program: str | None) -> str | None:
     return env if program is None else name_of(program)
 
 
-def _environment(
+def environment_of(
     env: str | None, given: EnvironmentSpec | None, asked: EnvironmentSpec
 ) -> tuple[str, EnvironmentSpec | None]:
     """Return the name of the environment to open, and the specification that replaces its own, or None.

@@ -1,0 +1,365 @@
+"""``surrogym renew``: learn a changed machine beside its old surrogate, and replace the policy that it runs."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from surrogym.cli.groups import Output, Service
+from surrogym.cli.options import NAMES, FallbackProgram, Surrogate
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from surrogym_client.transport import Api
+    from surrogym_sampler.original.protocol import Environment
+    from surrogym_shared.spec import EnvironmentSpec
+    from surrogym_shared.terminal import Update
+    from surrogym_shared.wire import PolicyDetail, SurrogateView
+    from surrogym_trainer.training.handover import Handover
+
+SHARE = 4  # by default, the renewal takes one of this many real steps of the old design
+FEWEST = 4  # but not fewer than this
+PATIENCE_SECONDS = 24 * 3_600.0  # longest time to wait for the real steps of the design
+
+
+def command(
+    context: typer.Context,
+    surrogate: Surrogate,
+    policy: Annotated[
+        str, typer.Option(help="Alias of the policy that the machine runs, such as production, or NAME@production.")
+    ],
+    env: Annotated[
+        str | None,
+        typer.Option(
+            help=f"The changed environment, in which to take real steps: {NAMES}. [default: the one that the surrogate "
+            "names, if opening it runs no file of yours]"
+        ),
+    ] = None,
+    budget: Annotated[
+        int | None,
+        typer.Option(
+            min=FEWEST,
+            help="Maximum number of real steps to learn the changed machine, without audits. [default: a quarter of "
+            "those of the old design]",
+        ),
+    ] = None,
+    episodes: Annotated[
+        int, typer.Option(min=1, max=100, help="Number of real episodes with the new policy before it stays.")
+    ] = 3,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="File for the new policy. [default: the new surrogate's name]")
+    ] = None,
+    fallback: FallbackProgram = None,
+    *,
+    service: Service,
+    output: Output,
+) -> None:
+    """Learn a machine that has changed, and replace its policy.
+
+    The old surrogate becomes the prior of a new one, which learns the difference from few real steps. The training
+    begins with the network of the old policy, if it can. If an audit trusts the new policy, the alias moves to it. Then
+    the new policy runs a few real episodes. If these contradict its promised return, the alias moves back. An
+    interruption leaves the alias where it was; the same command continues with the new surrogate. This needs a token
+    of role admin.
+
+    Example: surrogym renew arm --policy arm@production --env arm:Real
+    """
+    from surrogym.cli.commands.sample import environment_of
+    from surrogym.cli.errors import CommandError
+    from surrogym_client.runtime.lifetime import terminations_as_interrupts
+    from surrogym_sampler.original.loading import for_queries
+    from surrogym_shared.terminal import on_interrupt, progress, say
+
+    name, _, alias = policy.rpartition("@")
+    if name not in ("", surrogate):
+        raise CommandError(f"expected a policy of {surrogate!r}, got {policy!r}: name the same surrogate twice")
+    with service.connect(context) as api:
+        old = api.policies.get(surrogate, alias)
+        if alias not in old.aliases:
+            raise CommandError(
+                f"expected an alias of a policy of {surrogate!r}, got {alias!r}: give one by surrogym policy alias "
+                f"{surrogate}@{old.version} production"
+            )
+        base, target = _chain(api, surrogate, alias)
+        renewal = _Renewal(api, service.token_for(context), surrogate, alias, old, base, target)
+        opened, given = environment_of(env, None, base.spec)
+        with (
+            terminations_as_interrupts(),
+            on_interrupt(renewal.words_of_interruption),
+            progress("renew", quiet=output.quiet) as update,
+            closing(for_queries(opened, 30.0, given, fallback)) as environment,
+        ):
+            spec = renewal.register(budget or _budget(api.surrogate(surrogate)))
+            say(
+                f"{target} learns with at most {spec.design.budget} real steps beside {base.name}; an audit follows, "
+                f"and {episodes} episodes in {opened}: at most {episodes * (spec.time_limit or 1_000)} real steps",
+                quiet=output.quiet,
+            )
+            path = out or Path(f"{target}.zip")
+            with _sampling(api, renewal, environment) as check:
+                handover = renewal.train(path, update, check)
+            if handover.trusted:
+                renewal.put_into_use(path, opened, episodes, fallback, quiet=output.quiet)
+    output.give(renewal.result(path, handover), lambda: renewal.words(path, handover))
+    if not renewal.stays:
+        raise typer.Exit(1)
+
+
+def _chain(api: Api, surrogate: str, alias: str) -> tuple[SurrogateView, str]:
+    """Return the surrogate whose policy the machine runs, and the name of the next one.
+
+    Renewals of ``arm`` are ``arm-2``, ``arm-3`` and so on. One that was interrupted, or whose policy did not stay, has
+    no policy of this alias.
+    """
+    from surrogym_client.errors import UnknownSurrogate
+
+    base, number = api.surrogate(surrogate), 2
+    while True:
+        target = f"{surrogate}-{number}"
+        try:
+            found = api.surrogate(target)
+        except UnknownSurrogate:
+            return base, target
+        if not any(alias in one.aliases for one in api.policies.list(target)):
+            return base, target
+        base, number = found, number + 1
+
+
+def _budget(view: SurrogateView) -> int:
+    """Return a quarter of the real steps of a design. Raises ``CommandError`` if it has taken none."""
+    from surrogym.cli.errors import CommandError
+
+    if not view.ledger.total:
+        raise CommandError(f"{view.name!r} has learned from a log alone: expected --budget with a number of real steps")
+    return max(FEWEST, view.ledger.total // SHARE)
+
+
+@contextmanager
+def _sampling(api: Api, renewal: _Renewal, environment: Environment) -> Iterator[Callable[[], None]]:
+    """Context in which a sampler answers the queries of the new surrogate. Yields a function that raises the error with
+    which the sampler has ended."""
+    from surrogym_client.transport import Api
+    from surrogym_sampler.queries.settings import SamplerSettings, worker_name
+    from surrogym_sampler.queries.worker import Sampler
+
+    failed: list[BaseException] = []
+    with Api(api.url, renewal.token) as own:
+        settings = SamplerSettings(name=worker_name(), wait_seconds=1.0)
+        sampler = Sampler(own, renewal.target, environment, settings)
+
+        def run() -> None:
+            try:
+                sampler.run()
+            except BaseException as error:
+                failed.append(error)
+
+        def check() -> None:
+            if failed:
+                raise failed[0]
+
+        thread = threading.Thread(target=run, daemon=True)
+        thread.start()
+        try:
+            yield check
+        finally:
+            sampler.stop()
+            thread.join()
+
+
+@dataclass
+class _Renewal:
+    """One renewal of a policy.
+
+    Attributes:
+        surrogate: name of the surrogate whose alias moves.
+        alias: the alias.
+        old: policy that the alias names at first.
+        base: surrogate that is the prior.
+        target: name of the new surrogate.
+        version: version of the new policy in ``surrogate``; None if it was not put into use.
+        stays: whether the alias names the new policy at last.
+        judged: judgement of the real episodes; None if there were none.
+    """
+
+    api: Api
+    token: str | None
+    surrogate: str
+    alias: str
+    old: PolicyDetail
+    base: SurrogateView
+    target: str
+    version: int | None = None
+    stays: bool = False
+    judged: Handover | None = None
+
+    def register(self, budget: int) -> EnvironmentSpec:
+        """Create the new surrogate with the old one as its prior, and return its specification. A repetition changes
+        nothing.
+
+        Raises:
+            SpecConflict: another surrogate has this name.
+            InvalidInput: the surrogate can't have a prior.
+        """
+        from surrogym_client.surrogates.transfer import export_surrogate
+        from surrogym_client.transport.priors import PriorCalls
+
+        design = self.base.spec.design
+        initial = None if design.initial is None else min(design.initial, budget)
+        smaller = design.model_copy(update={"budget": budget, "initial": initial})
+        spec = self.base.spec.model_copy(update={"design": smaller})
+        created, priors = self.api.create_surrogate(self.target, spec).created, PriorCalls(self.api.connection)
+        if not created and priors.get(self.target).about is not None:
+            return spec
+        try:
+            priors.put(self.target, export_surrogate(self.api, self.base.name).to_bytes())
+        except BaseException:
+            if created:
+                self.api.delete_surrogate(self.target)
+            raise
+        return spec
+
+    def train(self, out: Path, update: Update, check: Callable[[], None]) -> Handover:
+        """Wait for the design, train a policy from the network of the old one, audit it and store it.
+
+        Args:
+            out: file for the policy.
+            update: shows the progress.
+            check: raises an error if the sampler has failed.
+        """
+        from dataclasses import asdict, replace
+
+        from surrogym_client.surrogates.waiting import share_of_design, wait_for_design, words_of_design
+        from surrogym_client.transport import HttpSurrogate
+        from surrogym_trainer.policies.card import write_card
+        from surrogym_trainer.policies.pushing import push
+        from surrogym_trainer.training.audited import AuditedTraining
+        from surrogym_trainer.training.cards import card_of
+        from surrogym_trainer.training.handover import AuditSettings
+        from surrogym_trainer.training.settings import TrainProgress, TrainSettings
+        from surrogym_trainer.training.words import words_of
+
+        def look(view: SurrogateView) -> None:
+            check()
+            update(share_of_design(view), words_of_design(view))
+
+        def record(now: TrainProgress) -> None:
+            check()
+            update(None, words_of(asdict(now)))
+
+        wait_for_design(self.api, self.target, PATIENCE_SECONDS, look)
+        with TemporaryDirectory() as folder, HttpSurrogate(self.api.url, self.target, self.token) as port:
+            settings = TrainSettings(algorithm=self.old.algorithm or None)
+            if (start := self._network(Path(folder) / "old.zip", port.spec())) is not None:
+                settings = replace(settings, start_from=start)
+            training = AuditedTraining(
+                self.api, self.target, port, out, settings, audit=AuditSettings(), progress=record, waiting=look
+            )
+            result, handover = training.train()
+            result = replace(result, settings={**result.settings, "start_from": None if start is None else self.named})
+            spec = port.spec()
+        card = card_of(result, handover, surrogate=self.target, spec=spec, url=self.api.url, seed=0, curve=())
+        write_card(out, card)
+        push(self.api, out, self.target)
+        return handover
+
+    def put_into_use(self, path: Path, env: str, episodes: int, fallback: str | None, *, quiet: bool) -> None:
+        """Move the alias to the new policy, run real episodes, and move it back if they contradict the promise, or if
+        the episodes fail or are interrupted."""
+        from surrogym_trainer.policies.pushing import push
+
+        self.version = push(self.api, path, self.surrogate).policy.version
+        try:
+            self.api.policies.put_alias(self.surrogate, self.alias, self.version)
+            self.judged = self._episodes(path, env, episodes, fallback, quiet=quiet)
+            self.stays = self.judged.trusted
+        finally:
+            if not self.stays:
+                self.api.policies.put_alias(self.surrogate, self.alias, self.old.version)
+        if self.stays:
+            self.api.policies.put_alias(self.target, self.alias, self.api.policies.get(self.target).version)
+
+    def _episodes(self, path: Path, env: str, episodes: int, fallback: str | None, *, quiet: bool) -> Handover:
+        """Run real episodes with the new policy, and judge its promise by them."""
+        from surrogym.cli.commands.audit import by_episodes
+        from surrogym.cli.opening import opener_for_policy
+        from surrogym_client.transport import HttpSurrogate
+        from surrogym_trainer.evaluation.evaluator import EvaluationSettings
+        from surrogym_trainer.policies.card import read_card
+        from surrogym_trainer.policies.files import load_policy
+        from surrogym_trainer.training.cards import session_of
+        from surrogym_trainer.training.handover import Subject
+
+        card = read_card(path)
+        opener = opener_for_policy(env, None, card, fallback, quiet=quiet)
+        with HttpSurrogate(self.api.url, self.target, self.token) as port:
+            session = session_of(card, self.api.surrogate(self.target))
+            predict = load_policy(path, card.algorithm)
+            subject = Subject(self.api, self.target, port, predict, session, card.untrained)
+            return by_episodes(subject, env, opener, EvaluationSettings(episodes), quiet=quiet)
+
+    def _network(self, path: Path, spec: EnvironmentSpec) -> Path | None:
+        """Write the old policy to a file with which a training can begin. None if it has no network of the same shapes
+        that fastppo can train."""
+        from surrogym_shared.network import Network
+        from surrogym_trainer.policies.card import UnusablePolicy
+        from surrogym_trainer.training.fast_ppo.learner import restored
+        from surrogym_trainer.training.fast_ppo.search import units_of
+
+        path.write_bytes(self.api.policies.file(self.surrogate, self.old.version, "zip"))
+        try:
+            if not Network.is_at(path):
+                return None
+            restored(path, spec, units_of(spec))
+        except UnusablePolicy:
+            return None
+        return path
+
+    @property
+    def named(self) -> str:
+        """The old policy, as commands take it."""
+        return f"{self.surrogate}@{self.old.version}"
+
+    def words_of_interruption(self) -> str:
+        return (
+            f"interrupted; {self.surrogate}@{self.alias} leads to version {self.old.version} as before; the same "
+            f"command continues with {self.target}"
+        )
+
+    def result(self, out: Path, handover: Handover) -> dict[str, Any]:
+        """Return the result as values that JSON can represent."""
+        episodes = self.judged
+        return {
+            "surrogate": self.target,
+            "prior": self.base.name,
+            "policy": str(out),
+            "real_steps": self.api.surrogate(self.target).ledger.model_dump(mode="json"),
+            "promise": None if handover.promise is None else handover.promise.model_dump(mode="json"),
+            "trusted": handover.trusted,
+            "reason": handover.reason,
+            "episodes": None if episodes is None else {"trusted": episodes.trusted, "reason": episodes.reason},
+            "alias": {"name": self.alias, "version": self.version if self.stays else self.old.version},
+            "renewed": self.stays,
+        }
+
+    def words(self, out: Path, handover: Handover) -> str:
+        from surrogym_trainer.training.words import words_of_handover
+
+        leads, before = f"{self.surrogate}@{self.alias}", f"version {self.old.version}"
+        lines = [f"{out}: the policy of {self.target}, whose prior is {self.base.name}", words_of_handover(handover)]
+        if self.judged is None:
+            lines.append(f"{leads} leads to {before} as before, because the new policy is not trusted")
+        elif not self.stays:
+            lines.append(f"{leads} leads to {before} again, because real episodes contradict the new promise:")
+            lines.append(f"  {self.judged.reason}")
+        else:
+            lines.append(f"{leads} leads to version {self.version} now: {self.judged.reason}")
+            lines.append(f"next: surrogym watch {self.target} --policy {self.alias} --follow")
+        return "\n".join(lines)

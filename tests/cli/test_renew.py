@@ -1,0 +1,169 @@
+"""``surrogym renew``: a policy of a changed plant replaces the old one only if an audit and real episodes agree."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from support.levitation import PENDULUM, Swing
+from support.saying import Said
+from support.server import ServerProcess
+from surrogym_client.surrogates.waiting import wait_for_design
+from surrogym_client.transport import Api, HttpSurrogate
+from surrogym_sampler.queries.settings import SamplerSettings
+from surrogym_sampler.queries.worker import Sampler
+from surrogym_shared.spec import Design
+from surrogym_trainer.policies.card import write_card
+from surrogym_trainer.policies.evidence import Promise
+from surrogym_trainer.policies.pushing import push
+from surrogym_trainer.training import TrainResult, TrainSettings, train
+from surrogym_trainer.training.audited import AuditedTraining
+from surrogym_trainer.training.cards import card_of
+from surrogym_trainer.training.handover import Handover
+
+Renew = Callable[..., Said]
+REAL_STEPS = 32
+
+
+@pytest.fixture(scope="module")
+def trained(server_process: ServerProcess, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """A surrogate of the pendulum before its change, with a policy in production."""
+    name, path = "swing", tmp_path_factory.mktemp("swing") / "old.zip"
+    spec = PENDULUM.spec.model_copy(update={"design": Design(initial=REAL_STEPS, budget=REAL_STEPS)})
+    with Api(server_process.url) as api, HttpSurrogate(server_process.url, name) as port:
+        api.create_surrogate(name, spec)
+        Sampler(api, name, Swing(), SamplerSettings(until_done=True, wait_seconds=1.0)).run()
+        view = wait_for_design(api, name, 120)
+        result = train(port, path, TrainSettings(algorithm="FASTPPO"))
+        write_card(path, card_of(result, surrogate=name, spec=view.spec, url=api.url, seed=0, curve=()))
+        push(api, path, name)
+        api.policies.put_alias(name, "production", 1)
+        yield name
+        api.delete_surrogate(name)
+
+
+@pytest.fixture
+def renew(on_server: Renew, trained: str, server_process: ServerProcess, tmp_path: Path) -> Iterator[Renew]:
+    def run(plant: str, *options: str) -> Said:
+        out = str(tmp_path / "new.zip")
+        asked = ("--policy", f"{trained}@production", "--env", f"support.levitation:{plant}", "--out", out)
+        return on_server("renew", trained, *asked, *options)
+
+    yield run
+    with Api(server_process.url) as api:
+        api.policies.put_alias(trained, "production", 1)
+        for one in api.surrogates():
+            if one.name.startswith(f"{trained}-"):
+                api.delete_surrogate(one.name)
+
+
+def led_to(server_process: ServerProcess, name: str) -> int:
+    with Api(server_process.url) as api:
+        return api.policies.get(name, "production").version
+
+
+def test_a_renewed_policy_replaces_the_old_one_with_a_quarter_of_the_real_steps(
+    renew: Renew, trained: str, server_process: ServerProcess
+):
+    said = renew("HeavySwing", "--json")
+    assert said.code == 0, said.err
+    found = said.json
+    assert (found["surrogate"], found["prior"], found["renewed"]) == ("swing-2", "swing", True)
+    assert found["real_steps"]["total"] <= REAL_STEPS // 4
+    assert led_to(server_process, trained) == found["alias"]["version"] > 1
+    with Api(server_process.url) as api:
+        card = api.policies.get("swing-2", "production")
+        assert (card.trusted, card.settings["start_from"]) == (True, "swing@1")
+        assert api.surrogate("swing-2").ledger.evaluation > 0
+
+
+def test_the_alias_goes_back_if_real_episodes_contradict_the_new_promise(
+    renew: Renew, trained: str, server_process: ServerProcess
+):
+    said = renew("TiredSwing")
+    assert said.code == 1
+    assert "leads to version 1 again, because real episodes contradict the new promise" in said.out, said.out + said.err
+    assert led_to(server_process, trained) == 1
+    with Api(server_process.url) as api:
+        assert [one.aliases for one in api.policies.list("swing-2")] == [[]]
+        assert api.surrogate("swing-2").ledger.evaluation > 0
+
+
+@pytest.fixture
+def handed_over(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Replaces training and audit by a short training, and a judgement of the caller's choice."""
+
+    def replaced(*, trusted: bool) -> None:
+        def short(self: AuditedTraining) -> tuple[TrainResult, Handover]:
+            settings = replace(self.settings, total_steps=4_096, prolong=False)
+            promise = Promise(median=80.0, low=78.0, high=82.0, functions=32, episodes=8)
+            return train(self.port, self.out, settings), Handover(promise, None, trusted, "so it was said")
+
+        monkeypatch.setattr(AuditedTraining, "train", short)
+
+    return replaced
+
+
+def test_a_policy_that_is_not_trusted_never_gets_the_alias(
+    renew: Renew, trained: str, server_process: ServerProcess, handed_over: Callable[..., None]
+):
+    handed_over(trusted=False)
+    said = renew("HeavySwing")
+    assert said.code == 1
+    assert "leads to version 1 as before, because the new policy is not trusted" in said.out
+    with Api(server_process.url) as api:
+        assert [one.version for one in api.policies.list(trained)] == [1]
+
+
+@pytest.mark.parametrize("where", ["train", "by_episodes"])
+def test_an_interrupted_renewal_leaves_the_alias_and_continues_with_the_same_surrogate(
+    renew: Renew,
+    trained: str,
+    server_process: ServerProcess,
+    handed_over: Callable[..., None],
+    monkeypatch: pytest.MonkeyPatch,
+    where: str,
+):
+    def stopped(*_: Any, **__: Any) -> None:
+        raise KeyboardInterrupt
+
+    handed_over(trusted=True)
+    with monkeypatch.context() as during:
+        place = {"train": "surrogym_trainer.training.audited.AuditedTraining.train"}
+        during.setattr(place.get(where, "surrogym.cli.commands.audit.by_episodes"), stopped)
+        said = renew("HeavySwing")
+    assert said.code == 130
+    assert "swing@production leads to version 1 as before" in said.err
+    assert led_to(server_process, trained) == 1
+    with Api(server_process.url) as api:
+        taken = api.surrogate("swing-2").ledger.total
+    agreed = Handover(None, None, True, "it was said again")
+    monkeypatch.setattr("surrogym.cli.commands.audit.by_episodes", lambda *_, **__: agreed)
+    first, second = renew("HeavySwing", "--json").json, renew("HeavySwing", "--json").json
+    assert (first["surrogate"], first["prior"], first["real_steps"]["total"]) == ("swing-2", "swing", taken)
+    assert (second["surrogate"], second["prior"], second["renewed"]) == ("swing-3", "swing-2", True)
+    assert led_to(server_process, trained) == second["alias"]["version"]
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        (("--policy", "1"), ["expected an alias", "got '1'"]),
+        (("--policy", "other@production"), ["expected a policy of 'swing'", "got 'other@production'"]),
+        (("--policy", "staging"), ["staging"]),
+        (("--policy", "production"), ["--env"]),
+    ],
+)
+def test_an_unusable_renewal_is_refused_before_it_changes_anything(
+    on_server: Renew, trained: str, server_process: ServerProcess, options: tuple[str, ...], named: list[str]
+):
+    said = on_server("renew", trained, *options)
+    assert said.code == 1
+    assert not [words for words in named if words not in said.err], said.err
+    with Api(server_process.url) as api:
+        assert not [one.name for one in api.surrogates() if one.name.startswith("swing-")]
+    assert led_to(server_process, trained) == 1
