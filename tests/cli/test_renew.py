@@ -56,6 +56,8 @@ def renew(on_server: Renew, trained: str, server_process: ServerProcess, tmp_pat
     yield run
     with Api(server_process.url) as api:
         api.policies.put_alias(trained, "production", 1)
+        for policy in api.policies.list(trained)[:-1]:
+            api.policies.delete(trained, policy.version)
         for one in api.surrogates():
             if one.name.startswith(f"{trained}-"):
                 api.delete_surrogate(one.name)

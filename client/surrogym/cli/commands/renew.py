@@ -108,7 +108,8 @@ def command(
                 handover = renewal.train(path, update, check)
             if handover.trusted:
                 renewal.put_into_use(path, opened, episodes, fallback, quiet=output.quiet)
-    output.give(renewal.result(path, handover), lambda: renewal.words(path, handover))
+        result = renewal.result(path, handover)
+    output.give(result, lambda: renewal.words(path, handover))
     if not renewal.stays:
         raise typer.Exit(1)
 
