@@ -4,7 +4,7 @@ Joints obey M(q) a = f(q, v, u) (M. W. Spong, S. Hutchinson, M. Vidyasagar, "Rob
 7.3). Friction is Coulomb's with a larger limit at rest: in each part of a step, an impulse stops the joint if the limit
 allows it (J. J. Moreau's time stepping; D. E. Stewart, SIAM Review 42, 2000).
 
-Shapes: n joints. Units: SI, angles in rad.
+Shapes: n joints, r sensors. Units: SI, angles in rad.
 """
 
 import math
@@ -27,16 +27,16 @@ class Dirt:
         limit: largest action that the actuator gives, of either sign.
         sliding: friction of each joint (n,) that moves.
         sticking: friction at rest, a multiple of ``sliding``.
-        noise: standard deviation of each sensor.
-        width: distance of two counts of each encoder; 0 is no encoder.
+        noise: standard deviation of each sensor (r,); empty for none.
+        width: distance of two counts of each encoder (r,); 0 is no encoder, and empty none at all.
     """
 
     delay: int = 0
     limit: float = math.inf
     sliding: tuple[float, ...] = ()
     sticking: float = 1.0
-    noise: tuple[float, ...] = (0.0, 0.0)
-    width: tuple[float, ...] = (0.0, 0.0)
+    noise: tuple[float, ...] = ()
+    width: tuple[float, ...] = ()
 
 
 class Machine:
@@ -62,7 +62,7 @@ class Machine:
         raise NotImplementedError
 
     def sensed(self):
-        """Return the two positions that the sensors see."""
+        """Return the positions (r,) that the r sensors see: here two."""
         return self.q[:2]
 
     def reset(self, seed=None):
@@ -80,9 +80,14 @@ class Machine:
         return self.measured()
 
     def measured(self):
-        """Return what the sensors read (2,)."""
-        read = self.sensed() + np.array(self.dirt.noise) * self._rng.standard_normal(2)
-        return np.array([w * round(r / w) if w else r for r, w in zip(read, self.dirt.width, strict=True)])
+        """Return what the sensors read (r,)."""
+        read = np.array(self.sensed())
+        if self.dirt.noise:
+            read += np.array(self.dirt.noise) * self._rng.standard_normal(len(read))
+        for sensor, width in enumerate(self.dirt.width):
+            if width:
+                read[sensor] = width * round(read[sensor] / width)
+        return read
 
     def move(self, u, h):
         """Move for h seconds: a Runge-Kutta step, and then friction."""

@@ -8,8 +8,10 @@ from functools import partial
 import numpy as np
 import pytest
 
+from surrogym_sampler.diagnosis.dirt import Dirt, identify, sensors
+from surrogym_sampler.diagnosis.dirt.taking import take
+from surrogym_sampler.diagnosis.dirt.words import declared
 from surrogym_sampler.diagnosis.doctor import environment
-from surrogym_sampler.diagnosis.history import declared, look_back
 from surrogym_sampler.original import make
 from surrogym_sampler.original.isolated import IsolatedEnvironment
 from surrogym_sampler.original.rollouts import answering
@@ -75,6 +77,11 @@ class Short(Joint):
         return observation, reward, True, False, {}
 
 
+def look_back(machine) -> Dirt:
+    spec = machine.spec()
+    return identify(take(machine, spec, STEPS), sensors(spec))
+
+
 def said(factory) -> tuple[str, str | None]:
     """The finding on the history, and its way out."""
     (finding,) = [f for f in environment(partial(IsolatedEnvironment, factory, 30.0), STEPS) if f.name == "history"]
@@ -84,18 +91,19 @@ def said(factory) -> tuple[str, str | None]:
 @pytest.mark.parametrize("dead_steps", range(4))
 def test_the_needed_history_for_a_hidden_speed_and_a_dead_time_is_found(dead_steps):
     machine = answering(Joint(dead_steps))
-    found = look_back(machine, machine.spec(), STEPS)
-    assert found is not None
-    assert (found.steps, found.changes, found.actions) == (STEPS, 1, dead_steps)
-    assert found.error < 0.01 < found.error_without
-    assert 0.1 < found.largest["angle"] < 2
+    found = look_back(machine)
+    assert found.explained is not None
+    assert found.plain is not None
+    assert (found.explained.changes, found.actions) == (1, dead_steps)
+    assert found.explained.error[0] < 0.02 < 0.1 < found.plain.error[0]
 
 
 def test_an_environment_with_a_complete_state_needs_no_history():
     machine = make("CartPole-v1", access="reset")
-    found = look_back(machine, machine.spec(), STEPS)
-    assert found is not None
-    assert (found.changes, found.actions) == (0, 0)
+    found = look_back(machine)
+    assert found.explained is not None
+    assert (found.explained.changes, found.actions) == (0, 0)
+    assert not found.named
     machine.close()
 
 
@@ -117,7 +125,7 @@ def test_the_doctor_command_recommends_the_history_to_declare():
     ("factory", "words", "way_out"),
     [
         (Declares, "what is declared tells what happens next", None),
-        (Shakes, "a linear regression does not show how far one has to look back", None),
+        (Shakes, "a regression does not show how far one has to look back", None),
         (Short, "episodes this short don't tell", "give --history more steps"),
     ],
 )

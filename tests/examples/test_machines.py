@@ -74,7 +74,7 @@ def test_friction_at_rest_holds_a_machine_against_small_actions(name: str, monke
     machine = made(name)
     hanging = 0.0 if name == "double_pendulum" else math.pi
     monkeypatch.setattr(machine, "start", lambda _: [0.0, hanging, 0.0][: len(machine.dirt.sliding)])
-    machine.dirt = dataclasses.replace(machine.dirt, noise=(0.0, 0.0))
+    machine.dirt = dataclasses.replace(machine.dirt, noise=())
     held = machine.dirt.sliding[-1 if name == "belt" else 0] / (machine.pull if name == "furuta" else 1.0)
     assert np.ptp(path(machine, [0.5 * held] * 20), axis=0).max() < 1e-3
     assert np.ptp(path(machine, [6.0] * 20), axis=0).max() > 0.05

@@ -27,7 +27,9 @@ from surrogym_client.errors import (
 from surrogym_client.runtime.versions import EXTRAS, versions
 from surrogym_client.transport.api import Api
 from surrogym_sampler.diagnosis.access import EXACT, Access, CheckFailed, examine
-from surrogym_sampler.diagnosis.history import History, declared, look_back
+from surrogym_sampler.diagnosis.dirt import Dirt, identify, sensors
+from surrogym_sampler.diagnosis.dirt.taking import take
+from surrogym_sampler.diagnosis.dirt.words import declared, history_call, traits
 from surrogym_sampler.original.actions import middle_action
 from surrogym_sampler.original.episodes import draw
 from surrogym_sampler.original.errors import OriginalError, StepFailed
@@ -41,6 +43,9 @@ from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import PROTOCOL, StepQuery
 
 ROUND_TRIPS = 20
+# If changes are predicted with an error above this share of their standard deviation, and noise does not explain it,
+# the rollouts can't tell which history is needed.
+EXPLAINED = 0.5
 NEEDS = "see docs/how-to/own-environment.md for what an environment needs"
 # The registry that each group of plug-ins (entry points) extends, as module:name. A registry is imported only if the
 # package that contains it is installed.
@@ -126,8 +131,8 @@ def environment(
 
     Args:
         opened: opens the environment.
-        history: number of further real steps, to find how many earlier changes and actions the next change depends on;
-            0 takes none.
+        history: number of further real steps, to find dead time, encoders, friction, noise, and how many earlier
+            changes and actions the next change depends on; 0 takes none.
     """
     try:
         with closing(opened()) as original:
@@ -139,7 +144,7 @@ def environment(
             if step.way_out is None:
                 yield from _access_of(original, spec)
                 if history:
-                    yield _history_of(original, spec, history)
+                    yield from _dirt_of(original, spec, history)
     except OriginalError as error:
         yield Finding("environment", str(error), NEEDS)
 
@@ -182,35 +187,52 @@ def _resets(access: Access) -> Finding:
     return Finding("resets", said, notable=True)
 
 
-def _history_of(original: IsolatedEnvironment | Executable | Simulated, spec: EnvironmentSpec, steps: int) -> Finding:
-    """Report how many earlier changes and actions the next change depends on, and whether the specification already
-    declares them as coordinates (lags)."""
+def _dirt_of(
+    original: IsolatedEnvironment | Executable | Simulated, spec: EnvironmentSpec, steps: int
+) -> Iterator[Finding]:
+    """Report dead time, encoders, friction that sticks and noise, and how many earlier changes and actions the next
+    change depends on."""
     if spec.query != "rollout":
-        return Finding("history", "not looked for: an environment that is set to a state has no past")
+        yield Finding("history", "not looked for: an environment that is set to a state has no past")
+        return
     try:
-        found = look_back(original, spec, steps)
+        rollouts = take(original, spec, steps)
     except StepFailed as error:
-        return Finding("history", str(error), "a sampler would fail in the same way: mend the environment first")
-    if found is None:
-        return Finding("history", f"{steps} real steps of episodes this short don't tell", "give --history more steps")
-    took = f"this took {found.steps} real steps"
-    if not found.told:
-        return Finding("history", f"a linear regression does not show how far one has to look back; {took}")
-    has = declared(spec)
-    if found.changes <= has[0] and found.actions <= has[1]:
+        yield Finding("history", str(error), "a sampler would fail in the same way: mend the environment first")
+        return
+    known = sensors(spec)
+    found = identify(rollouts, known)
+    took = f"this took {sum(len(rollout.action) for rollout in rollouts)} real steps"
+    for name, said in traits(found, known, spec):
+        yield Finding(name, said, notable=True)
+    yield _history_of(found, declared(spec), history_call(found, known, rollouts), took)
+
+
+def _history_of(found: Dirt, has: tuple[int, int], call: str, took: str) -> Finding:
+    """Report how many earlier changes and actions the next change depends on, and whether the specification already
+    declares them as coordinates (lags).
+
+    Args:
+        found: what was found.
+        has: number of earlier changes and of earlier actions that are declared.
+        call: source text that declares those that were found.
+        took: how many real steps were taken, in words.
+    """
+    if found.explained is None or found.plain is None:
+        return Finding("history", f"episodes this short don't tell; {took}", "give --history more steps")
+    error, changes = float(found.explained.error.max()), found.explained.changes
+    if error > EXPLAINED and not found.noise:
+        return Finding("history", f"a regression does not show how far one has to look back; {took}")
+    if changes <= has[0] and found.actions <= has[1]:
         return Finding("history", f"what is declared tells what happens next; {took}")
-    needed = (
-        f"the next change of a coordinate depends on {found.changes} earlier changes and {found.actions} earlier "
-        f"actions: errors of {100 * found.error:.2g} % of its standard deviation, "
-        f"and of {100 * found.error_without:.2g} % without them; {took}"
-    )
-    return Finding("history", needed, _declaring(found))
-
-
-def _declaring(found: History) -> str:
-    """Return the advice to declare this history, with the source text of the call that does it."""
-    moving = ", with at_start if a reset leaves it moving" if found.changes else ""
-    return f"declare {found.call}{moving}; see docs/how-to/history.md"
+    needed = f"the next change of a coordinate depends on {changes} earlier changes and {found.actions} earlier actions"
+    if changes:
+        without = float(found.plain.error.max())
+        needed += (
+            f": errors of {100 * error:.2g} % of its standard deviation, and of {100 * without:.2g} % without them"
+        )
+    moving = ", with at_start if a reset leaves it moving" if changes else ""
+    return Finding("history", f"{needed}; {took}", f"declare {call}{moving}; see docs/how-to/history.md")
 
 
 def _way_out(spec: EnvironmentSpec, access: Access) -> str | None:
