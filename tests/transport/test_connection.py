@@ -1,8 +1,10 @@
 """What the network does to a request: lost replies, time-outs, dead and foreign servers. On real sockets."""
 
+import gzip
 import pickle
 import socket
 import threading
+from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 
 import pytest
@@ -219,3 +221,31 @@ def test_an_unusable_file_of_certificates_is_named(monkeypatch: pytest.MonkeyPat
         monkeypatch.setenv("SSL_CERT_FILE", str(file))
         with pytest.raises(errors.UnusableCertificates, match=rf"SSL_CERT_FILE: expected .*{file.name}.*{reason}"):
             Connection("http://127.0.0.1:1")
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        (gzip.compress(bytes(2 * 10**6)), r"expected an answer of at most 1000000 bytes from http.*, got more"),
+        (b"no gzip", r"expected an answer that can be decompressed from http"),
+    ],
+)
+def test_an_answer_that_inflates_without_end_or_not_at_all_is_refused(
+    monkeypatch: pytest.MonkeyPatch, content: bytes, says: str
+):
+    """A few megabytes of gzip filled the client's memory; what is no gzip gave a traceback."""
+    monkeypatch.setattr("surrogym_client.transport.connection.MOST_ANSWER", 10**6)
+
+    def zipped(handler: BaseHTTPRequestHandler) -> None:
+        handler.send_response(200)
+        handler.send_header("Content-Encoding", "gzip")
+        handler.send_header("Content-Length", str(len(content)))
+        handler.end_headers()
+        handler.wfile.write(content)
+
+    with (
+        scripted_server(zipped) as server,
+        Connection(server.url, retries=QUICK) as connection,
+        pytest.raises(errors.ProtocolMismatch, match=says),
+    ):
+        connection.send("GET", "/x")

@@ -42,6 +42,7 @@ TOKEN_FILE_VARIABLE = "SURROGYM_TOKEN_FILE"
 _NOT_SENT = (httpx.ConnectError, httpx.ConnectTimeout, httpx.PoolTimeout, StreamUnavailable)
 _TIMEOUTS = (httpx.TimeoutException, TimeoutError)
 _GATEWAY_STATUSES = (502, 503, 504)
+MOST_ANSWER = 512 * 2**20  # largest answer in bytes, decompressed; twice as large as the largest file of a surrogate
 _KEEPALIVE_SECONDS = 3.0  # idle connections are kept for this time; the server closes them after 5 s
 
 
@@ -184,7 +185,11 @@ class Connection:
                 headers={"Content-Type": media_type, "Accept": media_type},
                 timeout=self._timeout(timeout),
             )
-            return _body(client.send(request))
+            response = client.send(request, stream=True)
+            try:
+                return _body(response, _content(response))
+            finally:
+                response.close()
 
         return send_once
 
@@ -236,8 +241,7 @@ class Connection:
             url, client = self.url + path, self._open_client()
             with client.stream("GET", url, headers=dict(headers), timeout=timeout) as response:
                 if response.is_error:
-                    response.read()
-                    _body(response)
+                    _body(response, _content(response))
                 yield response.iter_lines()
         except httpx.TransportError as failure:
             raise _given_up(failure, self.url) from None
@@ -323,12 +327,31 @@ def _is_loopback(url: str) -> bool:
         return host == "localhost"
 
 
-def _body(response: httpx.Response) -> bytes:
+def _content(response: httpx.Response) -> bytes:
+    """Read and decompress an answer, and no more than ``MOST_ANSWER`` bytes of it."""
+    parts, size = [], 0
+    try:
+        for part in response.iter_bytes():
+            size += len(part)
+            if size > MOST_ANSWER:
+                raise ProtocolMismatch(
+                    f"expected an answer of at most {MOST_ANSWER} bytes from {response.url}, got more: check the "
+                    "address"
+                )
+            parts.append(part)
+    except httpx.DecodingError:
+        raise ProtocolMismatch(
+            f"expected an answer that can be decompressed from {response.url}, got another: check the address"
+        ) from None
+    return b"".join(parts)
+
+
+def _body(response: httpx.Response, content: bytes) -> bytes:
     kind = response.headers.get("content-type", "")
     if response.is_success and not kind.startswith("text/html"):
-        return response.content
+        return content
     try:
-        problem = Problem.model_validate_json(response.content)
+        problem = Problem.model_validate_json(content)
     except ValidationError:
         if response.status_code in _GATEWAY_STATUSES:
             raise httpx.RemoteProtocolError(
