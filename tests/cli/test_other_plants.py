@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from support.machine import SettableMachine, diary_in
+from surrogym_client.transport import Api
 from surrogym_shared.archives import stored
+from surrogym_shared.network import Network
 from surrogym_trainer.policies import PolicyCard
 from surrogym_trainer.policies.evidence import Promise
 
@@ -43,3 +45,31 @@ def test_returns_in_the_policys_own_environment_are_compared_with_the_promised_r
     assert said.code == 0, said.err
     assert ("kept" in said.out) == (promised.median < 0)
     assert ("broken" in said.out) == (promised.median > 0)
+
+
+@pytest.fixture
+def of_a_log(promised, server_process, tmp_path, name):
+    """The name of a surrogate, whose policy this is and whose specification names no environment, as that of a log."""
+    card = PolicyCard.model_validate_json((tmp_path / "policy.json").read_text())
+    assert card.spec is not None
+    spec = card.spec.model_copy(update={"environment": name})
+    size = Network.size(spec, 4)
+    Network.of(spec, np.zeros(1), np.ones(1), 4, np.zeros(size)).save(tmp_path / "policy.zip")
+    own = card.model_copy(update={"spec": spec, "surrogate": name, "algorithm": "CMAES"})
+    (tmp_path / "policy.json").write_text(own.model_dump_json())
+    with Api(server_process.url) as api:
+        api.create_surrogate(name, spec)
+        yield name
+        api.delete_surrogate(name)
+
+
+def test_a_promise_from_a_log_is_not_judged_in_another_than_the_first_environment(surrogym, server_process, of_a_log):
+    evaluate = ("evaluate", "policy.zip", "--episodes", "30", "--server", server_process.url)
+    first = surrogym(*evaluate, "--env", OWN)
+    assert "kept" in first.out or "broken" in first.out, first.err
+    other = surrogym(*evaluate, "--env", OTHER)
+    assert other.code == 0, other.err
+    assert "kept" not in other.out
+    assert "broken" not in other.out
+    assert "is for the environment of the surrogate's first evaluation" in other.out
+    assert json.loads(surrogym(*evaluate, "--env", OTHER, "--json").out)["promise_kept"] is None

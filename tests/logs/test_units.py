@@ -12,7 +12,7 @@ from support.server import ServerProcess
 from surrogym_client.transport import Api
 from surrogym_sampler.logs import importing
 from surrogym_sampler.original.classic import pendulum
-from surrogym_shared.logs.checking import ReadLog, check_log
+from surrogym_shared.logs.checking import ReadLog, check_log, draft_log
 from surrogym_shared.logs.columns import roles_by_name
 from surrogym_shared.logs.rows import require_reward_unit, require_units
 from surrogym_shared.logs.table import Table, UnusableLog
@@ -219,3 +219,32 @@ def test_logged_rewards_that_merely_differ_from_the_samples_are_accepted(known: 
     paid = np.linspace(-40, 5, 50)
     paid[:5] = -1e6  # a few crashes
     require_reward_unit(paid, known, "tank")
+
+
+def clocked(heading: str, interval: float) -> Table:
+    times = interval * np.arange(40)
+    cells = {heading: times, "T": np.sin(np.arange(40.0)), "action_u": np.cos(np.arange(40.0)), "reward": np.zeros(40)}
+    return Table(cells, np.arange(2, 42))
+
+
+CLOCKS = {"time_s": 1.0, "time [ms]": 1e-3, "time (us)": 1e-6, "time [min]": 60.0, "time": 1.0}  # seconds of a unit
+
+
+@pytest.mark.parametrize("heading", CLOCKS)
+@pytest.mark.parametrize("factor", [0.5, 2.0, 1.0, 1.05])
+def test_a_log_of_another_sampling_period_than_the_specification_is_refused(heading: str, factor: float) -> None:
+    table = clocked(heading, 0.5 / CLOCKS[heading])
+    own = draft_log(table, roles_by_name(list(table.columns)), "tank").spec.model_copy(update={"sampling_period": 0.5})
+    other = clocked(heading, factor * 0.5 / CLOCKS[heading])
+    if abs(factor - 1) <= 0.1:
+        check_log(other, roles_by_name(list(other.columns)), own)
+        return
+    with pytest.raises(UnusableLog, match=r"expected a step every 0\.5 s, the sampling_period .* got one every"):
+        check_log(other, roles_by_name(list(other.columns)), own)
+
+
+def test_a_draft_declares_the_sampling_period_of_a_clock_with_a_unit() -> None:
+    for heading, unit in CLOCKS.items():
+        table = clocked(heading, 0.5 / unit)
+        period = draft_log(table, roles_by_name(list(table.columns)), "tank").spec.sampling_period
+        assert period == (None if heading == "time" else 0.5)

@@ -15,7 +15,6 @@ from surrogym_sampler.logs.reading import format_of
 from surrogym_shared.logs.checking import check_log
 from surrogym_shared.logs.columns import LogMapping
 from surrogym_shared.logs.roles import read_roles
-from surrogym_shared.logs.rows import OFF_PERIOD
 from surrogym_shared.logs.table import Ints
 from surrogym_shared.logs.text import decoded, table_of_text
 from surrogym_shared.logs.transitions import TooFewSteps
@@ -25,7 +24,6 @@ from surrogym_trainer.evaluation.comparing import StepOfEpisode
 LOOK_SECONDS = 1.0  # seconds between two reads of a log that grows
 LATEST = 1_000  # if a growing log has twice as many rows, all but this number of latest rows are dropped
 CHUNK = 2**20  # largest number of bytes that one read takes from a stream
-UNITS = (1.0, 1e3, 1e6, 1e9)  # the clock of a log may count seconds, or this number of units in a second
 
 Mapping_ = Path | Mapping[str, Any] | None
 
@@ -57,7 +55,7 @@ def read_once(path: Path, mapping: Mapping_, spec: EnvironmentSpec) -> ReadLog:
             recorded at another sampling period.
         OSError: the file can't be read.
     """
-    return _checked(read_log(path, Options(mapping, spec)), spec)
+    return read_log(path, Options(mapping, spec))
 
 
 def read_growing(chunks: Iterable[bytes], where: str, mapping: Mapping_, spec: EnvironmentSpec) -> Iterator[ReadLog]:
@@ -136,7 +134,7 @@ class _Growing:
             self._drop(table.lines)
             self._mapping = roles.mapping
         try:
-            return _checked(check_log(table, roles, self._spec), self._spec)
+            return check_log(table, roles, self._spec)
         except TooFewSteps:
             return None
 
@@ -146,17 +144,3 @@ class _Growing:
         lines = self._text.splitlines(keepends=True)
         self._text = b"".join([*lines[:first], *lines[kept:]])
         self._dropped += kept - first
-
-
-def _checked(log: ReadLog, spec: EnvironmentSpec) -> ReadLog:
-    """Return the log, after a check that the interval between its rows is the declared sampling period. The log's clock
-    may count seconds, or milli-, micro- or nanoseconds. Raises ``UnusableLog`` for another interval."""
-    period, interval = spec.sampling_period, log.steps.interval
-    if period is None or interval is None or log.roles.time is None:
-        return log
-    if not any(abs(interval / (unit * period) - 1) <= OFF_PERIOD for unit in UNITS):
-        raise UnusableLog(
-            f"expected a step every {period:g} s, the sampling_period of the specification, got one every "
-            f"{interval:g} in the column {log.roles.time!r}: record the log at this period"
-        )
-    return log

@@ -15,7 +15,7 @@ from surrogym_shared.faults import first_fault
 from surrogym_shared.logs.columns import Roles
 from surrogym_shared.logs.drafting import Draft, declared_choices, draft, lost_ends, wrapped
 from surrogym_shared.logs.rewards import declared_reward
-from surrogym_shared.logs.rows import require_units, rows_of, unit_notes
+from surrogym_shared.logs.rows import require_period, require_units, rows_of, unit_notes
 from surrogym_shared.logs.table import Bools, Floats, Table, UnusableLog
 from surrogym_shared.logs.transitions import Transitions, require_steps, transitions_of
 from surrogym_shared.logs.writing import spreadsheet_cell
@@ -66,11 +66,12 @@ class ReadLog:
 
 
 def check_log(table: Table, roles: Roles, spec: EnvironmentSpec) -> ReadLog:
-    """Check the rows of a log against a specification. Limits, choices, units and ends are not checked in the log of an
-    evaluation, because the environment itself wrote it.
+    """Check the rows of a log against a specification. Limits, choices, units, ends and the clock are not checked in
+    the log of an evaluation, because the environment itself wrote it.
 
     Raises:
-        UnusableLog: the columns don't fit the specification, or are in other units.
+        UnusableLog: the columns don't fit the specification, or are in other units; or the interval between two rows is
+            not the sampling period of the specification.
         TooFewSteps: no step is usable.
     """
     roles = _of_spec(roles, spec)
@@ -84,6 +85,7 @@ def check_log(table: Table, roles: Roles, spec: EnvironmentSpec) -> ReadLog:
         units = unit_notes(rows.q, spec)
         if rows.following is not None:
             require_units(rows.following, spec, "next ")
+        require_period(roles, steps.interval, spec.sampling_period)
         steps = _consistent(spec, steps)
     require_steps(table, steps, 1)
     lost = lost_ends(steps) if spec.termination == "learned" else []

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from surrogym_shared.checks import LARGEST, NARROWEST, RESOLUTION
-from surrogym_shared.logs.columns import Roles, heading
+from surrogym_shared.logs.columns import SECONDS, Roles, heading
 from surrogym_shared.logs.table import Bools, Floats, UnusableLog
 from surrogym_shared.logs.transitions import Transitions
 from surrogym_shared.spec import (
@@ -91,6 +91,7 @@ def draft(roles: Roles, steps: Transitions, name: str, budget: int = 0) -> Draft
         time_limit=_time_limit(steps, notes),
         outside_reward=_outside_reward(steps, budget, notes),
         reward=_reward(steps, notes),
+        sampling_period=_period(roles, steps),
         design=Design(budget=budget),
     )
     notes += [*_about(roles, steps), *lost_ends(steps)]
@@ -387,6 +388,14 @@ def _reward(steps: Transitions, notes: list[str]) -> Reward | DeclaredReward:
         )
         return DeclaredReward(kind="declared", terms=(RewardTerm(weight=0, shape="one"),))
     return Reward(timing="auto")
+
+
+def _period(roles: Roles, steps: Transitions) -> float | None:
+    """Return the interval between two rows in seconds, in three digits; None if the clock's unit is not known."""
+    seconds = SECONDS.get(roles.units.get(roles.time or "", ""))
+    if seconds is None or not steps.interval:
+        return None
+    return float(f"{steps.interval * seconds:.3g}")
 
 
 def _about(roles: Roles, steps: Transitions) -> list[str]:

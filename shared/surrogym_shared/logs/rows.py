@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from surrogym_shared.logs.columns import EITHER_END, Roles, heading
+from surrogym_shared.logs.columns import EITHER_END, SECONDS, Roles, heading
 from surrogym_shared.logs.table import Bools, Floats, Ints, Table, UnusableLog, flags, groups, numbers, times
 from surrogym_shared.spec import EnvironmentSpec, limits
 
@@ -180,6 +180,30 @@ def require_units(q: Floats, spec: EnvironmentSpec, which: str = "") -> None:
                 f"{half}, outside its sampling range of {low:.4g} to {high:.4g}: {unit}. If the values are right, "
                 "widen the sampling range in a new specification (--spec)"
             )
+
+
+def require_period(roles: Roles, interval: float | None, period: float | None) -> None:
+    """Check that the interval between two rows is the sampling period of a specification.
+
+    Args:
+        roles: roles of the columns, with the unit of the clock. A clock without a unit may count seconds, or milli-,
+            micro- or nanoseconds.
+        interval: median interval between two rows, in the unit of the clock; None without a clock.
+        period: sampling period of the specification in seconds; None if it declares none.
+
+    Raises:
+        UnusableLog: the interval is another one.
+    """
+    if period is None or not interval or roles.time is None:
+        return
+    seconds = SECONDS.get(roles.units.get(roles.time, ""))
+    units = [1.0, 1e-3, 1e-6, 1e-9] if seconds is None else [seconds]
+    if not any(abs(interval * unit / period - 1) <= OFF_PERIOD for unit in units):
+        raise UnusableLog(
+            f"expected a step every {period:g} s, the sampling_period of the specification, got one every "
+            f"{interval:g} in the column {roles.time!r}: record the log at this period, or leave the column out of a "
+            "mapping file (--map) if it is no clock"
+        )
 
 
 def impossible(spec: EnvironmentSpec, state: Sequence[float]) -> str | None:

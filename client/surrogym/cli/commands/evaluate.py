@@ -169,6 +169,8 @@ def command(
             _keep(policy, reports, settings, _named(env, card), card.spec, quiet=output.quiet)
         filmed = film(policy, env, card, opener, result, settings, quiet=output.quiet) if keeping.video else None
         version = push_or_say(service.server, token, policy, ledger, quiet=output.quiet) if stored else None
+        if env and not elsewhere and version and ledger:
+            elsewhere = _elsewhere_by_server(service.server, token, ledger, version, env, promise)
         imagining = Imagining(partial(reading.load, policy, card), card, token)
         found = differences.between(
             ledger, service.server, token, result, settings, expected, steps, imagining, quiet=output.quiet
@@ -203,13 +205,35 @@ def _elsewhere(env: str | None, card: PolicyCard, promise: Promise | None) -> li
     from surrogym_shared.environments import is_name, is_same
 
     own = card.spec.environment if card.spec else ""
-    if env is None or not is_name(own) or is_same(env, own):
+    return [] if env is None or not is_name(own) or is_same(env, own) else [_apart(env, own, promise)]
+
+
+def _elsewhere_by_server(
+    server: str | None, token: str | None, surrogate: str, version: int, env: str, promise: Promise | None
+) -> list[str]:
+    """Return the remark of :func:`_elsewhere` for a specification that names no environment, such as that of a log.
+    The server then takes the environment of the surrogate's first evaluation for its own. The remark is empty if that
+    is ``env``, or if the server can't be asked."""
+    from surrogym.cli.options import connect
+    from surrogym_client.errors import SurrogymClientError
+
+    try:
+        with connect(server, token) as api:
+            evaluations = api.policies.get(surrogate, version).evaluations
+    except SurrogymClientError:
         return []
+    latest = next((one for one in reversed(evaluations) if one.environment == env), None)
+    if latest is None or latest.own:
+        return []
+    return [_apart(env, "the environment of the surrogate's first evaluation", promise)]
+
+
+def _apart(env: str, own: str, promise: Promise | None) -> str:
     ran = f"these episodes ran in {env}"
     if promise is None:
-        return [f"{ran}, and the policy is for {own}: the server shows them apart"]
+        return f"{ran}, and the policy is for {own}: the server shows them apart"
     promised = f"the promise of {promise.low:.4g} to {promise.high:.4g} is for {own}"
-    return [f"{ran}, and {promised}: it is not judged, and the server shows them apart"]
+    return f"{ran}, and {promised}: it is not judged, and the server shows them apart"
 
 
 def _why_not_judged(card: PolicyCard, settings: EvaluationSettings, result: Evaluation) -> list[str]:
