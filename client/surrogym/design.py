@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import itertools
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, Protocol, Self
@@ -18,7 +18,7 @@ from uuid import uuid4
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from surrogym import checks
 from surrogym.files import existing
@@ -29,6 +29,7 @@ from surrogym_server.local import LocalSurrogate
 from surrogym_server.sampling.design import initial_queries
 from surrogym_shared import nouns
 from surrogym_shared.nouns import RealStep
+from surrogym_shared.port import HORIZON
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.states import Phase
 from surrogym_shared.surrogate_file import RealSamples, SurrogateFile
@@ -48,7 +49,8 @@ class QueriesOpen(RuntimeError):
 @dataclass(frozen=True, kw_only=True)
 class Query(nouns.Query):
     """Request for real steps: one step from ``coordinates``, or, if the environment can't be set to any state, several
-    ``actions`` from a snapshot or a reset. A discrete action is given by its number."""
+    ``actions`` from a snapshot or a reset. A discrete action is given by its number. If ``replan`` is true, take the
+    actions from ``Design.acting``."""
 
     id: int
     purpose: Literal["initial", "adaptive"]
@@ -167,6 +169,23 @@ class Design:
         query = self._queue.popleft()
         self._open[query.id] = query
         return query
+
+    def acting(self, query: Query) -> Callable[[int, ArrayLike], nouns.Vector]:
+        """Return a function that gives the action (F,) of each step of a query. Its arguments are the number of the
+        step, from 0, and the state (C,) that was measured before it.
+
+        It gives ``query.actions`` in order. If ``query.replan`` is true, it plans each action anew on the latest model,
+        so that the steps lead to their aim although the model is not exact. This makes a planner first, in some
+        seconds.
+
+        Raises:
+            InvalidInput: the query is not open.
+        """
+        self._require_open(query)
+        if not query.replan:
+            return lambda number, _: query.actions[number]
+        planner = self.surrogate().planner(HORIZON, query.id)
+        return lambda _, state: tuple(planner.from_states(np.array([state], dtype=np.float64))[0].tolist())
 
     def tell(
         self, query: Query | None, steps: RealStep | Sequence[RealStep], snapshots: Sequence[str | None] = ()
@@ -347,7 +366,9 @@ class Design:
 
     def _numbered(self, purpose: Literal["initial", "adaptive"], queries: Sequence[nouns.Query]) -> list[Query]:
         return [
-            Query(q.coordinates, q.actions, q.snapshot, id=next(self._ids), purpose=purpose, design=self._name)
+            Query(
+                q.coordinates, q.actions, q.snapshot, q.replan, id=next(self._ids), purpose=purpose, design=self._name
+            )
             for q in queries
         ]
 

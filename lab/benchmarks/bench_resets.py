@@ -77,10 +77,11 @@ def _run(task: str, seed: int, budget: int, episodes: int, *, rounds: bool) -> l
             known = design.steps
             rows.append(row(10))
         resets += 1
-        machine.begin(int(starts.integers(2**31)))
+        acting, state = design.acting(query), machine.begin(int(starts.integers(2**31)))
         steps = []
-        for action in query.actions:
-            steps.append(machine.act(np.array(action)))
+        for number in range(query.steps):
+            steps.append(machine.act(np.array(acting(number, state))))
+            state = np.asarray(steps[-1].next_coordinates)
             if steps[-1].terminated or steps[-1].truncated:
                 break
         design.tell(query, steps)

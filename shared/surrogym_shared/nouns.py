@@ -31,6 +31,9 @@ class Query:
     coordinates: Vector  # (C,) the C coordinates of the state to set; () for a query from a snapshot or a reset
     actions: tuple[Vector, ...]  # (T, F) actions of F entries to apply in T steps, one after the other
     snapshot: str | None = None  # name of the snapshot at which the steps begin; None: at coordinates or a reset
+    # Whether each action is planned anew on the model, from the state that was measured. ``actions`` are then only
+    # expected, and are applied where nothing can be planned.
+    replan: bool = False
 
     @staticmethod
     def step(coordinates: Iterable[float], action: Iterable[float]) -> Query:
@@ -38,9 +41,9 @@ class Query:
         return Query(tuple(coordinates), (tuple(action),))
 
     @staticmethod
-    def rollout(actions: Iterable[Iterable[float]], snapshot: str | None = None) -> Query:
+    def rollout(actions: Iterable[Iterable[float]], snapshot: str | None = None, *, replan: bool = False) -> Query:
         """Return the query of T actions (T, F), one after the other, from a snapshot, or from a reset if it is None."""
-        return Query((), tuple(map(tuple, actions)), snapshot)
+        return Query((), tuple(map(tuple, actions)), snapshot, replan)
 
     @property
     def kind(self) -> QueryKind:

@@ -8,7 +8,7 @@ steps.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol, Self, TypeVar, runtime_checkable
 
@@ -189,13 +189,28 @@ class ModelPort(SurrogatePort, Protocol):
         ...
 
 
+HORIZON = 12  # default number of steps of each rollout of a planner
+
+
 @runtime_checkable
 class PlanningPort(SurrogatePort, Protocol):
     """A surrogate in this process, on whose model actions can be planned."""
 
-    def planner(self, horizon: int, seed: int) -> Callable[[NDArray[np.float32]], NDArray[Any]]:
-        """Return a function from observations (N, D) to actions, (N, F), or (N,) if they are discrete. It plans each
-        action by rollouts of ``horizon`` steps, in which it tries random changes of actions."""
+    def planner(self, horizon: int, seed: int) -> Planning:
+        """Return a function that plans each action by rollouts of ``horizon`` steps, in which it tries random changes
+        of actions."""
+        ...
+
+
+class Planning(Protocol):
+    """Function that plans actions for N environments, from what was measured."""
+
+    def __call__(self, observations: NDArray[np.floating[Any]], /) -> NDArray[Any]:
+        """Return the actions for observations (N, D): (N, F), or (N,) if they are discrete."""
+        ...
+
+    def from_states(self, states: NDArray[np.float64], /) -> NDArray[np.float64]:
+        """Return the actions (N, F) for states (N, C). A discrete action is given by its number."""
         ...
 
 

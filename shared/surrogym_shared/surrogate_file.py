@@ -62,6 +62,12 @@ class RealSamples:
     # (n,) whether a step comes from a log, so that the budget does not count it; None: no step does.
     logged: Bools | None = None
 
+    @classmethod
+    def none(cls, coordinates: int, actions: int) -> Self:
+        """Return no samples, of states with so many coordinates and actions with so many entries."""
+        states, none = np.zeros((0, coordinates)), np.zeros(0, dtype=np.bool_)
+        return cls(states, np.zeros((0, actions)), states, np.zeros(0), none, none)
+
     def __len__(self) -> int:
         return len(self.reward)
 

@@ -10,6 +10,7 @@ import time
 import uuid
 from itertools import pairwise
 
+import numpy as np
 import pytest
 
 from support.rail import SPEC, HangsRight, Rail, RaisesRight
@@ -18,6 +19,7 @@ from surrogym_sampler import original
 from surrogym_sampler.original.errors import UnknownEnvironment
 from surrogym_sampler.original.isolated import IsolatedEnvironment
 from surrogym_sampler.queries import Sampler, SamplerSettings
+from surrogym_sampler.queries.replanning import replanning
 from surrogym_sampler.queries.sample_conversion import reset_seed
 from surrogym_shared.wire import NewSample
 
@@ -229,3 +231,56 @@ def test_classic_control_tasks_are_learned_from_rollouts_only(api):
     assert report.steps == view.ledger.total <= 24
     assert view.fidelity.confidence_index > 0.99
     api.delete_surrogate(name)
+
+
+@pytest.fixture
+def swinging(api):
+    """A pendulum that can only be reset, and a surrogate of it."""
+    name, machine = f"pendulum-{uuid.uuid4().hex[:8]}", original.make("Pendulum-v1", access="reset", seed=0, budget=30)
+    api.create_surrogate(name, machine.spec())
+    yield name, machine
+    api.delete_surrogate(name)
+
+
+def trial_of(api, name):
+    """The one query that is planned anew, and the samples of its steps."""
+    (query,) = [query for query in api.queries(name) if query.replan]
+    return query, [sample for sample in api.samples(name) if sample.query_id == query.id]
+
+
+def test_a_sampler_plans_each_action_of_a_trial_from_the_state_that_it_measured(api, swinging, monkeypatch):
+    name, machine = swinging
+    planned = []
+
+    def watched(*arguments):
+        planner = replanning(*arguments)
+
+        def act(state):
+            action = planner(state)
+            planned.append((np.asarray(state).tolist(), list(action)))
+            return action
+
+        return act
+
+    monkeypatch.setattr("surrogym_sampler.queries.worker.replanning", watched)
+    Sampler(api, name, machine, SamplerSettings(until_done=True, time_limit=120.0)).run()
+    query, samples = trial_of(api, name)
+    assert len(samples) == len(query.actions)
+    assert [(sample.coordinates, sample.action) for sample in samples] == planned
+
+
+def test_a_sampler_that_can_not_plan_applies_the_expected_actions_and_says_why(api, swinging, monkeypatch):
+    name, machine = swinging
+
+    def missing(*_):
+        raise ImportError("stepping a file needs torch: pip install 'surrogym[server]'")
+
+    monkeypatch.setattr("surrogym_sampler.queries.worker.replanning", missing)
+    told = []
+    settings = SamplerSettings(until_done=True, time_limit=120.0)
+    Sampler(api, name, machine, settings, lambda query, outcome, error: told.append((query, outcome, error))).run()
+    query, samples = trial_of(api, name)
+    assert [sample.action for sample in samples] == query.actions
+    ((outcome, error),) = [(outcome, error) for query, outcome, error in told if getattr(query, "replan", False)]
+    assert outcome == "answered"
+    assert "none could be planned anew: stepping a file needs torch" in error

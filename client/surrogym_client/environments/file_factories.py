@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from importlib.metadata import entry_points
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from surrogym_client.environments.env import RemoteEnv
 from surrogym_client.environments.vector import RemoteVectorEnv
-from surrogym_shared.port import SurrogatePort
+from surrogym_shared.port import Planning, PlanningPort, SurrogatePort
 
 # Group of entry points in which the server's package registers a function that opens a surrogate's file in this
 # process.
@@ -33,6 +34,24 @@ def open_file(path: str | Path) -> SurrogatePort:
     except ModuleNotFoundError as error:
         raise ImportError(f"stepping a file needs {error.name}: pip install 'surrogym[server]'") from error
     return opened
+
+
+def planner_of(file: bytes, horizon: int, seed: int) -> Planning:
+    """Return a function that plans actions in this process, on the model in the content of a surrogate's ``file``. This
+    computes its values, in some seconds. ``PlanningPort.planner`` explains ``horizon`` and ``seed``.
+
+    Raises:
+        ImportError: the extra ``server`` is missing.
+        TypeError: the installed server can't plan.
+        ValueError: the model does not fit its specification, or does not allow planning; with the reason.
+    """
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "model.surrogate"
+        path.write_bytes(file)
+        port = open_file(path)
+    if not isinstance(port, PlanningPort):
+        raise TypeError("the installed server can't plan")
+    return port.planner(horizon, seed)
 
 
 def make_env(*, file: str | Path, **options: Any) -> RemoteEnv:

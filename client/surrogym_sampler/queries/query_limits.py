@@ -63,7 +63,7 @@ def check_query(own: EnvironmentSpec, query: Query) -> None:
     if isinstance(query, StepQuery):
         names = [f"coordinate {name!r}" for name in own.coordinate_names]
         _check_values("coordinates", names, query.coordinates, _coordinate_ranges(own))
-        _check_action(own, query.action)
+        check_action(own, query.action)
         return
     if query.snapshot is not None and not own.snapshots:
         raise QueryRefused(
@@ -77,10 +77,11 @@ def check_query(own: EnvironmentSpec, query: Query) -> None:
             f"environment under another name with --max-rollout {longest}"
         )
     for action in query.actions:
-        _check_action(own, action)
+        check_action(own, action)
 
 
-def _check_action(own: EnvironmentSpec, action: Sequence[float]) -> None:
+def check_action(own: EnvironmentSpec, action: Sequence[float]) -> None:
+    """Raise ``QueryRefused`` if the environment's own specification does not allow an action (F,)."""
     _check_values("action", [f"action {i}" for i in range(own.action.size)], action, own.action.ranges)
     if not isinstance(own.action, BoxAction) and not all(float(value).is_integer() for value in action):
         raise QueryRefused(

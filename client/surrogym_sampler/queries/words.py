@@ -31,7 +31,8 @@ def words_of_query(spec: EnvironmentSpec, query: Query | QueryView) -> list[str]
     """Describe a query: its start, then one line for each entry of the action, with a bar for each step."""
     actions = query.actions if isinstance(query, QueryView) or query.kind == "rollout" else [query.action]
     steps = f"{len(actions)} step{'s' * (len(actions) > 1)}"
-    lines = [f"query {query.id} ({query.purpose}): {steps} from {_start(spec, query)}"]
+    anew = ", each action planned anew from the measured state; expected:" if getattr(query, "replan", False) else ""
+    lines = [f"query {query.id} ({query.purpose}): {steps} from {_start(spec, query)}{anew}"]
     for entry, (low, high) in enumerate(spec.action.ranges):
         values = [action[entry] for action in actions]
         bars = "".join(BARS[min(int((v - low) / (high - low) * len(BARS)), len(BARS) - 1)] for v in values)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TypeVar, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
 from surrogym_client.errors import InvalidInput, LeaseExpired, NotThere
 from surrogym_client.surrogates.waiting import ENDED
@@ -25,7 +26,8 @@ from surrogym_sampler.original.rollouts import answering
 from surrogym_sampler.queries.failures import Failures, Violations
 from surrogym_sampler.queries.leases import LeaseEnded, Leases
 from surrogym_sampler.queries.pipeline import Pipeline
-from surrogym_sampler.queries.query_limits import check_environment, check_query
+from surrogym_sampler.queries.query_limits import check_action, check_environment, check_query
+from surrogym_sampler.queries.replanning import replanning
 from surrogym_sampler.queries.returning import Returning, snapshots_of
 from surrogym_sampler.queries.sample_conversion import reset_seed, sample_of
 from surrogym_sampler.queries.settings import Outcome, SamplerReport, SamplerSettings
@@ -125,6 +127,7 @@ class Sampler:
         self._refused: set[int] = set()  # ids of refused queries, which the server may offer again
         self._failures = Failures()
         self._steps = 0
+        self._remark = ""  # why no action of the present query was planned anew; "" if there is no reason to say so
         self._begun: Query | None = None  # query whose real steps began last
         self._returning: Returning | None = None  # the environment's snapshots; None if it has none
         self._phase: Phase | None = None
@@ -258,7 +261,7 @@ class Sampler:
 
     def _step(self, query: Query) -> _Answer:
         taken: list[NewSample] = []
-        error, for_good = "", False
+        self._remark, error, for_good = "", "", False
         outcome: Outcome = "failed"  # used only if the query gives no sample; samples count as an answer
         try:
             check_query(self._own, query)
@@ -283,7 +286,7 @@ class Sampler:
             self._hand_in(taken)
             self._steps += len(taken)
             raise
-        remark = self._returning.remarks() if self._returning else ""
+        remark = "; ".join(filter(None, (self._remark, self._returning.remarks() if self._returning else "")))
         return _Answer(query, taken, outcome, error, remark, for_good)
 
     def _deliver(self, answer: _Answer) -> _Answer:
@@ -325,23 +328,37 @@ class Sampler:
             taken.append(sample_of(query, step, size))
             return
         assert isinstance(environment, RolloutEnvironment)
+        planner = self._planner() if query.replan and query.snapshot is None else None
         self._leases.check(query)
         if query.snapshot is None:
-            environment.begin(reset_seed(query, self._spec.design.seed))
+            state = environment.begin(reset_seed(query, self._spec.design.seed))
         else:
             assert self._returning is not None  # check_query has refused snapshots if the environment has none
             self._returning.begin(query.snapshot)
-        for number, action in enumerate(query.actions):
+            state = np.empty(0)  # only queries that begin at a reset are planned anew
+        for number, expected in enumerate(query.actions):
             if self._stopped():
                 return
             self._leases.check(query)
+            action = expected if planner is None else planner(state)
+            check_action(self._own, action)
             step = environment.act(np.array(action))
+            state = np.asarray(step.next_coordinates, dtype=np.float64)
             taken.append(sample_of(query, step, size, number))
             if step.terminated or step.truncated:
                 return
             if self._returning is not None:
                 snapshot = self._returning.save(taken[-1].next_coordinates)
                 taken[-1] = taken[-1].model_copy(update={"snapshot": snapshot})
+
+    def _planner(self) -> Callable[[NDArray[np.float64]], Sequence[float]] | None:
+        """Return a function that plans an action for a state. Return None and set a remark if nothing can be planned
+        here; the expected actions of the query are applied then."""
+        try:
+            return replanning(self._api, self._surrogate, self._spec)
+        except Exception as error:  # errors of the server's package, whose classes the client does not import
+            self._remark = f"the expected actions were applied, because none could be planned anew: {error}"
+            return None
 
     def _report_gone(self) -> None:
         """Tell the server which of its snapshots no longer exist, so that the design chooses other queries."""

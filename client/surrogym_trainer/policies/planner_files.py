@@ -5,15 +5,13 @@ from __future__ import annotations
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Literal, Self
 
 from pydantic import BaseModel, ValidationError
 
-from surrogym_client.environments.file_factories import open_file
+from surrogym_client.environments.file_factories import planner_of
 from surrogym_shared.archives import has_entry, read_entries
 from surrogym_shared.faults import first_fault
-from surrogym_shared.port import PlanningPort
 from surrogym_shared.surrogate_file import MAX_FILE_BYTES, PLANNER_HEAD
 from surrogym_trainer.policies.card import UnusablePolicy
 from surrogym_trainer.policies.predict import Predict
@@ -67,12 +65,6 @@ class PlannerFile:
             UnusablePolicy: the extra ``server`` is missing, or the model does not allow planning; with the reason.
         """
         try:
-            with TemporaryDirectory() as folder:
-                path = Path(folder) / MODEL
-                path.write_bytes(self.surrogate)
-                port = open_file(path)
-            if not isinstance(port, PlanningPort):
-                raise TypeError("the installed server can't plan")
-            return port.planner(self.horizon, self.seed)
+            return planner_of(self.surrogate, self.horizon, self.seed)
         except Exception as error:  # errors of the server's package, whose classes the client does not import
             raise UnusablePolicy(str(error)) from error

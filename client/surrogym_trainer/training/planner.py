@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 
-import numpy as np
-
-from surrogym_shared.port import ModelPort, SurrogatePort
+from surrogym_shared.port import HORIZON, ModelPort, SurrogatePort
 from surrogym_shared.surrogate_file import RealSamples, SurrogateFile
 from surrogym_trainer.policies.card import UnusablePolicy
 from surrogym_trainer.policies.planner_files import PlannerFile
@@ -19,7 +17,7 @@ from surrogym_trainer.training.settings import TrainProgress
 class Planner(PolicySearch):
     """A policy that plans each action by rollouts of the model. Nothing is trained."""
 
-    horizon: int = 12  # number of steps of each planned rollout
+    horizon: int = HORIZON  # number of steps of each planned rollout
 
     suggested_steps = 1
     resumable = False  # it computes its values anew from the latest model
@@ -45,6 +43,4 @@ def _file_of(port: SurrogatePort) -> SurrogateFile:
     if not isinstance(port, ModelPort):
         raise ValueError("algorithm PLANNER: expected a surrogate with a model, got an original environment")
     spec, model = port.spec(), port.model_file()
-    states, none = np.zeros((0, len(spec.coordinates))), np.zeros(0, dtype=np.bool_)
-    samples = RealSamples(states, np.zeros((0, spec.action.size)), states, np.zeros(0), none, none)
-    return SurrogateFile("planner", spec, model, samples)
+    return SurrogateFile("planner", spec, model, RealSamples.none(len(spec.coordinates), spec.action.size))

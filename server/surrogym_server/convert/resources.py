@@ -127,7 +127,9 @@ def _leased(query: LeasedQuery, lease_seconds: float) -> replies.Query:
         "lease_seconds": lease_seconds,
     }
     if query.kind == "rollout":
-        return replies.RolloutQuery(**common, actions=_rows(query.actions), snapshot=query.snapshot)
+        return replies.RolloutQuery(
+            **common, actions=_rows(query.actions), snapshot=query.snapshot, replan=query.replan
+        )
     return replies.StepQuery(**common, coordinates=list(query.coordinates), action=list(query.action))
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.observation_inverse import ObservationInverse
 from surrogym_server.errors import InvalidInput
-from surrogym_server.models.abilities import CompiledSteps, GridPolicy, PlannedActions, offers
+from surrogym_server.models.abilities import ArraySteps, CompiledSteps, GridPolicy, PlannedActions, offers
 from surrogym_server.models.port import DynamicsModel
 from surrogym_server.planning.grid import solve, unfit
 from surrogym_shared.spec import BoxAction
@@ -42,10 +42,25 @@ def planner_of(model: DynamicsModel, horizon: int, seed: int = 0) -> Planner:
     Raises:
         InvalidInput: the horizon is out of its range, or the model or its environment does not allow planning.
     """
-    definition = model.definition
     if type(horizon) is not int or not 1 <= horizon <= MOST_HORIZON:
         raise InvalidInput(f"horizon: expected a whole number of steps from 1 to {MOST_HORIZON}, got {horizon!r}")
-    inverse = _inverse(definition)
+    inverse, able, steps = _requirements(model)
+    policy = solve(steps, model.terminal_reward, model.definition.time_limit)
+    return Planner(model.definition, inverse, able, policy, horizon, seed)
+
+
+def allows_planning(model: DynamicsModel) -> bool:
+    """Return whether ``planner_of`` can plan on a model."""
+    try:
+        _requirements(model)
+    except InvalidInput:
+        return False
+    return True
+
+
+def _requirements(model: DynamicsModel) -> tuple[ObservationInverse, PlannedActions, ArraySteps]:
+    """Return what a planner needs of a model. Raises ``InvalidInput`` with the reason if it does not allow planning."""
+    inverse = _inverse(model.definition)
     able, compiled = offers(model, PlannedActions), offers(model, CompiledSteps)
     steps = None if compiled is None else compiled.compiled()
     if able is None or steps is None or not able.plans:
@@ -53,8 +68,7 @@ def planner_of(model: DynamicsModel, horizon: int, seed: int = 0) -> Planner:
             "expected a model of Gaussian processes without a prior, with compiled steps, because a planner rolls it "
             "out in compiled code: train a policy"
         )
-    policy = solve(steps, model.terminal_reward, definition.time_limit)
-    return Planner(definition, inverse, able, policy, horizon, seed)
+    return inverse, able, steps
 
 
 def _inverse(definition: EnvironmentDefinition) -> ObservationInverse:
@@ -108,7 +122,11 @@ class Planner:
 
     def __call__(self, observations: NDArray[np.floating[Any]]) -> NDArray[Any]:
         shown = torch.from_numpy(np.asarray(observations, dtype=np.float64))
-        q = self.inverse(shown, shown.new_zeros(len(shown), len(self._near))).numpy()
+        actions = self.from_states(self.inverse(shown, shown.new_zeros(len(shown), len(self._near))).numpy())
+        return actions[:, 0].astype(np.int64) if self.policy.choices else actions
+
+    def from_states(self, q: Floats) -> Floats:
+        """Return the actions (N, F) for states q (N, C). A discrete action is given by its number."""
         plans, arrived = self._continued(q), np.empty_like(q)
         actions = np.empty((len(q), plans.shape[2]))
         changes = self._changes[self._calls % SETS]
@@ -116,7 +134,7 @@ class Planner:
             actions[i], arrived[i] = self.model.planned(self.policy, q[i], changes, ELITE, plans[i])
         self._calls += 1
         self._arrived, self._plans = arrived, plans
-        return actions[:, 0].astype(np.int64) if self.policy.choices else actions
+        return actions
 
     def _continued(self, q: Floats) -> Floats:
         """Return the plan (T, F) to continue at each state q (N, C): that of the last call which predicted the nearest

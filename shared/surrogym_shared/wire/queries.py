@@ -81,6 +81,11 @@ class RolloutQuery(LeasedQuery):
         description="(T, F) actions of F entries to apply in T steps, one after the other"
     )
     snapshot: str | None = Field(default=None, description="name of the snapshot to begin at; null: begin at a reset")
+    replan: bool = Field(
+        default=False,
+        description="whether to plan each action anew on the surrogate's latest model, from the measured state; "
+        "``actions`` are then only expected, and to be applied where nothing can be planned",
+    )
 
 
 Query = Annotated[StepQuery | RolloutQuery, Field(discriminator="kind")]
@@ -140,6 +145,9 @@ class QueryView(Reply):
     actions: list[list[float]] = Field(description="(T, F) actions to apply in T steps; T is 1 for a query of one step")
     snapshot: str | None = Field(
         default=None, description="name of the snapshot at which a rollout begins; null for a step, and for a reset"
+    )
+    replan: bool = Field(
+        default=False, description="whether the sampler plans each action anew, so that ``actions`` are only expected"
     )
     attempts: int = Field(description="how often the query has been leased so far")
     sampler: str | None = Field(description="name of the sampler that claimed the query last; null if none has")

@@ -35,6 +35,14 @@ def test_the_actions_of_a_rollout_query_are_stored_bit_exactly(storage: Storage,
     assert storage.queries.get(name, long.id).actions == ROLLOUTS[0].actions
 
 
+def test_a_claimed_rollout_says_whether_its_actions_are_planned_anew(
+    storage: Storage, make: Callable[..., str]
+) -> None:
+    name = make(queries=(Query.rollout([[0.5], [0.25]], replan=True), ROLLOUTS[1]))
+    assert [query.replan for query in storage.queries.claim(name, "a", 2, LONG)] == [True, False]
+    assert [query.replan for query in storage.queries.list(name)] == [True, False]
+
+
 def test_manual_step_and_rollout_queries_can_be_queued_together(storage: Storage, make: Callable[..., str]) -> None:
     name = make(queries=0)
     by_hand = Query.step((1.0, 1.0), (1.0,))

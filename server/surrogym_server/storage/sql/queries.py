@@ -57,7 +57,7 @@ from surrogym_server.storage.sql.tables import leases, queries, requests, sample
 from surrogym_shared.nouns import Query, Vector
 from surrogym_shared.states import LEAST_AUDITED, Purpose, QueryStatus
 
-CONTENT = [getattr(queries.c, name) for name in ("coordinates", "action", "steps", "snapshot")]
+CONTENT = [getattr(queries.c, name) for name in ("coordinates", "action", "steps", "snapshot", "replan")]
 STATE = [getattr(queries.c, name) for name in ("id", "purpose", "status", "round", "attempts", "sampler", "error")]
 
 _EARLIER = queries.alias()
@@ -685,11 +685,13 @@ def _columns(query: Query) -> dict[str, Any]:
         "action": tuple(chain.from_iterable(query.actions)),
         "steps": query.steps,
         "snapshot": query.snapshot,
+        "replan": query.replan,
     }
 
 
 def query_in(row: Row[Any]) -> dict[str, Any]:
-    """Convert a row with columns ``coordinates``, ``action``, ``steps`` and ``snapshot`` to fields of a ``Query``."""
+    """Convert a row with columns ``coordinates``, ``action``, ``steps``, ``snapshot`` and ``replan`` to fields of a
+    ``Query``."""
     size = max(1, len(row.action) // row.steps)
     actions = tuple(row.action[first : first + size] for first in range(0, len(row.action), size))
-    return {"coordinates": row.coordinates, "actions": actions, "snapshot": row.snapshot}
+    return {"coordinates": row.coordinates, "actions": actions, "snapshot": row.snapshot, "replan": row.replan}

@@ -200,6 +200,9 @@ queries = sa.Table(
     sa.Column("action", Floats, nullable=False),  # all actions of a rollout, concatenated
     sa.Column("steps", sa.Integer, nullable=False, server_default="1"),
     sa.Column("snapshot", sa.Text),  # name of the snapshot at which a rollout begins; NULL: a reset
+    sa.Column(
+        "replan", sa.Boolean, nullable=False, server_default=sa.false()
+    ),  # whether the sampler plans actions anew
     # Whether the query was chosen only because ``improve`` requested more.
     sa.Column("extra", sa.Boolean, nullable=False, server_default=sa.false()),
     sa.Column("attempts", sa.Integer, nullable=False),
