@@ -262,7 +262,11 @@ class Mute(Exception):
 
 @pytest.mark.parametrize(
     ("error", "said"),
-    [(ValueError("valve \ud800 stuck"), r"ValueError: valve \ud800 stuck"), (Mute(), "its message can't be read")],
+    [
+        (ValueError("valve \ud800 stuck"), r"ValueError: valve \ud800 stuck"),
+        (ValueError("valve\0 stuck"), r"ValueError: valve\x00 stuck"),
+        (Mute(), "its message can't be read"),
+    ],
 )
 def test_any_environment_error_becomes_text_that_can_be_sent(error: Exception, said: str):
     for described in (sentence(error), sentence(StepFailed(str(error))) if error.args else said):

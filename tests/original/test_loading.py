@@ -184,6 +184,36 @@ def test_the_error_for_an_environment_module_that_calls_exit_names_it(tmp_path, 
         original.make("ends:Cart")
 
 
+BROKEN = """
+import own_cart
+class Mute(Exception):
+    def __str__(self): raise RuntimeError("no words")
+class Made(own_cart.Cart):
+    def __init__(self): raise ValueError("no licence")
+class Specified(own_cart.Cart):
+    def spec(self): raise Mute()
+class Open:
+    spec, step_from = own_cart.Cart.spec, own_cart.Cart.step_from
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("Made", r"broken:Made failed while it was made: ValueError: no licence \(broken.py:6\)"),
+        ("Specified", r"spec\(\) of broken:Specified failed: Mute: its message can't be read"),
+        ("Open", r"expected an object with spec, step_from and close, .* got a Open without close$"),
+    ],
+)
+def test_the_error_for_a_broken_environment_class_names_the_fault(own_module, tmp_path, monkeypatch, name, message):
+    """The command ended in a traceback of Surrogym."""
+    (tmp_path / "broken.py").write_text(BROKEN)
+    for module in ("broken", own_module):
+        monkeypatch.delitem(sys.modules, module, raising=False)
+    with pytest.raises(UnknownEnvironment, match=message):
+        original.make(f"broken:{name}")
+
+
 def test_a_specification_from_a_server_can_only_open_built_in_environments():
     assert is_known("Pendulum-v1")
     assert is_known("Hopper-v5")

@@ -130,7 +130,7 @@ def message_of(error: BaseException) -> str:
         return f"its message can't be read, because of {type(failed).__name__}"
     if len(said) > LONGEST:
         said = f"{said[:LONGEST]} ... (of {len(said)} characters)"
-    return said.encode(errors="backslashreplace").decode()
+    return said.replace("\0", r"\x00").encode(errors="backslashreplace").decode()
 
 
 def sentence(error: BaseException) -> str:

@@ -8,10 +8,12 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
+from pydantic import ValidationError
+
 from surrogym_sampler.original.actions import require_same_action
 from surrogym_sampler.original.adapters import adapter_of, is_trusted, open_simulator, with_colon
 from surrogym_sampler.original.classic import TASKS
-from surrogym_sampler.original.errors import UnknownEnvironment, sentence
+from surrogym_sampler.original.errors import OriginalError, UnknownEnvironment, sentence
 from surrogym_sampler.original.executables import Executable, is_executable, open_executable
 from surrogym_sampler.original.factories import load_factory
 from surrogym_sampler.original.gymnasium import GymnasiumEnvironment, opens_task, task_for
@@ -270,21 +272,36 @@ class Respecified:
 
 
 def _made(name: str) -> Any:
-    """Make a user's environment by its factory. Raises ``UnknownEnvironment`` if there is no factory, or if it calls
-    ``sys.exit``."""
+    """Make a user's environment by its factory. Raises ``UnknownEnvironment`` if there is no factory, or if it fails or
+    calls ``sys.exit``."""
     factory = load_factory(name)
     try:
-        return factory()
+        return _called(f"{name} failed while it was made", factory)
     except SystemExit as error:
         raise UnknownEnvironment(
             f"{name} called sys.exit while it was made: {sentence(error)}; remove the call"
         ) from error
 
 
+def _called(what: str, function: Callable[[], Any]) -> Any:
+    """Call a function of a user's environment, and return its result. An error whose own words say what to do, such as
+    that of a missing package or of an invalid specification, is raised unchanged.
+
+    Raises:
+        UnknownEnvironment: the function raised another error; ``what`` are the first words of the message.
+    """
+    try:
+        return function()
+    except (OriginalError, ImportError, ValidationError):
+        raise
+    except Exception as error:
+        raise UnknownEnvironment(f"{what}: {sentence(error)}; correct it and try again") from error
+
+
 def _own(name: str, made: Any, spec: EnvironmentSpec | None, choose: Choose) -> Environment:
     if not callable(getattr(made, "spec", None)):
         return answering(made)  # raises an error that names the missing method
-    own = made.spec()
+    own = _called(f"spec() of {name} failed", made.spec)
     given = choose(spec or own)
     require_period(name, given, period_of(made))
     return answering(made if given == own else Respecified(made, given))
