@@ -13,7 +13,9 @@ in the changed plant, and real returns there, means of 200 episodes:
 
 ``renewed_steps`` and ``tuned_steps`` are the virtual steps of the last two trainings, and ``renewed_reached`` and
 ``tuned_reached`` those of them after which the imagined return had 95 % of the gain over no action that the better one
-of the two has at last. ``share`` is how much of the fresh policy's gain over no action the renewed one has.
+of the two has at last; -1 if it never had. ``share`` is how much of the fresh policy's gain over no action the renewed
+one has.
+
 Rows are saved in ``--out``/renewal.csv, so that the same command continues after Ctrl-C.
 """
 
@@ -110,11 +112,15 @@ def run(plant: str, seed: int) -> Row:
     with TemporaryDirectory() as folder:
         trained = [policy(one, seed, Path(folder) / f"{i}.zip") for i, one in enumerate((old, fresh, renewed))]
         trained.append(policy(renewed, seed, Path(folder) / "tuned.zip", trained[0].path))
-        values = [value(load_policy(one.path, SEARCH)) for one in trained]
+        earned = [value(load_policy(one.path, SEARCH)) for one in trained]
     aim = idle + ENOUGH * (max(one.curve[-1][1] for one in trained[2:]) - idle)
     steps = [one.curve[-1][0] for one in trained[2:]]
     reached = [next((at for at, found in one.curve if found >= aim), -1) for one in trained[2:]]
-    return Row(plant, seed, fresh.steps, renewed.steps, idle, *values, *steps, *reached)
+    return Row(
+        *(plant, seed, fresh.steps, renewed.steps, idle),
+        *(earned[0], earned[1], earned[2], earned[3]),
+        *(steps[0], steps[1], reached[0], reached[1]),
+    )
 
 
 def design(machine: Any, parameters: Mapping[str, float], seed: int, budget: int, prior: Any = None) -> surrogym.Design:

@@ -12,6 +12,7 @@ import pytest
 from support.levitation import PENDULUM, Swing
 from support.saying import Said
 from support.server import ServerProcess
+from surrogym.cli.commands.policy import stored_card
 from surrogym_client.surrogates.waiting import wait_for_design
 from surrogym_client.transport import Api, HttpSurrogate
 from surrogym_sampler.queries.settings import SamplerSettings
@@ -23,8 +24,10 @@ from surrogym_trainer.policies.pushing import push
 from surrogym_trainer.training import TrainResult, TrainSettings, train
 from surrogym_trainer.training.audited import AuditedTraining
 from surrogym_trainer.training.cards import card_of
+from surrogym_trainer.training.fast_ppo.search import FastPpo
 from surrogym_trainer.training.handover import Handover
 
+pytestmark = pytest.mark.timeout(900)  # on a machine that others use as well
 Renew = Callable[..., Said]
 REAL_STEPS = 32
 
@@ -47,7 +50,12 @@ def trained(server_process: ServerProcess, tmp_path_factory: pytest.TempPathFact
 
 
 @pytest.fixture
-def renew(on_server: Renew, trained: str, server_process: ServerProcess, tmp_path: Path) -> Iterator[Renew]:
+def renew(
+    on_server: Renew, trained: str, server_process: ServerProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Renew]:
+    """Runs the command. Its trainings are short, because the old policy is a good start."""
+    monkeypatch.setattr(FastPpo, "suggested_steps", 60_000)
+
     def run(plant: str, *options: str) -> Said:
         out = str(tmp_path / "new.zip")
         asked = ("--policy", f"{trained}@production", "--env", f"support.levitation:{plant}", "--out", out)
@@ -119,6 +127,22 @@ def test_a_policy_that_is_not_trusted_never_gets_the_alias(
     assert "leads to version 1 as before, because the new policy is not trusted" in said.out
     with Api(server_process.url) as api:
         assert [one.version for one in api.policies.list(trained)] == [1]
+
+
+def test_a_training_does_not_begin_with_a_policy_that_fails_in_the_new_model(
+    renew: Renew, trained: str, server_process: ServerProcess, handed_over: Callable[..., None], tmp_path: Path
+):
+    """A ball that is 30 % heavier falls. A training that began with its old policy ended at 29 in place of 143."""
+    with Api(server_process.url) as api:
+        card = stored_card(api, trained, "1")[1].model_copy(update={"imagined_return": 800.0})
+        (tmp_path / "failing.zip").write_bytes(api.policies.file(trained, 1, "zip"))
+        write_card(tmp_path / "failing.zip", card)
+        failing = push(api, tmp_path / "failing.zip", trained).policy.version
+        handed_over(trusted=False)
+        for version, start in ((1, f"{trained}@1"), (failing, None)):
+            api.policies.put_alias(trained, "production", version)
+            assert renew("HeavySwing").code == 1
+            assert api.policies.get(f"{trained}-2").settings["start_from"] == start
 
 
 @pytest.mark.parametrize("where", ["train", "by_episodes"])

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
     from surrogym_client.transport import Api
     from surrogym_sampler.original.protocol import Environment
+    from surrogym_shared.port import SurrogatePort
     from surrogym_shared.spec import EnvironmentSpec
     from surrogym_shared.terminal import Update
     from surrogym_shared.wire import PolicyDetail, SurrogateView
@@ -27,6 +28,9 @@ if TYPE_CHECKING:
 
 SHARE = 4  # by default, the renewal takes one of this many real steps of the old design
 FEWEST = 4  # but not fewer than this
+# the training begins with the old network if this network still has this share of its imagined gain over an untrained
+# policy in the new model; with less, a training from it can end far below one from a new network
+KEPT = 0.5
 PATIENCE_SECONDS = 24 * 3_600.0  # longest time to wait for the real steps of the design
 
 
@@ -65,10 +69,10 @@ def command(
     """Learn a machine that has changed, and replace its policy.
 
     The old surrogate becomes the prior of a new one, which learns the difference from few real steps. The training
-    begins with the network of the old policy, if it can. If an audit trusts the new policy, the alias moves to it. Then
-    the new policy runs a few real episodes. If these contradict its promised return, the alias moves back. An
-    interruption leaves the alias where it was; the same command continues with the new surrogate. This needs a token
-    of role admin.
+    begins with the network of the old policy if it still has half of its gain. If an audit trusts the new policy, the
+    alias moves to it. Then the new policy runs a few real episodes. If these contradict its promised return, the alias
+    moves back. An interruption leaves the alias where it was; the same command continues with the new surrogate. This
+    needs a token of role admin.
 
     Example: surrogym renew arm --policy arm@production --env arm:Real
     """
@@ -258,7 +262,7 @@ class _Renewal:
         wait_for_design(self.api, self.target, PATIENCE_SECONDS, look)
         with TemporaryDirectory() as folder, HttpSurrogate(self.api.url, self.target, self.token) as port:
             settings = TrainSettings(algorithm=self.old.algorithm or None)
-            if (start := self._network(Path(folder) / "old.zip", port.spec())) is not None:
+            if (start := self._network(Path(folder) / "old.zip", port)) is not None:
                 settings = replace(settings, start_from=start)
             training = AuditedTraining(
                 self.api, self.target, port, out, settings, audit=AuditSettings(), progress=record, waiting=look
@@ -306,22 +310,27 @@ class _Renewal:
             subject = Subject(self.api, self.target, port, predict, session, card.untrained)
             return by_episodes(subject, env, opener, EvaluationSettings(episodes), quiet=quiet)
 
-    def _network(self, path: Path, spec: EnvironmentSpec) -> Path | None:
+    def _network(self, path: Path, port: SurrogatePort) -> Path | None:
         """Write the old policy to a file with which a training can begin. None if it has no network of the same shapes
-        that fastppo can train."""
+        that fastppo can train, or if it earns too little in the new model."""
         from surrogym_shared.network import Network
+        from surrogym_trainer.evaluation.imagined import imagined_returns
         from surrogym_trainer.policies.card import UnusablePolicy
+        from surrogym_trainer.policies.files import load_policy
         from surrogym_trainer.training.fast_ppo.learner import restored
         from surrogym_trainer.training.fast_ppo.search import units_of
+        from surrogym_trainer.training.settings import CHECK_EPISODES
 
         path.write_bytes(self.api.policies.file(self.surrogate, self.old.version, "zip"))
+        earned, floor, spec = self.old.imagined_return, self.old.untrained, port.spec()
         try:
-            if not Network.is_at(path):
+            if earned is None or floor is None or not Network.is_at(path):
                 return None
             restored(path, spec, units_of(spec))
         except UnusablePolicy:
             return None
-        return path
+        now = float(imagined_returns(port, load_policy(path, self.old.algorithm), CHECK_EPISODES, 0).mean())
+        return path if now - floor >= KEPT * (earned - floor) else None
 
     @property
     def named(self) -> str:
