@@ -48,7 +48,9 @@ class Webhook:
 
         for pause in (*PAUSES, None):
             try:
-                httpx.post(self._url, json=message, timeout=ANSWER_SECONDS).raise_for_status()
+                # only the status is read, because the content of an answer may have no end
+                with httpx.stream("POST", self._url, json=message, timeout=ANSWER_SECONDS) as answer:
+                    answer.raise_for_status()
             except httpx.HTTPStatusError as error:
                 fault = f"it answered with status {error.response.status_code}"
             except Exception as error:  # a fault of one message must not end the thread

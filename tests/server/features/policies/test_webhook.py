@@ -7,6 +7,7 @@ import logging
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -101,6 +102,28 @@ def test_a_failed_delivery_is_tried_again_and_a_lost_one_is_logged_without_the_p
     assert "127.0.0.1" in line
     assert "status 500" in line
     assert "secret" not in line
+
+
+def test_an_answer_without_end_does_not_delay_the_next_message(receiver: Receiver, monkeypatch: pytest.MonkeyPatch):
+    """The server read all of it into its memory."""
+
+    def endless(handler: Handler) -> None:
+        content = handler.rfile.read(int(handler.headers["content-length"]))
+        receiver.received.append(json.loads(content)["event"])
+        receiver.arrived.release()
+        handler.send_response(200)
+        handler.end_headers()
+        with suppress(ConnectionError):
+            while True:
+                handler.wfile.write(bytes(4096))
+                time.sleep(0.01)
+
+    monkeypatch.setattr(Handler, "do_POST", endless)
+    hook = Webhook(receiver.url)
+    for event in ("first", "second"):
+        hook.post({"event": event})
+        assert receiver.arrived.acquire(timeout=10)
+    assert receiver.received == ["first", "second"]
 
 
 def test_messages_beyond_the_limit_are_dropped_and_logged(caplog: pytest.LogCaptureFixture, monkeypatch):
