@@ -192,6 +192,11 @@ def test_the_import_command_drafts_registers_and_waits_for_the_model(
     said = capsys.readouterr().out
     assert "1 row can't be used" in said
     assert f"{name}: 0 new logged steps, {ROWS - 1} were there before" in said
+    assert "surrogym prior" not in said
+    with pytest.raises(SystemExit):
+        main(["import", str(path), "--register", f"{name}-2", "--server", server_process.url])
+    advice = f"if a simulator made these rows, learn the machine beside them: surrogym prior MACHINE surrogate:{name}-2"
+    assert advice in capsys.readouterr().out.splitlines()
 
 
 @pytest.mark.parametrize(

@@ -273,6 +273,10 @@ def _words(file: Path, imported: Imported, view: SurrogateView | None) -> list[s
     were = "was" if imported.duplicates == 1 else "were"
     there = f", {imported.duplicates} {were} there before" if imported.duplicates else ""
     lines.append(f"{name}: {counted(imported.taken, 'new logged step')}{there}")
+    if imported.taken:
+        lines.append(
+            f"if a simulator made these rows, learn the machine beside them: surrogym prior MACHINE surrogate:{name}"
+        )
     if view is not None and view.fidelity is not None:
         index = view.fidelity.confidence_index
         lines.append(f"model {view.model_version} of {counted(view.samples, 'step')}: confidence index {index:.4f}")
