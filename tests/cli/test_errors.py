@@ -4,6 +4,7 @@ import pytest
 
 from support.scripted_server import problem, reply, scripted_server
 from surrogym.cli.commands.evaluate import enter_steps
+from surrogym_client.transport import Api
 from surrogym_shared.archives import stored
 from surrogym_shared.codes import Code
 
@@ -184,3 +185,18 @@ def test_options_with_nan_or_infinite_values_are_refused(surrogym, arguments):
     said = surrogym(*arguments)
     assert said.code == 2
     assert f"Invalid value for '{arguments[2]}': expected a finite number, got {arguments[3]}" in said.err
+
+
+def test_an_environment_that_fails_to_close_can_be_registered(surrogym, server_process, monkeypatch, name):
+    """The command ended in a traceback, and nothing was registered."""
+
+    def close(_):
+        raise ValueError("the port is busy")
+
+    monkeypatch.setattr("support.moody.Line.close", close)
+    said = surrogym("register", "support.moody:Line", "--name", name, "--server", server_process.url)
+    assert said.code == 0, said.err
+    assert "support.moody:Line could not be closed: ValueError: the port is busy" in said.err
+    with Api(server_process.url) as api:
+        assert api.surrogate(name).phase
+        api.delete_surrogate(name)

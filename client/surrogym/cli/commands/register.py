@@ -26,6 +26,7 @@ from surrogym_shared.presets import PresetName
 
 if TYPE_CHECKING:
     from surrogym_client.transport.api import Api
+    from surrogym_sampler.original.protocol import Environment
     from surrogym_shared.spec import EnvironmentSpec
     from surrogym_shared.wire import SurrogateView
 
@@ -249,13 +250,25 @@ def _specification(environment: str | None, spec: EnvironmentSpec | None, **choi
             try:
                 return original.spec()
             finally:
-                original.close()
+                _close(original, environment)
         if spec is not None:
             others = {name: given.pop(name) for name in ("bins", "access", "max_rollout") if name in given}
             return with_choices(spec, given, **others)  # type: ignore[arg-type]
     except ValueError as error:
         raise CommandError(invalid(error)) from error
     raise CommandError("expected an environment or --spec FILE, got neither: for example surrogym register Pendulum-v1")
+
+
+def _close(original: Environment, name: str) -> None:
+    """Close an environment that was opened for its specification. An error of its ``close`` is only printed, because
+    the specification is valid nevertheless."""
+    from surrogym_sampler.original.errors import sentence
+    from surrogym_shared.terminal import say
+
+    try:
+        original.close()
+    except Exception as error:
+        say(f"{name} could not be closed: {sentence(error)}")
 
 
 def _opened_by(environment: str, spec: EnvironmentSpec) -> EnvironmentSpec:
