@@ -21,7 +21,8 @@ from surrogym_sampler.original.isolated import IsolatedEnvironment
 from surrogym_sampler.queries import Sampler, SamplerSettings
 from surrogym_sampler.queries.replanning import replanning
 from surrogym_sampler.queries.sample_conversion import reset_seed
-from surrogym_shared.wire import NewSample
+from surrogym_sampler.queries.words import line_of, words_of_query
+from surrogym_shared.wire import NewSample, RolloutQuery
 
 RIGHT, LEFT = [1.0], [-1.0]
 ONE = SamplerSettings(name="worker", batch=1, once=True, wait_seconds=5.0)
@@ -284,3 +285,12 @@ def test_a_sampler_that_can_not_plan_applies_the_expected_actions_and_says_why(a
     ((outcome, error),) = [(outcome, error) for query, outcome, error in told if getattr(query, "replan", False)]
     assert outcome == "answered"
     assert "none could be planned anew: stepping a file needs torch" in error
+
+
+def test_a_query_that_is_planned_anew_is_drawn_and_reported_as_such():
+    lease = {"id": 7, "number": 0, "purpose": "adaptive", "attempt": 1, "lease_token": "t", "lease_seconds": 60.0}
+    trial = RolloutQuery(**lease, actions=[[0.5], [-0.5]], replan=True)
+    assert line_of(trial, "answered", "") == "query 7 (adaptive, 2 steps planned anew) answered"
+    first = words_of_query(SPEC, trial)[0]
+    assert first.endswith("from a reset, each action planned anew from the measured state; expected:")
+    assert "anew" not in words_of_query(SPEC, trial.model_copy(update={"replan": False}))[0]

@@ -23,7 +23,8 @@ class Line:
 
 def line_of(query: Query, outcome: Outcome, error: str) -> str:
     """Return a line of output about the outcome of a query; ``error`` is empty if there was none."""
-    asked = f", {len(query.actions)} steps" if query.kind == "rollout" else ""
+    anew = " planned anew" if query.kind == "rollout" and query.replan else ""
+    asked = f", {len(query.actions)} steps{anew}" if query.kind == "rollout" else ""
     return f"query {query.id} ({query.purpose}{asked}) {outcome}{': ' if error else ''}{error}"
 
 
