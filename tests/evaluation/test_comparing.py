@@ -76,6 +76,17 @@ def test_a_single_mispredicted_step_is_reported_in_the_singular() -> None:
     assert second == "  episode of seed 1: 1 such step; its compared steps earned 1.5 more than predicted"
 
 
+def test_rewards_within_the_claimed_errors_are_not_given_as_the_reason_of_a_loss() -> None:
+    """A weaker pump cost the return, and the reason was "earned 1.3e-08 more than predicted"."""
+    errors = np.zeros((20, 2))
+    errors[13] = (0.9, 1.3e-8)
+    found = held(episodes(2, 10), errors)
+    assert found.missing[1] == pytest.approx(1.3e-8)
+    _, second, *_ = Differing(found, 0).in_words(SPEC)
+    assert "e-08" not in second
+    assert second.endswith("earned what was predicted, so a loss comes from the states they lead to")
+
+
 def test_no_real_step_is_reported_as_differing_from_a_correct_model() -> None:
     found = held(episodes(2, 10), np.zeros((20, 2)))
     assert Differing(found, 0).in_words(SPEC) == [

@@ -288,9 +288,11 @@ class Differing:
         ]
         for episode, count in list(found.by_episode().items())[:SHOWN]:
             more = found.missing.get(episode, 0.0)
+            earned = f"its compared steps earned {abs(more):.4g} {'less' if more < 0 else 'more'} than predicted"
+            if episode in found.as_predicted:
+                earned = "its compared steps earned what was predicted, so a loss comes from the states they lead to"
             lines.append(
-                f"  episode of seed {self.first_seed + episode}: {count} such step{'s' * (count > 1)}; its compared "
-                f"steps earned {abs(more):.4g} {'less' if more < 0 else 'more'} than predicted"
+                f"  episode of seed {self.first_seed + episode}: {count} such step{'s' * (count > 1)}; {earned}"
             )
         names = () if spec is None else spec.coordinate_names
         lines += [f"  {self._at(one, names)}" for one in found.found[:SHOWN]]

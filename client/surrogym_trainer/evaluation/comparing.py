@@ -156,12 +156,14 @@ class Disagreements:
         found: steps whose error exceeds the one that the model predicts, by more than chance; the worst first.
         missing: sum of real minus predicted rewards over the compared steps of each episode, by the episode's number.
         shared: further steps that contribute most to an error that all steps share, the largest first.
+        as_predicted: numbers of the episodes whose entry in ``missing`` is within the errors that the model claims.
     """
 
     compared: int
     found: tuple[Disagreement, ...]
     missing: dict[int, float]
     shared: tuple[StepOfEpisode, ...] = ()
+    as_predicted: frozenset[int] = frozenset()
 
     def by_episode(self) -> dict[int, int]:
         """Return the number of steps that contradict the model, by episode, the largest first."""
@@ -190,11 +192,15 @@ def disagreements(steps: Sequence[StepOfEpisode], beside: Compared) -> Disagreem
         for i in order
     )
     missing: dict[int, float] = {}
+    claimed: dict[int, float] = {}  # by episode: sum of the claimed errors of the rewards
     if "reward" in beside.names:
-        errors = beside.errors[:, list(beside.names).index("reward")]
-        for step, error in zip(steps, errors.tolist(), strict=True):
+        reward = list(beside.names).index("reward")
+        pairs = zip(steps, beside.errors[:, reward].tolist(), beside.claimed[:, reward].tolist(), strict=True)
+        for step, error, claim in pairs:
             missing[step.episode] = missing.get(step.episode, 0.0) + error
-    return Disagreements(n, found, missing)
+            claimed[step.episode] = claimed.get(step.episode, 0.0) + claim
+    as_predicted = frozenset(episode for episode, sum_ in missing.items() if abs(sum_) <= claimed[episode])
+    return Disagreements(n, found, missing, as_predicted=as_predicted)
 
 
 def samples_of(found: Disagreements, most: int) -> list[NewSample]:
