@@ -203,7 +203,7 @@ def _dirt_of(
     known = sensors(spec)
     found = identify(rollouts, known)
     took = f"this took {sum(len(rollout.action) for rollout in rollouts)} real steps"
-    for name, said in traits(found, known, spec):
+    for name, said in traits(found, known, spec, rollouts):
         yield Finding(name, said, notable=True)
     yield _history_of(found, declared(spec), history_call(found, known, rollouts), took)
 

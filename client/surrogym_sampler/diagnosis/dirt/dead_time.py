@@ -109,41 +109,67 @@ class _Profile:
     theta: list[Array]
 
 
+@dataclass(frozen=True)
+class _Compared:
+    """Dead times (G,) with a profile for each of M outputs, the sum of their evidences (G,), and which outputs the
+    actions matter to."""
+
+    delays: Array
+    profiles: list[_Profile]
+    total: Array
+    acts: list[bool]
+
+
 def _explained(found: Rows, past: int) -> Explained | None:
     if len(found.change) < FEWEST:
         return None
     state, spread = _standard(found.state), found.change.std(0)
     outputs = _standard(found.change)
-    responses = ("speed", "after change") if past else ("speed", "position")
-    fits = [_fits(state, found.actions, y, responses) for y in outputs.T]
-
-    def profiles_at(delays: Array) -> list[_Profile]:
-        return [_profile(state, found.actions, y, delays, fit) for y, fit in zip(outputs.T, fits, strict=True)]
-
-    coarse = np.linspace(0.0, LONGEST, round(LONGEST / COARSE) + 1)
-    about = coarse[np.argmax(_total(profiles_at(coarse)))]
-    near = np.round(about + FINE * np.arange(-5, 6), 1)
-    delays = np.unique([0.0, *near[(near >= 0) & (near <= LONGEST)]])
-    profiles = profiles_at(delays)
-    total = _total(profiles)
+    if past:
+        # A plant in steps, such as a simulation by Euler's method, has the response of a speed. One in time may look
+        # so by chance, and would then have another dead time.
+        compared = _compared(state, found.actions, outputs, ("after change",))
+        stepped = _compared(state, found.actions, outputs, ("speed",))
+        if stepped.total.max() > compared.total.max() + CLEAR:
+            compared = stepped
+    else:
+        compared = _compared(state, found.actions, outputs, ("speed", "position"))
+    delays, profiles, total = compared.delays, compared.profiles, compared.total
     best = int(total.argmax())
     plausible = delays[total >= total[best] - PLAUSIBLE]
     ended = [_ended(found, state, y, p, best, delays) for y, p in zip(outputs.T, profiles, strict=True)]
-    count = found.actions.shape[1]
-    used = [weights(p.response[best], float(delays[best]), count) for p in profiles if _acts(p, best)]
-    back = max((int(np.flatnonzero(w > TINY * w.max()).max()) for w in used), default=0)
+    used = [
+        weights(profile.response[best], float(delays[best]), found.actions.shape[1])
+        for profile, acts in zip(profiles, compared.acts, strict=True)
+        if acts
+    ]
     return Explained(
         changes=past,
         delay=float(delays[best]),
         low=float(plausible.min()),
         high=float(plausible.max()),
         gain=float(total[best] - total[0]),
-        actions=back,
+        actions=max((int(np.flatnonzero(w > TINY * w.max()).max()) for w in used), default=0),
         evidence=sum(max(process.evidence for process in three) for three in ended),
         error=np.array([math.sqrt(float((plain.off**2).mean())) for plain, _, _ in ended]),
         noise=np.array([noisy.noise for _, noisy, _ in ended]) * spread,
         noisy=np.array([noisy.evidence - quiet.evidence for _, noisy, quiet in ended]),
     )
+
+
+def _compared(state: Array, actions: Array, outputs: Array, responses: Sequence[str]) -> _Compared:
+    """Compare dead times: first few in the whole range, and then those near the best one and 0."""
+    fits = [_fits(state, actions, y, responses) for y in outputs.T]
+
+    def profiles_at(delays: Array) -> list[_Profile]:
+        return [_profile(state, actions, y, delays, fit) for y, fit in zip(outputs.T, fits, strict=True)]
+
+    coarse = np.linspace(0.0, LONGEST, round(LONGEST / COARSE) + 1)
+    rough = profiles_at(coarse)
+    near = np.round(coarse[_total(rough).argmax()] + FINE * np.arange(-5, 6), 1)
+    delays = np.unique([0.0, *near[(near >= 0) & (near <= LONGEST)]])
+    profiles = profiles_at(delays)
+    return _Compared(delays, profiles, _total(profiles), [float(np.ptp(p.evidence)) > CLEAR for p in rough])
 
 
 def _total(profiles: Sequence[_Profile]) -> Array:
@@ -174,11 +200,6 @@ def _profile(state: Array, actions: Array, y: Array, delays: Array, fits: _Fits)
                 if found > evidence[i]:
                     evidence[i], response[i], theta[i] = found, name, start
     return _Profile(evidence, response, theta)
-
-
-def _acts(profile: _Profile, best: int) -> bool:
-    """Whether the weighted action matters to an output: some other dead time has a clearly smaller evidence."""
-    return float(profile.evidence[best] - profile.evidence.min()) > CLEAR
 
 
 def _ended(

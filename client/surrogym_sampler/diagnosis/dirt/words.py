@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -11,11 +11,16 @@ from surrogym_sampler.diagnosis.dirt.rollouts import Rollout, Sensors, changes
 from surrogym_shared.spec import EnvironmentSpec
 
 CERTAIN = 10.0  # logarithm of odds that are called certain
+USUAL = 0.05  # tolerance of a coordinate without a declared one, as a share of the standard deviation of its changes
 WIDER = 1.5  # the declared largest change of a coordinate is this multiple of its largest observed change
 
 
-def traits(found: Dirt, known: Sensors, spec: EnvironmentSpec) -> Iterator[tuple[str, str]]:
+def traits(
+    found: Dirt, known: Sensors, spec: EnvironmentSpec, rollouts: Sequence[Rollout]
+) -> Iterator[tuple[str, str]]:
     """Yield a name and a sentence for each kind of dirt, except for the history that is needed."""
+    spread = np.concatenate([changes(rollout, known.turning) for rollout in rollouts]).std(0)
+    allowed = {n: spec.tolerances.get(n, USUAL * std) for n, std in zip(known.names, spread, strict=True)}
     if (delay := found.delay) is not None:
         seconds = f" ({delay.steps * spec.sampling_period:.2g} s)" if spec.sampling_period else ""
         said = (
@@ -24,7 +29,7 @@ def traits(found: Dirt, known: Sensors, spec: EnvironmentSpec) -> Iterator[tuple
         yield "dead time", f"{said}; {_sure(delay.odds)}"
     for name, width in found.encoders.items():
         circle = f", {turns(width)} counts in a turn" if known.turning[known.names.index(name)] else ""
-        yield "encoder", f"{name} is read in steps of {width:.3g}{circle}; certain{_tolerance(spec, name, width)}"
+        yield "encoder", f"{name} is read in steps of {width:.3g}{circle}; certain{_tolerance(name, width, allowed)}"
     for name, stuck in found.stiction.items():
         most = ", ".join(f"{most:.2g}" for most in stuck.under)
         said = (
@@ -34,7 +39,7 @@ def traits(found: Dirt, known: Sensors, spec: EnvironmentSpec) -> Iterator[tuple
     for name, noise in found.noise.items():
         share = 100 * noise.std / known.span[known.names.index(name)]
         said = f"a measurement of {name} has a standard deviation of {noise.std:.2g}, {share:.2g} % of its range"
-        yield "noise", f"{said}; {_sure(noise.odds)}{_tolerance(spec, name, noise.std)}"
+        yield "noise", f"{said}; {_sure(noise.odds)}{_tolerance(name, noise.std, allowed)}"
 
 
 def history_call(found: Dirt, known: Sensors, rollouts: Sequence[Rollout]) -> str:
@@ -63,8 +68,8 @@ def _sure(odds: float) -> str:
     return "certain" if odds >= CERTAIN else "likely"
 
 
-def _tolerance(spec: EnvironmentSpec, name: str, error: float) -> str:
-    """Return the advice to declare a tolerance of at least an error of one measurement; empty if one is declared."""
-    if spec.tolerances.get(name, 0.0) >= error:
+def _tolerance(name: str, error: float, allowed: Mapping[str, float]) -> str:
+    """Return the advice to declare a tolerance of at least the error of one measurement; empty if ``allowed`` is."""
+    if error <= allowed[name]:
         return ""
     return f'; declare a tolerance of at least that, such as tolerances={{"{name}": {error:.2g}}}'
