@@ -36,8 +36,8 @@ def command(
         int,
         typer.Option(
             min=0,
-            help="Take this many further real steps, to find out whether the environment needs earlier changes and "
-            "actions as lags. 40 to 60 are enough for most.",
+            help="Take this many further real steps, to find dead time, encoders, friction, noise, and whether the "
+            "environment needs earlier changes and actions as lags. 60 are enough for most.",
         ),
     ] = 0,
     *,

@@ -74,14 +74,18 @@ def explain(rollouts: Sequence[Rollout], known: Sensors) -> tuple[Explained, Exp
     if plain is None or float(plain.error.max()) <= ENOUGH:
         return None if plain is None else (plain, plain)
     # the same steps for all, so that their evidences can be compared
-    common = [_explained(rows(rollouts, known, k, MOST_CHANGES, LONGEST + 1), k) for k in range(MOST_CHANGES + 1)]
-    if (needed := common[0]) is None:
+    needed = _explained(rows(rollouts, known, 0, MOST_CHANGES, LONGEST + 1), 0)
+    if needed is None:
         return None
-    for more in common[1:]:
+    for past in range(1, MOST_CHANGES + 1):
+        more = _explained(rows(rollouts, known, past, MOST_CHANGES, LONGEST + 1), past)
         assert more is not None
-        halved = bool((more.error**2 < HALF ** (more.changes - needed.changes) * needed.error**2).any())
-        if halved and more.evidence > needed.evidence + CLEAR:
-            needed = more
+        halved = bool((more.error**2 < HALF * needed.error**2).any())
+        if not halved or more.evidence < needed.evidence + CLEAR:
+            break
+        needed = more
+    if needed.changes == 0:
+        return plain, plain
     best = _explained(rows(rollouts, known, needed.changes, needed.changes, LONGEST + 1), needed.changes)
     assert best is not None
     return best, plain

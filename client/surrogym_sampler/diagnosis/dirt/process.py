@@ -17,7 +17,7 @@ import numpy as np
 from surrogym_sampler.original.protocol import Array
 
 # Logarithms of length scales, sigma_f, lambda and sigma_n: mean and standard deviation of their normal priors.
-LENGTH, SIGNAL, LINEAR, NOISE = (1.0, 1.0), (-1.0, 1.5), (-0.5, 1.5), (-4.0, 3.0)
+LENGTH, SIGNAL, LINEAR, NOISE = (2.0, 0.6), (-1.0, 1.5), (-0.5, 1.5), (-4.0, 3.0)
 # Standard deviation of noise that is always assumed, as a share of the output's: what is left of smaller effects does
 # not decide between two explanations.
 FLOOR = 0.02
