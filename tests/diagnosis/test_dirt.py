@@ -76,7 +76,7 @@ def test_noise_of_the_sensors_is_found_with_its_standard_deviation():
     assert found.explained.changes == 0
     strict = SPEC.model_copy(update={"tolerances": {"x": 0.001}})
     said = [said for name, said in traits(found, KNOWN, strict, rollouts) if name == "noise"]
-    assert "declare a tolerance of at least that, such as tolerances={\"x\": 0.0" in said[0]
+    assert 'declare a tolerance of at least that, such as tolerances={"x": 0.0' in said[0]
 
 
 def test_a_hidden_speed_is_found_and_is_no_dead_time():
