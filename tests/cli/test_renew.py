@@ -20,7 +20,7 @@ from surrogym_sampler.queries.worker import Sampler
 from surrogym_shared.spec import Design
 from surrogym_trainer.policies.card import write_card
 from surrogym_trainer.policies.evidence import Promise
-from surrogym_trainer.policies.pushing import push
+from surrogym_trainer.policies.pushing import as_pushed, push
 from surrogym_trainer.training import TrainResult, TrainSettings, train
 from surrogym_trainer.training.audited import AuditedTraining
 from surrogym_trainer.training.cards import card_of
@@ -138,8 +138,10 @@ def test_a_training_does_not_begin_with_a_policy_that_fails_in_the_new_model(
         (tmp_path / "failing.zip").write_bytes(api.policies.file(trained, 1, "zip"))
         write_card(tmp_path / "failing.zip", card)
         failing = push(api, tmp_path / "failing.zip", trained).policy.version
+        foreign = as_pushed(card.model_copy(update={"algorithm": "of another program"}))
+        other = api.policies.push(trained, foreign, [], "onnx", b"\x08 no model").version
         handed_over(trusted=False)
-        for version, start in ((1, f"{trained}@1"), (failing, None)):
+        for version, start in ((1, f"{trained}@1"), (failing, None), (other, None)):
             api.policies.put_alias(trained, "production", version)
             assert renew("HeavySwing").code == 1
             assert api.policies.get(f"{trained}-2").settings["start_from"] == start

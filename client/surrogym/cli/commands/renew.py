@@ -261,7 +261,7 @@ class _Renewal:
 
         wait_for_design(self.api, self.target, PATIENCE_SECONDS, look)
         with TemporaryDirectory() as folder, HttpSurrogate(self.api.url, self.target, self.token) as port:
-            settings = TrainSettings(algorithm=self.old.algorithm or None)
+            settings = TrainSettings(algorithm=self._algorithm())
             if (start := self._network(Path(folder) / "old.zip", port)) is not None:
                 settings = replace(settings, start_from=start)
             training = AuditedTraining(
@@ -310,9 +310,19 @@ class _Renewal:
             subject = Subject(self.api, self.target, port, predict, session, card.untrained)
             return by_episodes(subject, env, opener, EvaluationSettings(episodes), quiet=quiet)
 
+    def _algorithm(self) -> str | None:
+        """Return the policy search of the old policy; None, which is the default search, if it is another program's."""
+        from surrogym_trainer.training.search import SEARCHES
+
+        try:
+            return SEARCHES.name_of(self.old.algorithm)
+        except ValueError:
+            return None
+
     def _network(self, path: Path, port: SurrogatePort) -> Path | None:
         """Write the old policy to a file with which a training can begin. None if it has no network of the same shapes
         that fastppo can train, or if it earns too little in the new model."""
+        from surrogym_client.errors import UnknownPolicy
         from surrogym_shared.network import Network
         from surrogym_trainer.evaluation.imagined import imagined_returns
         from surrogym_trainer.policies.card import UnusablePolicy
@@ -321,13 +331,13 @@ class _Renewal:
         from surrogym_trainer.training.fast_ppo.search import units_of
         from surrogym_trainer.training.settings import CHECK_EPISODES
 
-        path.write_bytes(self.api.policies.file(self.surrogate, self.old.version, "zip"))
         earned, floor, spec = self.old.imagined_return, self.old.untrained, port.spec()
         try:
+            path.write_bytes(self.api.policies.file(self.surrogate, self.old.version, "zip"))
             if earned is None or floor is None or not Network.is_at(path):
                 return None
             restored(path, spec, units_of(spec))
-        except UnusablePolicy:
+        except (UnknownPolicy, UnusablePolicy):  # there is only a file of another form, or one of another training
             return None
         now = float(imagined_returns(port, load_policy(path, self.old.algorithm), CHECK_EPISODES, 0).mean())
         return path if now - floor >= KEPT * (earned - floor) else None
