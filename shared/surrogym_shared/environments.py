@@ -22,3 +22,9 @@ def is_same(name: str, other: str) -> bool:
     paths = PurePath(file), PurePath(other_file)
     by_file = kind == other_kind and all(path.suffix in FILES for path in paths)
     return name == other or (by_file and paths[0].name == paths[1].name)
+
+
+def is_elsewhere(name: str | None, own: str) -> bool:
+    """Whether a name refers to another environment than ``own``, the environment of a specification. False if the name
+    is None, or if the specification only describes its environment."""
+    return name is not None and is_name(own) and not is_same(name, own)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -12,7 +13,8 @@ from surrogym_client.transport import Api
 from surrogym_shared.archives import stored
 from surrogym_shared.network import Network
 from surrogym_trainer.policies import PolicyCard
-from surrogym_trainer.policies.evidence import Promise
+from surrogym_trainer.policies.evidence import Audit, Promise
+from surrogym_trainer.training.handover import Handover
 
 OWN, OTHER = "support.machine:SettableMachine", "support.moody:Line"
 EVALUATE = ("evaluate", "policy.zip", "--episodes", "30", "--no-push", "--server", "http://127.0.0.1:9")
@@ -47,20 +49,27 @@ def test_returns_in_the_policys_own_environment_are_compared_with_the_promised_r
     assert ("broken" in said.out) == (promised.median > 0)
 
 
-@pytest.fixture
-def of_a_log(promised, server_process, tmp_path, name):
-    """The name of a surrogate, whose policy this is and whose specification names no environment, as that of a log."""
-    card = PolicyCard.model_validate_json((tmp_path / "policy.json").read_text())
+@contextmanager
+def registered(url, folder, name, environment):
+    """A surrogate whose policy is that of ``promised``, and whose specification is of ``environment``."""
+    card = PolicyCard.model_validate_json((folder / "policy.json").read_text())
     assert card.spec is not None
-    spec = card.spec.model_copy(update={"environment": name})
+    spec = card.spec.model_copy(update={"environment": environment})
     size = Network.size(spec, 4)
-    Network.of(spec, np.zeros(1), np.ones(1), 4, np.zeros(size)).save(tmp_path / "policy.zip")
-    own = card.model_copy(update={"spec": spec, "surrogate": name, "algorithm": "CMAES"})
-    (tmp_path / "policy.json").write_text(own.model_dump_json())
-    with Api(server_process.url) as api:
+    Network.of(spec, np.zeros(1), np.ones(1), 4, np.zeros(size)).save(folder / "policy.zip")
+    own = card.model_copy(update={"spec": spec, "surrogate": name, "algorithm": "CMAES", "untrained": -10.0})
+    (folder / "policy.json").write_text(own.model_dump_json())
+    with Api(url) as api:
         api.create_surrogate(name, spec)
         yield name
         api.delete_surrogate(name)
+
+
+@pytest.fixture
+def of_a_log(promised, server_process, tmp_path, name):
+    """The name of a surrogate whose specification names no environment, as that of a log."""
+    with registered(server_process.url, tmp_path, name, name):
+        yield name
 
 
 def test_a_promise_from_a_log_is_not_judged_in_another_than_the_first_environment(surrogym, server_process, of_a_log):
@@ -73,3 +82,23 @@ def test_a_promise_from_a_log_is_not_judged_in_another_than_the_first_environmen
     assert "broken" not in other.out
     assert "is for the environment of the surrogate's first evaluation" in other.out
     assert json.loads(surrogym(*evaluate, "--env", OTHER, "--json").out)["promise_kept"] is None
+
+
+def test_an_audit_in_another_environment_does_not_make_a_policy_trusted(
+    surrogym, server_process, promised, tmp_path, name, monkeypatch
+):
+    """It was written into the card without the name of the environment."""
+    audit = Audit(steps=60, passed=True, before=promised, after=promised)
+    agreed = Handover(promised, audit, True, "the episodes agree")
+    monkeypatch.setattr("surrogym.cli.commands.audit.by_episodes", lambda *_, **__: agreed)
+    command = ("audit", "policy.zip", "--server", server_process.url)
+    with registered(server_process.url, tmp_path, name, OWN):
+        before = (tmp_path / "policy.json").read_text()
+        elsewhere = surrogym(*command, "--env", OTHER)
+        assert elsewhere.code == 0, elsewhere.err
+        assert f"ran in {OTHER}, and the policy is for {OWN}: its card is unchanged" in elsewhere.out
+        assert (tmp_path / "policy.json").read_text() == before
+        with Api(server_process.url) as api:
+            assert api.policies.list(name) == []
+        surrogym(*command, "--env", OWN)
+        assert json.loads((tmp_path / "policy.json").read_text())["trusted"] is True

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -60,7 +60,8 @@ def command(
     Most real steps are taken at states that the policy visits; all are compared with the model. This needs a running
     sampler. With --env, the real steps are whole episodes, whose returns are compared with the promised return too;
     the command says beforehand how many steps they may take. The promised return, the audit and the verdict (trusted or
-    not) go into the card beside the policy. With --surrogate, the card names that surrogate from then on.
+    not) go into the card beside the policy, unless --env is not the policy's own environment. With --surrogate, the
+    card names that surrogate from then on.
 
     Example: surrogym audit policy.zip --steps 16
 
@@ -70,6 +71,7 @@ def command(
     from surrogym.cli.opening import opener_for_policy
     from surrogym_client.surrogates.waiting import words_of_audit
     from surrogym_client.transport import HttpSurrogate
+    from surrogym_shared.environments import is_elsewhere
     from surrogym_shared.terminal import progress
     from surrogym_trainer.evaluation.evaluator import EvaluationSettings
     from surrogym_trainer.policies.card import read_card, write_card
@@ -103,10 +105,20 @@ def command(
     if found.audit is None:
         raise CommandError(_not_made(view, found.reason))
     noted = card.model_copy(update={"surrogate": name, "spec": card.spec or view.spec, **vars(found)})
+    if is_elsewhere(env, view.spec.environment):
+        result = _result(policy, noted, found, None)
+        remark = f"this audit ran in {env}, and the policy is for {view.spec.environment}: its card is unchanged"
+        output.give(result, lambda: f"{words_of_handover(found)}\n{remark}")
+        return
     write_card(policy, noted)
     version = push_or_say(service.server, service.token_for(context), policy, name, quiet=output.quiet)
-    result = {"policy": str(policy), **noted.model_dump(mode="json", include=set(vars(found))), "version": version}
-    output.give(result, lambda: words_of_handover(found))
+    output.give(_result(policy, noted, found, version), lambda: words_of_handover(found))
+
+
+def _result(policy: Path, noted: PolicyCard, found: Handover, version: int | None) -> dict[str, Any]:
+    """Return the result of an audit as JSON: the entries of the card that it gives, and the version of the policy on
+    the server."""
+    return {"policy": str(policy), **noted.model_dump(mode="json", include=set(vars(found))), "version": version}
 
 
 def by_episodes(

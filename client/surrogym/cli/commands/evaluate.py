@@ -202,10 +202,10 @@ def _named(env: str | None, card: PolicyCard) -> str:
 def _elsewhere(env: str | None, card: PolicyCard, promise: Promise | None) -> list[str]:
     """Return a remark if the episodes ran in another environment than the one that the policy was trained for, because
     they can't test the promised return then. Empty if it is the same environment, or if one of the two is unknown."""
-    from surrogym_shared.environments import is_name, is_same
+    from surrogym_shared.environments import is_elsewhere
 
     own = card.spec.environment if card.spec else ""
-    return [] if env is None or not is_name(own) or is_same(env, own) else [_apart(env, own, promise)]
+    return [_apart(env, own, promise)] if env is not None and is_elsewhere(env, own) else []
 
 
 def _elsewhere_by_server(
