@@ -2,10 +2,14 @@
 
 python lab/benchmarks/bench_waiters.py
 python lab/benchmarks/bench_waiters.py --postgresql --each 500
+python lab/benchmarks/bench_waiters.py --writers
 
 Another process holds ``--each`` connections of each kind open and claims again after each reply. /healthz is measured
 without them, beside them, and beside them while one event a second wakes all of them. The waiting process shares the
 machine with the server, so measure on two free cores at least.
+
+``--writers`` measures a client instead that enters one step after the other into a ledger: alone, and while a surrogate
+of 100,000 initial queries is registered and deleted.
 """
 
 from __future__ import annotations
@@ -16,7 +20,7 @@ import multiprocessing
 import os
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from multiprocessing.sharedctypes import Synchronized
@@ -41,7 +45,9 @@ from support.server import running_server
 
 NAME = "waited-for"
 TOKENS = {"admin": "admin-of-this-benchmark", "read": "reads-only", "train": "trains-only", "sample": "samples-only"}
+ADMIN = {"authorization": f"Bearer {TOKENS['admin']}"}
 EACH, SECONDS = 2_000, 65.0
+MANY = 100_000  # queries of the surrogate that is registered beside a writer
 WAIT_SECONDS = 60  # of a claim; so each is renewed once within a measurement
 OPEN_AT_ONCE, PAUSE = 10, 0.08  # spread as the clients of many machines are, so that their claims end one by one
 
@@ -130,7 +136,7 @@ def events(url: str) -> Iterator[None]:
     stop = threading.Event()
 
     def change() -> None:
-        with httpx.Client(base_url=url, headers={"authorization": f"Bearer {TOKENS['admin']}"}, timeout=60) as client:
+        with httpx.Client(base_url=url, headers=ADMIN, timeout=60) as client:
             budget = 2
             while not stop.wait(1.0):
                 budget = 5 - budget
@@ -183,11 +189,53 @@ def measured(url: str, pid: int, each: int, seconds: float) -> dict[str, Any]:
     return found
 
 
+def beside(url: str, what: str, work: Callable[[], object]) -> dict[str, Any]:
+    """Latencies in ms of a client that writes while ``work`` is done."""
+    stop, taken = threading.Event(), list[float]()
+
+    def enter() -> None:
+        with httpx.Client(base_url=url, headers=ADMIN, timeout=60) as client:
+            while not stop.is_set():
+                body = {"steps": 1, "idempotency_key": f"{what} {len(taken)}"}
+                begun = monotonic()
+                client.post(f"/v1/surrogates/{NAME}/ledger", json=body).raise_for_status()
+                taken.append(1e3 * (monotonic() - begun))
+                stop.wait(0.01)
+
+    thread, begun = threading.Thread(target=enter), monotonic()
+    thread.start()
+    try:
+        work()
+    finally:
+        stop.set()
+        thread.join()
+    found = {**figures(taken), "seconds": monotonic() - begun, "load": machine()["load"][0]}
+    print(f"{what:32}" + ", ".join(f"{name} {figure:.1f}" for name, figure in found.items()))
+    return found
+
+
+def written(url: str, client: httpx.Client, seconds: float) -> dict[str, Any]:
+    """Latencies of a writer alone, and beside the registration and the deletion of 100,000 queries."""
+    large = {"name": "large", "spec": spec(initial=MANY, budget=MANY)}
+
+    def register() -> None:
+        client.post("/v1/surrogates", json=large).raise_for_status()
+        while client.get("/v1/surrogates/large").json()["queries"]["pending"] < MANY:
+            sleep(0.5)
+
+    return {
+        "alone": beside(url, "alone", partial(sleep, seconds)),
+        "registering": beside(url, "registering", register),
+        "deleting": beside(url, "deleting", lambda: client.delete("/v1/surrogates/large").raise_for_status()),
+    }
+
+
 def main() -> None:
     made = parser(__doc__)
     made.add_argument("--each", type=int, default=EACH, help="clients of each kind")
     made.add_argument("--seconds", type=float, default=SECONDS, help="of each measurement")
     made.add_argument("--postgresql", action="store_true", help="a PostgreSQL of its own instead of SQLite")
+    made.add_argument("--writers", action="store_true", help="a client that writes, instead of /healthz")
     options = started(made)
     tokens = ",".join(f"{role}:{token}" for role, token in TOKENS.items())
     with ExitStack() as stack:
@@ -196,12 +244,15 @@ def main() -> None:
         if options.postgresql:
             database = ("--database", stack.enter_context(running_postgresql()).new_database())
         server = stack.enter_context(running_server(folder, *database, SURROGYM_TOKENS=tokens))
-        headers = {"authorization": f"Bearer {TOKENS['admin']}"}
-        with httpx.Client(base_url=server.url, headers=headers, timeout=60) as client:
-            client.post("/v1/surrogates", json={"name": NAME, "spec": spec(initial=2, budget=2)}).raise_for_status()
-            client.patch(f"/v1/surrogates/{NAME}", json={"paused": True}).raise_for_status()
-        found = measured(server.url, server.process.pid, options.each, options.seconds)
-    write(options.out, "waiters_postgresql" if options.postgresql else "waiters", found)
+        client = stack.enter_context(httpx.Client(base_url=server.url, headers=ADMIN, timeout=300))
+        client.post("/v1/surrogates", json={"name": NAME, "spec": spec(initial=2, budget=2)}).raise_for_status()
+        client.patch(f"/v1/surrogates/{NAME}", json={"paused": True}).raise_for_status()
+        if options.writers:
+            found = written(server.url, client, options.seconds)
+        else:
+            found = measured(server.url, server.process.pid, options.each, options.seconds)
+    name = "writers" if options.writers else "waiters"
+    write(options.out, f"{name}_postgresql" if options.postgresql else name, found)
 
 
 if __name__ == "__main__":
