@@ -43,11 +43,13 @@ def test_an_evaluation_job_goes_only_to_a_worker_that_allows_its_episodes(api: A
     api.jobs.finish(known, job.id, job.lease_token, "failed", error="the motor did not answer")
 
 
-def test_a_training_job_cannot_finish_with_an_unknown_evaluation(api: Api, known: str):
+def test_a_training_job_cannot_finish_with_an_unknown_policy_or_evaluation(api: Api, known: str):
     version = api.policies.push(known, wire.PushedCard(), [], "zip", network_file(seed=2)).version
     api.jobs.add(known, TRAIN)
     job = api.jobs.claim(known, "trainer-1")
     assert job is not None
+    with pytest.raises(UnknownPolicy, match="which does not exist"):
+        api.jobs.finish(known, job.id, job.lease_token, "done", version=version + 1)
     with pytest.raises(UnknownPolicy, match="evaluation"):
         api.jobs.finish(known, job.id, job.lease_token, "done", version=version, evaluation=2**40)
     ended = api.jobs.finish(known, job.id, job.lease_token, "done", version=version)
