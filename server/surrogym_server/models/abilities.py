@@ -366,7 +366,7 @@ class PlannedActions(ABC):
 
     @abstractmethod
     def planned(
-        self, policy: GridPolicy, start: Floats, changes: Floats, elite: int, best: Floats
+        self, policy: GridPolicy, start: Floats, offset: Floats, changes: Floats, elite: int, best: Floats
     ) -> tuple[Floats, Floats]:
         """Return the first action (F,) of the best of R rounds of N rollouts over T steps, and the state (C,) that the
         model predicts after it.
@@ -374,6 +374,8 @@ class PlannedActions(ABC):
         Args:
             policy: the policy, which acts in each rollout, and the values after the last step.
             start: (C,) state.
+            offset: (C,) numbers to add to the predicted change of each coordinate at every step. A model of changes of
+                the observation ignores them.
             changes: (R, N, T, F) changes of the policy's actions to try: numbers to add to the mean plan of the round
                 before; or discrete actions, -1 for the policy's, -2 for the best plan's.
             elite: number of the best rollouts of a round whose mean the next round changes.

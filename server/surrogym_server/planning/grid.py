@@ -20,6 +20,7 @@ MOST_COORDINATES = 4
 NODES = 100_000  # largest number of nodes of a grid
 MOST_ALONG = 201  # largest number of nodes along one coordinate
 LEVELS = {1: 5, 2: 3, 3: 3}  # number of values of each entry that value iteration tries, by the number of entries
+FINE = 100  # smallest number of nodes along each coordinate of a grid on which the values begin at an upper bound
 SWEEPS = 400  # largest number of sweeps of value iteration
 SWEEPS_PER_CHOICE = 5  # the best actions are chosen again in one of this number of sweeps
 CHANGE = 1e-3  # value iteration stops once no value changes by more than this share of the range of the values
@@ -56,12 +57,13 @@ class GridModel:
         grid, (actions, levels) = _grid(steps.definition, nodes), _actions(action)
         return cls(grid, actions, levels, *_transitions(steps, _nodes(*grid[:3]), actions, terminal_reward))
 
-    def policy(self, discount: float, reward: Singles | None = None) -> GridPolicy:
-        """Return the best policy by value iteration, for other rewards (S, A) than the model's if they are given."""
+    def policy(self, discount: float, reward: Singles | None = None, *, first: float = 0.0) -> GridPolicy:
+        """Return the best policy by value iteration, for other rewards (S, A) than the model's if they are given.
+        ``first`` is the value of each node before the first sweep."""
         from surrogym_server.compiled.grid import choose, sweep
 
         paid = self.reward if reward is None else reward
-        values, best = np.zeros(len(paid)), np.zeros(len(paid), dtype=np.int64)
+        values, best = np.full(len(paid), first), np.zeros(len(paid), dtype=np.int64)
         for number in range(SWEEPS):
             choosing = number % SWEEPS_PER_CHOICE == 0
             change = sweep(*self.grid, self.q_next, paid, discount, choosing, number % 2 == 0, values, best)
@@ -76,7 +78,13 @@ class GridModel:
 def solve(steps: ArraySteps, terminal_reward: float, time_limit: int | None) -> GridPolicy:
     """Return the policy with the highest return on a grid, for episodes of at most ``time_limit`` steps, if they have a
     limit. ``terminal_reward`` is what steps that end the episode pay in addition."""
-    return GridModel.of(steps, terminal_reward).policy(discount_of(time_limit))
+    on_grid, discount = GridModel.of(steps, terminal_reward), discount_of(time_limit)
+    if on_grid.grid[2].min() < FINE:
+        return on_grid.policy(discount)
+    # Thousands of sweeps would be needed to raise the values from 0 to those of an endless episode. Until then they
+    # would depend on the order of the nodes. So they begin at an upper bound, or at 0 if all rewards are negative.
+    highest = on_grid.reward.max(where=~np.isnan(on_grid.q_next[:, :, 0]), initial=0.0)
+    return on_grid.policy(discount, first=float(highest) / (1 - discount))
 
 
 def discount_of(time_limit: int | None) -> float:

@@ -29,6 +29,10 @@ LENGTHS, BEGINNINGS = (1, 1, 2, 3, 5), (0, 0, 0, 1, 2, 4, 7)  # changes of a dis
 # A plan of an earlier decision is continued if the state lies within this share of each coordinate's sampling range
 # from the state that the plan predicted.
 NEAR = 0.1
+# A lasting error of the predicted change is estimated from steps in which no coordinate moves by more than this share
+# of its sampling range. An error in faster motion says little about the error at rest.
+STILL = 0.02
+GAIN = 0.1  # share of the error of such a step by which the estimate changes, so noise hardly changes it
 
 
 def planner_of(model: DynamicsModel, horizon: int, seed: int = 0) -> Planner:
@@ -103,6 +107,9 @@ class Planner:
 
     It keeps the plans of its last call. A plan is continued from the state that it predicted; elsewhere the search
     begins anew. So episodes need no names, and a planner may serve several at once.
+
+    It also keeps an estimate of the lasting error of the predicted change of each coordinate, and adds it to the steps
+    of the rollouts.
     """
 
     definition: EnvironmentDefinition
@@ -115,39 +122,48 @@ class Planner:
 
     def __post_init__(self) -> None:
         low, high = (ends.cpu().numpy() for ends in self.definition.sampled)
-        self._near = NEAR * (high - low)
+        self._span = high - low
         self._cyclic = self.policy.grid[3]
         self._changes = _changes(self.policy, self.horizon, self.seed)
         self._arrived, self._plans = np.empty((0, len(low))), np.empty((0, self.horizon, len(self.policy.least)))
+        self._states, self._offsets = self._arrived, self._arrived
 
     def __call__(self, observations: NDArray[np.floating[Any]]) -> NDArray[Any]:
         shown = torch.from_numpy(np.asarray(observations, dtype=np.float64))
-        actions = self.from_states(self.inverse(shown, shown.new_zeros(len(shown), len(self._near))).numpy())
+        actions = self.from_states(self.inverse(shown, shown.new_zeros(len(shown), len(self._span))).numpy())
         return actions[:, 0].astype(np.int64) if self.policy.choices else actions
 
     def from_states(self, q: Floats) -> Floats:
         """Return the actions (N, F) for states q (N, C). A discrete action is given by its number."""
-        plans, arrived = self._continued(q), np.empty_like(q)
+        (plans, offsets), arrived = self._continued(q), np.empty_like(q)
         actions = np.empty((len(q), plans.shape[2]))
         changes = self._changes[self._calls % SETS]
         for i in range(len(q)):
-            actions[i], arrived[i] = self.model.planned(self.policy, q[i], changes, ELITE, plans[i])
+            actions[i], arrived[i] = self.model.planned(self.policy, q[i], offsets[i], changes, ELITE, plans[i])
         self._calls += 1
-        self._arrived, self._plans = arrived, plans
+        self._states, self._arrived, self._plans, self._offsets = q, arrived, plans, offsets
         return actions
 
-    def _continued(self, q: Floats) -> Floats:
-        """Return the plan (T, F) to continue at each state q (N, C): that of the last call which predicted the nearest
-        state, one step later; or the policy's, if none is near."""
-        count, idle = len(q), -1.0 if self.policy.choices else 0.0
-        plans = np.full((count, *self._plans.shape[1:]), idle)
-        for i in range(count if len(self._arrived) else 0):
-            apart = np.abs(self._arrived - q[i])
-            apart = np.where(self._cyclic, np.minimum(apart, 2 * np.pi - apart), apart) / self._near
-            nearest = int(np.argmin(apart.max(1)))
-            if apart[nearest].max() <= 1:
-                plans[i, :-1] = self._plans[nearest, 1:]
-        return plans
+    def _continued(self, q: Floats) -> tuple[Floats, Floats]:
+        """Return the plan (T, F) to continue at each of the states q (N, C), and the estimated error (C,) of the
+        predicted change: those of the call before for the same row, or else for the row whose predicted state is
+        nearest. If no predicted state is near, return the policy's plan and 0."""
+        plans = np.full((len(q), *self._plans.shape[1:]), -1.0 if self.policy.choices else 0.0)
+        offsets = np.zeros_like(q)
+        for i in range(len(q) if len(self._arrived) else 0):
+            error = self._apart(q[i], self._arrived)
+            share = (np.abs(error) / self._span).max(1)
+            last = i if i < len(share) and share[i] <= NEAR else int(np.argmin(share))
+            if share[last] <= NEAR:
+                plans[i, :-1] = self._plans[last, 1:]
+                moved = np.abs(self._apart(q[i], self._states[last])) / self._span
+                offsets[i] = self._offsets[last] + (GAIN * error[last] if moved.max() <= STILL else 0.0)
+        return plans, offsets
+
+    def _apart(self, q: Floats, others: Floats) -> Floats:
+        """Return q (C,) minus other states (..., C); differences of angles lie between -pi and pi."""
+        apart = q - others
+        return np.where(self._cyclic, (apart + np.pi) % (2 * np.pi) - np.pi, apart)
 
 
 def _changes(policy: GridPolicy, horizon: int, seed: int) -> Floats:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -94,11 +95,51 @@ def test_planned_discrete_actions_hold_an_unstable_pole(falling: LocalSurrogate)
 
 def test_a_plan_is_continued_only_from_the_state_that_it_predicted(hanging: LocalSurrogate):
     planner = hanging.planner(5)
-    planner._arrived = np.array([[3.1, 1.0]])
-    planner._plans = np.arange(5.0).reshape(1, 5, 1)
-    near, wrapped, far = planner._continued(np.array([[3.0, 1.1], [-3.1, 1.0], [1.0, 1.0]]))[:, :, 0]
+    planner._states = planner._arrived = np.array([[3.1, 1.0]])
+    planner._plans, planner._offsets = np.arange(5.0).reshape(1, 5, 1), np.zeros((1, 2))
+    near, wrapped, far = planner._continued(np.array([[3.0, 1.1], [-3.1, 1.0], [1.0, 1.0]]))[0][:, :, 0]
     assert near.tolist() == wrapped.tolist() == [1, 2, 3, 4, 0]
     assert far.tolist() == [0, 0, 0, 0, 0]
+
+
+def test_an_error_at_rest_changes_the_estimate_one_in_motion_keeps_it_and_a_reset_clears_it(hanging: LocalSurrogate):
+    planner = hanging.planner(5)
+    planner._plans, planner._offsets = np.zeros((1, 5, 1)), np.array([[0.01, 0.0]])
+    planner._arrived = np.array([[3.1, 0.0]])
+    planner._states = np.array([[3.14, 0.0]])
+    assert planner._continued(np.array([[-3.1, 0.0]]))[1][0].tolist() == pytest.approx([0.01 + 0.00831853, 0])
+    planner._states = np.array([[2.8, 0.0]])
+    assert planner._continued(np.array([[-3.1, 0.0]]))[1].tolist() == [[0.01, 0]]
+    assert planner._continued(np.array([[0.0, 0.0]]))[1].tolist() == [[0, 0]]
+
+
+def test_rollouts_add_the_estimated_error_to_each_predicted_change(hanging: LocalSurrogate):
+    planner, start = hanging.planner(5), np.array([0.5, 1.0])
+    unchanged = np.zeros((1, 4, 5, 1))
+    arrivals = [
+        hanging.model.planned(planner.policy, start, np.array(offset), unchanged, 1, np.zeros((5, 1)))[1]
+        for offset in ([0.0, 0.0], [0.02, -0.3])
+    ]
+    # The angle moves by 0.05 times the next speed, which the error changes too.
+    assert (arrivals[1] - arrivals[0]).tolist() == pytest.approx([0.02 - 0.05 * 0.3, -0.3], abs=1e-3)
+
+
+class Paying:
+    """Compiled steps that pay 20 more for each step."""
+
+    def __init__(self, steps) -> None:
+        self.steps, self.definition = steps, steps.definition
+
+    def __call__(self, q, u, **options):
+        moved = self.steps(q, u, **options)
+        return replace(moved, reward=moved.reward + 20)
+
+
+def test_a_constant_added_to_all_rewards_adds_the_same_to_the_values_of_all_nodes(hanging: LocalSurrogate):
+    steps: Any = hanging.model.compiled()
+    plain, paid = solve(steps, 0.0, 60), solve(Paying(steps), 0.0, 60)  # type: ignore[arg-type]
+    added = paid.values - plain.values
+    assert np.ptp(added) < 0.02 * np.ptp(plain.values)
 
 
 def test_equal_planners_act_alike_and_other_seeds_try_other_changes(hanging: LocalSurrogate):

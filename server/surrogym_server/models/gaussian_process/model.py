@@ -253,11 +253,17 @@ class GaussianProcessModel(
     def plans(self) -> bool:
         return self._compiled is not None and self.prior is None
 
-    def planned(self, policy: GridPolicy, start: Array, changes: Array, elite: int, best: Array) -> tuple[Array, Array]:
+    def planned(
+        self, policy: GridPolicy, start: Array, offset: Array, changes: Array, elite: int, best: Array
+    ) -> tuple[Array, Array]:
         from surrogym_server.models.gaussian_process.prediction.compiled.plan import plan
 
         steps, action, arrival = self._compiled, np.empty(changes.shape[3]), np.empty(len(start))
         assert steps is not None
+        known = np.zeros((0, 0))
+        if offset.any() and not self.definition.moves_observation:
+            known = np.zeros((changes.shape[1], len(steps.uses)))
+            known[:, : len(offset)] = offset
         low, cell, count, cyclic = policy.grid
         plan(
             *steps.tables,
@@ -275,6 +281,7 @@ class GaussianProcessModel(
             policy.least,
             policy.most,
             start,
+            known,
             changes,
             elite,
             best,

@@ -32,6 +32,7 @@ KEEP = -2.0  # in the changes of a discrete action: the action of the best plan 
     types.float64[::1],
     types.float64[::1],
     types.float64[::1],
+    types.float64[:, ::1],
     types.float64[:, :, :, ::1],
     types.int64,
     types.float64[:, ::1],
@@ -55,6 +56,7 @@ def plan(
     least: Floats,
     most: Floats,
     start: Floats,
+    known: Floats,
     changes: Floats,
     elite: int,
     best: Floats,
@@ -77,6 +79,7 @@ def plan(
         choices: number of discrete actions; 0 for continuous actions.
         least, most: (F,) smallest and largest action.
         start: (C,) state.
+        known: (N, columns) numbers to add to the model's outputs at each step, or (0, 0), as in ``step.step``.
         changes: (R, N, T, F) changes to try. Continuous ones are added to the mean of the ``elite`` best plans of the
             round before. A discrete one is an action, -1 for the policy's, or ``KEEP``. Rollout 0 of the first round
             follows the policy, rollout 1 the plan ``best``, whatever their changes are.
@@ -116,7 +119,7 @@ def plan(
                         u[i, f] = plans[i, t, f]
                     elif not choices:
                         u[i, f] = min(max(u[i, f] + plans[i, t, f], least[f]), most[f])
-            step(numbers, places, q, u, none, none, none, none, False, False, q_next, reward, std, over, none)
+            step(numbers, places, q, u, none, none, none, known, False, False, q_next, reward, std, over, none)
             if has_regions:
                 judge(numbers, places, q, q_next, entries, False, reward, std, over)
             for i in range(lanes):
