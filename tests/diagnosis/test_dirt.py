@@ -10,6 +10,7 @@ import pytest
 from surrogym_sampler.diagnosis.dirt import Rollout, Sensors, identify
 from surrogym_sampler.diagnosis.dirt.dead_time import weights
 from surrogym_sampler.diagnosis.dirt.lattice import widths
+from surrogym_sampler.diagnosis.dirt.process import at
 from surrogym_sampler.diagnosis.dirt.stiction import sticking
 from surrogym_sampler.diagnosis.dirt.words import traits
 from surrogym_shared.spec import BoxAction, Coordinate, EnvironmentSpec, ObservationEntry, Term, Uniform
@@ -136,6 +137,11 @@ def test_a_coordinate_that_rests_at_one_stop_does_not_stick():
 )
 def test_the_weights_of_past_actions_follow_from_the_dead_time(response, delay, expected):
     assert weights(response, delay, 4) == pytest.approx(expected)
+
+
+def test_a_process_of_a_very_large_signal_has_a_finite_evidence():
+    x = np.linspace(0, 1, 60)[:, None]
+    assert math.isfinite(at(x, np.sin(x[:, 0]), np.array([2.0, 20.0, 0.0, -9.0])).evidence)
 
 
 def test_rollouts_of_few_steps_tell_nothing_about_the_past():

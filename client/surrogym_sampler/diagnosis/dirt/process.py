@@ -22,6 +22,7 @@ LENGTH, SIGNAL, LINEAR, NOISE = (2.0, 0.6), (-1.0, 1.5), (-0.5, 1.5), (-4.0, 3.0
 # not decide between two explanations.
 FLOOR = 0.02
 QUIET = -9.0  # logarithm of a sigma_n that counts as none
+JITTER = 1e-10  # added to the diagonal of a covariance, as a share of its mean
 ITERATIONS = 60
 ENOUGH = 1e-3  # a search ends if a step lowers the objective by less
 
@@ -128,7 +129,7 @@ def _covariance(theta: Array, parts: _Parts) -> tuple[Array, Array]:
 
 def _inverse(k: Array) -> tuple[Array, float]:
     """Return the inverse of a covariance (n, n), and half the logarithm of its determinant."""
-    factor = np.linalg.cholesky(k + 1e-10 * np.eye(len(k)))
+    factor = np.linalg.cholesky(k + JITTER * float(k.diagonal().mean()) * np.eye(len(k)))
     low = np.linalg.inv(factor)
     return low.T @ low, float(np.log(factor.diagonal()).sum())
 
@@ -137,7 +138,10 @@ def _objective(theta: Array, parts: _Parts, y: Array, mean: Array, std: Array) -
     """Return the negative logarithm of the posterior, and its gradient (p,) (R&W, eq. 5.9)."""
     d = len(parts.square)
     k, smooth = _covariance(theta, parts)
-    inverse, half_log = _inverse(k)
+    try:
+        inverse, half_log = _inverse(k)
+    except np.linalg.LinAlgError:  # a step of the search that went too far
+        return math.inf, np.zeros(len(theta))
     beta = inverse @ y
     off = (theta - mean) / std
     value = 0.5 * float(y @ beta) + half_log + 0.5 * float(off @ off)
