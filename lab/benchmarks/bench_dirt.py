@@ -4,7 +4,7 @@
 
 The swing-up (PILCO's, moved by ``examples/machines/dirt.py``, only reset) has sizes that each seed draws within 15 %.
 A row counts as right if the kind of dirt is named with its size and no other kind is: a dead time within 0.2 of a step,
-widths of encoders within 1 %, standard deviations of noise within a factor of 1.5 for at least half of the coordinates.
+widths of encoders within 1 %, noise of at least half of the coordinates, each named deviation within a factor of 1.5.
 ``clean`` is a dead time of 0. ``no speeds`` hides both speeds: one earlier change is needed.
 """
 
