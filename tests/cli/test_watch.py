@@ -15,10 +15,15 @@ import pytest
 from support.saying import Said
 from support.server import ServerProcess
 from support.tank import HEADING, lines, watched_tank, write
+from surrogym.cli.commands.renew import chain
 from surrogym_client.errors import ServerUnreachable
+from surrogym_client.surrogates.transfer import export_surrogate
 from surrogym_client.transport import Api
+from surrogym_client.transport.priors import PriorCalls
 from surrogym_client.transport.steps import StepCalls
+from surrogym_shared import wire
 from surrogym_shared.wire.watching import MachineStep
+from surrogym_trainer.watching.watcher import Watcher
 
 Watch = Callable[..., Said]
 
@@ -227,6 +232,87 @@ def test_the_watch_command_with_follow_refuses_a_log_that_became_shorter(
     said = watch(log, "--follow")
     assert said.code == 1
     assert "grow" in said.err
+
+
+def test_the_watch_command_refuses_a_policy_of_another_surrogate(on_server: Watch, tank: str, tmp_path: Path):
+    log = write(tmp_path / "log.csv", lines(50, seed=8))
+    said = on_server("watch", tank, str(log), "--policy", "other@production")
+    assert said.code == 1
+    assert f"expected a policy of '{tank}', got 'other@production'" in said.err
+
+
+@pytest.fixture
+def second(server_process: ServerProcess, tank: str) -> Iterator[Callable[[bool], str]]:
+    """Makes a surrogate with the name of a renewal of the tank, whose prior is the tank or which has none, and with the
+    tank's policy in production."""
+    name = f"{tank}-2"
+    with Api(server_process.url) as api:
+
+        def make(renewed: bool) -> str:
+            api.create_surrogate(name, api.surrogate(tank).spec)
+            if renewed:
+                PriorCalls(api.connection).put(name, export_surrogate(api, tank).to_bytes())
+            card = wire.PushedCard(spec=api.surrogate(tank).spec, promise=None, trusted=None, reason="not audited")
+            api.policies.push(name, card, [], "zip", api.policies.file(tank, 1, "zip"))
+            api.policies.put_alias(name, "production", 1)
+            return name
+
+        yield make
+        api.delete_surrogate(name)
+
+
+def test_the_watch_command_refuses_a_renewed_policy_at_its_old_surrogate(
+    watch: Watch, policy: Callable[[], Any], second: Callable[[bool], str], tmp_path: Path
+):
+    """The old model differs from the machine for which the new policy was trained."""
+    renewed, before = second(True), policy()
+    said = watch(write(tmp_path / "log.csv", lines(300, seed=5, worn_from=150)))
+    assert said.code == 1
+    assert f"surrogym watch {renewed} --policy production" in said.err
+    assert policy() == before
+
+
+def test_another_surrogate_with_the_name_of_a_renewal_is_none(
+    watch: Watch, tank: str, server_process: ServerProcess, second: Callable[[bool], str], tmp_path: Path
+):
+    second(False)
+    assert watch(write(tmp_path / "log.csv", lines(300, seed=2))).code == 0
+    with Api(server_process.url) as api:
+        base, target = chain(api, tank, "production")
+    assert (base.name, target) == (tank, f"{tank}-3")
+
+
+def test_the_watch_command_says_that_the_alias_has_moved_meanwhile(
+    watch: Watch, tank: str, server_process: ServerProcess, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+):
+    take = Watcher.take
+    with Api(server_process.url) as api:
+        card = wire.PushedCard(spec=api.surrogate(tank).spec, promise=None, trusted=None, reason="not audited")
+        later = api.policies.push(tank, card, [], "zip", api.policies.file(tank, 1, "zip")).version
+
+        def moved(self: Watcher, steps: Any) -> Any:
+            api.policies.put_alias(tank, "production", later)
+            return take(self, steps)
+
+        monkeypatch.setattr(Watcher, "take", moved)
+        said = watch(write(tmp_path / "log.csv", lines(300, seed=12, worn_from=150)))
+        api.policies.put_alias(tank, "production", 1)
+        api.policies.delete(tank, later)
+    assert said.code == 1
+    assert f"{tank}@1 is not trusted from now on" in said.out
+    assert f"{tank}@production leads to version {later} by now" in said.out
+
+
+def test_the_watch_command_says_that_a_policy_is_still_trusted_after_a_repeated_report(
+    watch: Watch, policy: Callable[[], Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+):
+    """Real episodes have confirmed the promise since the same drift was reported."""
+    confirmed = policy()[0].model_copy(update={"trusted": True})
+    monkeypatch.setattr(Watcher, "withdraw", lambda *_: confirmed)
+    said = watch(write(tmp_path / "log.csv", lines(300, seed=5, worn_from=150)))
+    assert said.code == 1
+    assert "is still trusted" in said.out
+    assert "not trusted" not in said.out
 
 
 @pytest.mark.parametrize(("name", "which"), [("nobody", "1"), ("", "staging"), ("", "7")])

@@ -92,7 +92,7 @@ def command(
                 f"expected an alias of a policy of {surrogate!r}, got {alias!r}: give one by surrogym policy alias "
                 f"{surrogate}@{old.version} production"
             )
-        base, target = _chain(api, surrogate, alias)
+        base, target = chain(api, surrogate, alias)
         renewal = _Renewal(api, service.token_for(context), surrogate, alias, old, base, target)
         opened, given = environment_of(env, None, base.spec)
         with (
@@ -118,24 +118,29 @@ def command(
         raise typer.Exit(1)
 
 
-def _chain(api: Api, surrogate: str, alias: str) -> tuple[SurrogateView, str]:
+def chain(api: Api, surrogate: str, alias: str) -> tuple[SurrogateView, str]:
     """Return the surrogate whose policy the machine runs, and the name of the next one.
 
     Renewals of ``arm`` are ``arm-2``, ``arm-3`` and so on. One that was interrupted, or whose policy did not stay, has
-    no policy of this alias.
+    no policy of this alias. A surrogate of such a name that does not have the one before as its prior is no renewal.
     """
     from surrogym_client.errors import UnknownSurrogate
+    from surrogym_client.transport.priors import PriorCalls
 
-    base, number = api.surrogate(surrogate), 2
+    base, number, priors = api.surrogate(surrogate), 2, PriorCalls(api.connection)
     while True:
         target = f"{surrogate}-{number}"
         try:
             found = api.surrogate(target)
         except UnknownSurrogate:
             return base, target
-        if not any(alias in one.aliases for one in api.policies.list(target)):
+        about = priors.get(target).about
+        in_use = any(alias in one.aliases for one in api.policies.list(target))
+        if in_use and about is not None and about.source == base.name:
+            base = found
+        elif not in_use and (about is None or about.source == base.name):
             return base, target
-        base, number = found, number + 1
+        number += 1
 
 
 def _budget(view: SurrogateView) -> int:

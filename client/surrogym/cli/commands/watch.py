@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from surrogym_shared.logs.checking import ReadLog
     from surrogym_shared.spec import EnvironmentSpec
     from surrogym_shared.terminal import Update
-    from surrogym_shared.wire import PolicyView, SurrogateView
+    from surrogym_shared.wire import PolicyDetail, PolicyView, SurrogateView
     from surrogym_trainer.evaluation.comparing import StepOfEpisode
     from surrogym_trainer.watching.watcher import Alarm, Watcher
 
@@ -68,8 +68,13 @@ def command(
     from surrogym_shared.terminal import on_interrupt, progress
     from surrogym_trainer.watching.watcher import Watcher
 
+    name, _, which = policy.rpartition("@")
+    if name not in ("", surrogate):
+        raise CommandError(f"expected a policy of {surrogate!r}, got {policy!r}: name the same surrogate twice")
     with service.connect(context) as api:
-        view, version = api.surrogate(surrogate), api.policies.get(surrogate, policy.rpartition("@")[2]).version
+        view, watched = api.surrogate(surrogate), api.policies.get(surrogate, which)
+        _require_own(api, surrogate, which, watched)
+        version = watched.version
         if view.fidelity is None:
             raise CommandError(f"{surrogate!r} has no model yet to compare the steps with: let a sampler run first")
         watcher, seen = Watcher(api, view, false_alarm_steps), _Seen()
@@ -85,6 +90,7 @@ def command(
         if not watcher.compared + watcher.left_out:
             raise CommandError(_words_of_none(view, log))
         stored = None if alarm is None else _withdrawn(watcher, version, alarm, seen.place)
+        moved = None if alarm is None or which not in watched.aliases else _moved(api, surrogate, which, version)
     named = f"{surrogate}@{version}"
     result = {
         "policy": named,
@@ -97,9 +103,38 @@ def command(
         "drift": None if alarm is None else {**asdict(alarm), "region": alarm.region and alarm.region._asdict()},
         "trusted": None if stored is None else stored.trusted,
     }
-    output.give(result, lambda: "\n".join(_words(seen, watcher, alarm, named)))
+    output.give(result, lambda: "\n".join([*_words(seen, watcher, alarm), *_words_of_trust(stored, named, moved)]))
     if alarm is not None:
         raise typer.Exit(1)
+
+
+def _require_own(api: Api, surrogate: str, alias: str, watched: PolicyDetail) -> None:
+    """Raise ``CommandError`` if a renewal has put the watched policy into use, because its promise is that of another
+    model, with which the steps have to be compared."""
+    from surrogym.cli.commands.renew import chain
+    from surrogym.cli.errors import CommandError
+
+    present = chain(api, surrogate, alias)[0].name
+    if present != surrogate:
+        files = {file.digest for file in watched.files}
+        if not files.isdisjoint(file.digest for file in api.policies.get(present, alias).files):
+            raise CommandError(
+                f"expected the surrogate from which {surrogate}@{alias} was trained, got {surrogate!r}: surrogym renew "
+                f"made this policy from {present!r}; next: surrogym watch {present} --policy {alias}"
+            )
+
+
+def _moved(api: Api, surrogate: str, alias: str, version: int) -> str | None:
+    """Return a sentence if an alias does not lead to the watched version any more, else None."""
+    from surrogym_client.errors import UnknownPolicy
+
+    try:
+        now = api.policies.get(surrogate, alias).version
+    except UnknownPolicy:
+        return f"{surrogate}@{alias} does not exist any more"
+    if now == version:
+        return None
+    return f"{surrogate}@{alias} leads to version {now} by now, which was not watched: watch it by the same command"
 
 
 def _readings(
@@ -192,7 +227,19 @@ def _withdrawn(watcher: Watcher, version: int, alarm: Alarm, place: str) -> Poli
         raise
 
 
-def _words(seen: _Seen, watcher: Watcher, alarm: Alarm | None, named: str) -> list[str]:
+def _words_of_trust(stored: PolicyView | None, named: str, moved: str | None) -> list[str]:
+    """Return sentences about the trust in a policy after a drift was reported; none without a drift."""
+    if stored is None:
+        return []
+    trust = (
+        "is still trusted: real episodes have confirmed its promise since this drift was reported"
+        if stored.trusted
+        else "is not trusted from now on"
+    )
+    return [f"{named} {trust}; next: surrogym policy show {named}", *([moved] if moved else [])]
+
+
+def _words(seen: _Seen, watcher: Watcher, alarm: Alarm | None) -> list[str]:
     from surrogym_shared.words import counted
 
     lines = [*seen.notes]
@@ -206,10 +253,7 @@ def _words(seen: _Seen, watcher: Watcher, alarm: Alarm | None, named: str) -> li
     found = f"drift, found in {seen.place} {alarm.line} after {counted(alarm.compared, 'real step')}: {alarm.words()}"
     if alarm.from_the_start:
         found += (
-            "; it is there from the start, so the steps may be of another machine, or the model was never right here"
+            "; it is there from the start, so the steps may be of another machine or in other units, or the model was "
+            "never right here"
         )
-    return [
-        *lines,
-        found,
-        f"{named} is not trusted from now on; next: surrogym policy show {named}",
-    ]
+    return [*lines, found]

@@ -29,7 +29,7 @@ EXAMPLE = {
     "",
     summary="Append real steps to a stream",
     dependencies=[SAMPLE],
-    openapi_extra=json_up_to(128),
+    openapi_extra=json_up_to(4_096),
     responses=documented(Code.UNKNOWN_SURROGATE, Code.IDEMPOTENCY_CONFLICT, Code.INVALID_REQUEST),
 )
 def add(name: str, body: Annotated[AddSteps, example(EXAMPLE)], watching: Watching) -> AddedSteps:

@@ -105,6 +105,14 @@ def test_other_steps_under_stored_numbers_are_refused(calls: StepCalls, surrogat
     assert len(calls.after(surrogate)) == 2
 
 
+def test_the_largest_request_is_not_too_large(calls: StepCalls, surrogate: str):
+    """500 steps of 64 coordinates and actions, the most that a specification can have."""
+    most = [-1.2345678901234567e-05] * 64
+    largest = [step(0, coordinates=most, action=most, next_coordinates=most)] * 500
+    with pytest.raises(InvalidInput, match=r"steps\.0\.coordinates"):
+        calls.add(surrogate, MACHINE, "a", 0, largest)
+
+
 def test_steps_for_an_unknown_surrogate_are_refused(calls: StepCalls):
     with pytest.raises(UnknownSurrogate):
         calls.add("nobody", MACHINE, "a", 0, [step(0)])
