@@ -23,6 +23,7 @@ samples and state, and return a decision and the next state.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from surrogym_server.environment.definition import EnvironmentDefinition
@@ -62,7 +63,7 @@ class Decision:
     queries: tuple[Query, ...]  # real steps that are requested before the next round of the design
 
 
-def initial_queries(definition: EnvironmentDefinition, budget: int) -> tuple[Query, ...]:
+def initial_queries(definition: EnvironmentDefinition, budget: int) -> Sequence[Query]:
     """Return the real steps to request (queries) before the first fit of a model, at most ``budget`` in total.
 
     They are a Latin hypercube, or random rollouts if the environment can't be set to any state.
@@ -75,7 +76,7 @@ def initial_queries(definition: EnvironmentDefinition, budget: int) -> tuple[Que
     if not steps:
         return ()
     tries = 1 if steps > FEW_POINTS else definition.design.hypercube_tries
-    return Points(*going_on(definition, *latin_hypercube(definition, steps, rng, tries), rng)).queries
+    return Points(*going_on(definition, *latin_hypercube(definition, steps, rng, tries), rng)).queries_on_demand
 
 
 def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignState, request: Request) -> Decision:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import textwrap
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,7 +24,7 @@ from surrogym_server.storage.records import (
 )
 from surrogym_shared.nouns import Query
 
-Plan = Callable[[EnvironmentDefinition, int], tuple[Query, ...]]
+Plan = Callable[[EnvironmentDefinition, int], Sequence[Query]]
 Complete = Callable[[dict[str, Any]], dict[str, Any]]
 
 ABSENT = object()

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -36,7 +37,7 @@ class NewSurrogate:
     spec: JSON
     budget: int
     target: float
-    queries: tuple[Query, ...] = ()
+    queries: Sequence[Query] = ()
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """The rounds of Algorithm 1: what is asked first, when it is enough, what is asked next, and on whose budget."""
 
+import gc
 import json
 import math
 from dataclasses import dataclass, replace
@@ -177,7 +178,7 @@ def test_a_design_round_repeated_on_equal_data_chooses_equal_queries(definition,
 
 
 def test_another_design_seed_gives_other_initial_queries():
-    one, same, other = (initial_queries(definition_from_spec(designed(seed=s)), 20) for s in (0, 0, 1))
+    one, same, other = (list(initial_queries(definition_from_spec(designed(seed=s)), 20)) for s in (0, 0, 1))
     assert one == same
     assert one != other
 
@@ -417,3 +418,21 @@ def test_a_design_with_open_queries_continues(definition, few, unseen):
     """A log may come while the rest of the budget is being answered."""
     made = advance(definition, few, NEVER, request(len(few) + 2, first(unseen, 2), open=2))
     assert (made.verdict, len(made.queries)) == ("continue", 0)
+
+
+def test_initial_queries_are_made_when_they_are_read_and_always_the_same():
+    queries = initial_queries(definition_from_spec(designed(initial=2_500)), 2_500)
+    read = list(queries)
+    assert read == [queries[i] for i in range(len(queries))] == list(queries)
+    assert list(queries[990:1_010]) == read[990:1_010]
+    assert len(queries) == 2_500
+    assert queries[-1] == read[-1]
+
+
+def test_planning_100000_queries_leaves_no_objects_that_a_garbage_collection_would_visit():
+    definition = definition_from_spec(designed(initial=100_000))
+    gc.collect()
+    before = len(gc.get_objects())
+    queries = initial_queries(definition, 100_000)
+    assert len(queries) == 100_000
+    assert len(gc.get_objects()) - before < 1_000
