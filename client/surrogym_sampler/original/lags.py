@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from surrogym_sampler.original.errors import StepFailed
 from surrogym_sampler.original.gymnasium import wrapped
 from surrogym_sampler.original.protocol import Array
 from surrogym_shared.spec import EnvironmentSpec, limits
@@ -68,3 +69,30 @@ def _change(spec: EnvironmentSpec, index: int, before: Array, after: Array) -> f
     if spec.coordinates[index].kind == "angle":
         return (change + np.pi) % (2 * np.pi) - np.pi
     return change
+
+
+def snapshot_with(at: Array | None, own: bytes, prefix: int) -> bytes:
+    """Return a snapshot that has the state ``at`` (C,), with its lags, before the environment's ``own`` bytes.
+    ``prefix`` is the number of bytes of the state; without lags it is 0, and the own bytes are the snapshot.
+
+    Raises ``StepFailed`` if no episode is running, so that there is no state.
+    """
+    if not prefix:
+        return own
+    if at is None:
+        raise StepFailed(
+            "expected a running episode, because a snapshot contains its earlier values (lags), got none: reset the "
+            "environment first"
+        )
+    return at.astype("<f8").tobytes() + own
+
+
+def parts_of(snapshot: bytes, prefix: int) -> tuple[Array, bytes]:
+    """Return the state (C,) in a snapshot of ``snapshot_with``, of no entries if ``prefix`` is 0, and the environment's
+    own bytes. Raises ``StepFailed`` if the snapshot is too short."""
+    if len(snapshot) < prefix:
+        raise StepFailed(
+            f"expected a snapshot of at least {prefix} bytes, the size of the coordinates in it, got {len(snapshot)} "
+            "bytes: delete the snapshots of this environment"
+        )
+    return np.frombuffer(snapshot[:prefix], dtype="<f8"), snapshot[prefix:]

@@ -8,7 +8,7 @@ import numpy as np
 
 from surrogym_sampler.original.errors import StepFailed, UnknownEnvironment
 from surrogym_sampler.original.gymnasium import native_action
-from surrogym_sampler.original.lags import begun, followed, placed, read_names
+from surrogym_sampler.original.lags import begun, followed, parts_of, placed, read_names, snapshot_with
 from surrogym_sampler.original.protocol import (
     Array,
     Environment,
@@ -106,14 +106,7 @@ class FromReset:
         snapshot: Any = _saving(self._environment).save()
         if not isinstance(snapshot, bytes):
             raise StepFailed(f"expected save to return bytes, got a {type(snapshot).__name__}: correct the environment")
-        if not self._prefix:
-            return snapshot
-        if self._at is None:
-            raise StepFailed(
-                "expected a running episode, because a snapshot contains its earlier values (lags), got none: reset "
-                "the environment first"
-            )
-        return self._at.astype("<f8").tobytes() + snapshot
+        return snapshot_with(self._at, snapshot, self._prefix)
 
     def restore(self, snapshot: bytes) -> Array:
         """Return to the state of a snapshot, and return the coordinates (C,) there.
@@ -123,13 +116,9 @@ class FromReset:
                 array (R,) of the R coordinates that are no lags.
         """
         self._at = None
-        if len(snapshot) < self._prefix:
-            raise StepFailed(
-                f"expected a snapshot of at least {self._prefix} bytes, the size of the coordinates in it, got "
-                f"{len(snapshot)} bytes: delete the snapshots of this environment"
-            )
-        read = self._read(_saving(self._environment).restore(snapshot[self._prefix :]))
-        before = np.frombuffer(snapshot[: self._prefix], dtype="<f8") if self._prefix else np.zeros(len(read))
+        before, own = parts_of(snapshot, self._prefix)
+        read = self._read(_saving(self._environment).restore(own))
+        before = before if self._prefix else np.zeros(len(read))
         self._at = placed(self._spec, read, before)
         return self._at
 

@@ -8,8 +8,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-import numpy as np
-
 from surrogym_sampler.original.errors import MORE_TIME, EnvironmentDied, StepFailed, StepTimedOut, UnknownEnvironment
 from surrogym_sampler.original.executables.messages import (
     PROTOCOL,
@@ -23,7 +21,7 @@ from surrogym_sampler.original.executables.messages import (
 )
 from surrogym_sampler.original.executables.program import Program
 from surrogym_sampler.original.gymnasium import wrapped
-from surrogym_sampler.original.lags import begun, followed, placed, read_names
+from surrogym_sampler.original.lags import begun, followed, parts_of, placed, read_names, snapshot_with
 from surrogym_sampler.original.limits import rest_seconds
 from surrogym_sampler.original.protocol import Array, RealStep
 from surrogym_shared.spec import EnvironmentSpec
@@ -92,31 +90,15 @@ class Executable:
 
     def save(self) -> bytes:
         """Return the program's snapshot of the current state: the text of its answer, as bytes."""
-        snapshot = text(self._ask("save", self._deadline()), "snapshot").encode()
-        if not self._prefix:
-            return snapshot
-        if self._at is None:
-            raise StepFailed(
-                "expected a running episode, because a snapshot contains its earlier values (lags), got none: reset "
-                "the environment first"
-            )
-        return self._at.astype("<f8").tobytes() + snapshot
+        return snapshot_with(self._at, text(self._ask("save", self._deadline()), "snapshot").encode(), self._prefix)
 
     def restore(self, snapshot: bytes) -> Array:
         """Let the program return to a snapshot, and return the coordinates (C,) there."""
         self._at = None
         self._revive()
-        if len(snapshot) < self._prefix:
-            raise StepFailed(
-                f"expected a snapshot of at least {self._prefix} bytes, the size of the coordinates in it, got "
-                f"{len(snapshot)} bytes: delete the snapshots of this environment"
-            )
-        own = snapshot[self._prefix :].decode(errors="replace")
-        reply = self._ask("restore", self._deadline(), snapshot=own)
-        if self._prefix:
-            self._at = placed(self._spec, self._read(reply), np.frombuffer(snapshot[: self._prefix], dtype="<f8"))
-        else:
-            self._at = self._state(reply)
+        before, own = parts_of(snapshot, self._prefix)
+        reply = self._ask("restore", self._deadline(), snapshot=own.decode(errors="replace"))
+        self._at = placed(self._spec, self._read(reply), before) if self._prefix else self._state(reply)
         return self._at
 
     def close(self) -> None:
