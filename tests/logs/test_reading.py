@@ -348,5 +348,5 @@ def test_a_folder_with_a_broken_data_set_is_refused(tmp_path: Path):
     pytest.importorskip("minari")
     (tmp_path / "data").mkdir()
     (tmp_path / "data" / "metadata.json").write_text("{}")
-    with pytest.raises(UnusableLog, match=r"expected a Minari data set in .* got one that can't be read"):
+    with pytest.raises(UnusableLog, match=r"expected the metadata of a Minari data set in .* got others"):
         read_log(tmp_path)

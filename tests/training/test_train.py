@@ -48,10 +48,13 @@ def small(**settings) -> TrainSettings:
 def test_the_promised_return_of_an_earlier_policy_is_deleted_before_saving_a_new_one(surrogate, tmp_path: Path):
     """Else a kill between the two files leaves a new policy with an old verdict."""
     out = tmp_path / "policy.zip"
-    out.mkdir()
     out.with_suffix(".json").write_text('{"trusted": true, "virtual_steps": 1}')
+
+    def occupy(_: TrainProgress) -> None:
+        out.mkdir(exist_ok=True)
+
     with pytest.raises(OSError):
-        train(surrogate, out, TrainSettings(algorithm="CMAES", total_steps=256))
+        train(surrogate, out, TrainSettings(algorithm="CMAES", total_steps=256), occupy)
     assert not out.with_suffix(".json").exists()
 
 
