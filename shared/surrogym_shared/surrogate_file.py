@@ -64,7 +64,7 @@ class RealSamples:
 
     @classmethod
     def none(cls, coordinates: int, actions: int) -> Self:
-        """Return no samples, of states with so many coordinates and actions with so many entries."""
+        """Return arrays of 0 samples, for ``coordinates`` (C) coordinates and ``actions`` (F) action entries."""
         states, none = np.zeros((0, coordinates)), np.zeros(0, dtype=np.bool_)
         return cls(states, np.zeros((0, actions)), states, np.zeros(0), none, none)
 

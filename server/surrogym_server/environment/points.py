@@ -52,7 +52,7 @@ class Points:
 AT_ONCE = 1_000  # number of queries that exist at once while all are read
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _OnDemand(Sequence[Query]):
     points: Points
 

@@ -18,8 +18,8 @@ from surrogym_sampler.original.protocol import Array
 
 # Logarithms of length scales, sigma_f, lambda and sigma_n: mean and standard deviation of their normal priors.
 LENGTH, SIGNAL, LINEAR, NOISE = (2.0, 0.6), (-1.0, 1.5), (-0.5, 1.5), (-4.0, 3.0)
-# Standard deviation of noise that is always assumed, as a share of the output's: what is left of smaller effects does
-# not decide between two explanations.
+# Standard deviation of noise that every process has, as a share of the output's standard deviation. Effects that are
+# smaller than this noise then do not decide between two explanations.
 FLOOR = 0.02
 QUIET = -9.0  # logarithm of a sigma_n that counts as none
 JITTER = 1e-10  # added to the diagonal of a covariance, as a share of its mean

@@ -18,7 +18,7 @@ from surrogym_sampler.diagnosis.dirt.rollouts import Rollout, Sensors, changes
 from surrogym_sampler.original.protocol import Array
 
 FEWEST = 3  # fewest steps in which the coordinate rests
-LEVEL = 1e-3  # largest probability of so many such steps without friction
+LEVEL = 1e-3  # friction is named if a coordinate without it would rest that often with at most this probability
 RESTING = 1e-6  # without an encoder, a change below this share of the largest counts as rest
 NEAR = 3  # changes of up to this many widths are the small ones
 ANY = 0.5  # small changes that are assumed beside the counted ones
@@ -26,8 +26,13 @@ ANY = 0.5  # small changes that are assumed beside the counted ones
 
 @dataclass(frozen=True)
 class Stiction:
-    """Friction that sticks: ``steps`` in which the coordinate rested, the largest action ``under`` which it did (F,),
-    and the ``chance`` of so many steps without friction."""
+    """Friction that sticks.
+
+    Attributes:
+        steps: number of steps in which the coordinate rested.
+        under: largest action (F,) in these steps.
+        chance: probability that a coordinate without friction rests in this number of steps or more.
+    """
 
     steps: int
     under: Array

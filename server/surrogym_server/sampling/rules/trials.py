@@ -9,6 +9,8 @@ from surrogym_server.sampling.round import Round
 from surrogym_server.sampling.rules.planned import SHORTEST
 from surrogym_shared.nouns import Query
 
+SHARE = 3  # a rollout has one step for each such number of samples
+
 
 def try_planner(round: Round) -> tuple[Query, ...] | None:
     """Return one rollout from a reset whose actions the sampler plans anew at each step, or None if this is not its
@@ -18,7 +20,7 @@ def try_planner(round: Round) -> tuple[Query, ...] | None:
     model is a little wrong. A planner comes back to it. The rollout has a third of the number of samples as steps.
     """
     definition, model = round.definition, round.model
-    steps = min(round.room, definition.max_rollout or 1, max(SHORTEST, len(round.samples) // 3))
+    steps = min(round.room, definition.max_rollout or 1, max(SHORTEST, len(round.samples) // SHARE))
     if not round.continues or round.number % 2 == 0 or definition.snapshots or definition.unknown_steps or steps < 1:
         return None
     if not allows_planning(model):
