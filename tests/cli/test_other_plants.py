@@ -10,10 +10,12 @@ import pytest
 
 from support.machine import SettableMachine, diary_in
 from surrogym_client.transport import Api
+from surrogym_server.features.policies.routes import DRIFT_EXAMPLE
 from surrogym_shared.archives import stored
 from surrogym_shared.network import Network
 from surrogym_trainer.policies import PolicyCard
-from surrogym_trainer.policies.evidence import Audit, Promise
+from surrogym_trainer.policies.evidence import Audit, Promise, RangeLeft
+from surrogym_trainer.policies.pushing import push
 from surrogym_trainer.training.handover import Handover
 
 OWN, OTHER = "support.machine:SettableMachine", "support.moody:Line"
@@ -82,6 +84,28 @@ def test_a_promise_from_a_log_is_not_judged_in_another_than_the_first_environmen
     assert "broken" not in other.out
     assert "is for the environment of the surrogate's first evaluation" in other.out
     assert json.loads(surrogym(*evaluate, "--env", OTHER, "--json").out)["promise_kept"] is None
+
+
+@pytest.mark.parametrize("promised", [-1e6], indirect=True)
+def test_a_policy_downloaded_after_a_drift_earns_back_the_trust_of_its_version(
+    surrogym, server_process, promised, tmp_path, name
+):
+    """Its episodes were stored with a new version, because the downloaded card says that it is not trusted."""
+    at_server = ("--server", server_process.url)
+    left = RangeLeft(coordinate="q", side="upper", end=1.0, share=0.1, farthest=2.0)
+    audit = Audit(steps=60, passed=True, before=promised, after=promised, range_left=left)
+    with registered(server_process.url, tmp_path, name, OWN), Api(server_process.url) as api:
+        card = PolicyCard.model_validate_json((tmp_path / "policy.json").read_text())
+        judged = {"trusted": True, "reason": "an audit passed", "audit": audit, "networks": 2}
+        (tmp_path / "policy.json").write_text(card.model_copy(update=judged).model_dump_json())
+        push(api, tmp_path / "policy.zip")
+        api.connection.send("POST", f"/v1/surrogates/{name}/policies/1/drifts", json.dumps(DRIFT_EXAMPLE).encode())
+        assert surrogym("policy", "get", f"{name}@1", "--out", "got.zip", *at_server).code == 0
+        assert json.loads((tmp_path / "got.json").read_text())["trusted"] is False
+        said = surrogym("evaluate", "got.zip", "--env", OWN, "--episodes", "30", "--json", *at_server)
+        assert (said.code, said.json["version"]) == (0, 1), said.err
+        (policy,) = api.policies.list(name)
+        assert (policy.trusted, policy.reason, policy.drifted_at) == (True, "an audit passed", None)
 
 
 def test_an_audit_in_another_environment_does_not_make_a_policy_trusted(

@@ -141,7 +141,8 @@ class FileNotice(Request):
 class AddPolicy(Request):
     """Request to store a policy: its card, its learning curve, and the announcement of its file.
 
-    A stored version never changes. The same file with another card or curve becomes a new version.
+    A stored version never changes. The same file with another card or curve becomes a new version, unless only the
+    trust in the card is another.
     """
 
     # Not strict here, because ``PushedCard`` checks the types of its fields.

@@ -110,8 +110,8 @@ def add(
 ) -> PushedPolicy:
     """Store a policy's card and learning curve, and announce its file, which follows with ``PUT .../files/{form}``. A
     version never changes: the same file with another card or curve is a new version, and a repeat of all three returns
-    the existing version. A policy for other observations or actions is refused; other differences of its specification
-    are named in ``differs``."""
+    the existing version. The trust in the card is not compared, so that a downloaded policy is the stored one. A policy
+    for other observations or actions is refused; other differences of its specification are named in ``differs``."""
     record, created = policies.add(name, *new_policy(body), by=holder(request.scope))
     return pushed_policy(record, created=created)
 

@@ -55,6 +55,9 @@ policy_files = checked(
 )
 
 OWNED = (policy_files, policy_evaluations)  # tables whose rows may name a blob (stored file)
+# Fields of a card that differ in a policy's downloaded card: its trust is that of the moment of the download, and the
+# others are not sent.
+NOT_KEPT = {PUSHED_BY, "trusted", "reason", "networks"}
 
 
 class Policies:
@@ -72,9 +75,10 @@ class Policies:
 
         Also returns the names of stored files (blobs) that are no longer needed.
 
-        A version never changes. A repeat with the same main file, card and curve returns the stored version. If there
-        are more than ``MAX_POLICIES`` policies, one without an alias is removed: the oldest of those that the token
-        with the most policies has stored.
+        A version never changes. A repeat with one of its files and the same card and curve returns the stored version.
+        The trust in the card may differ, because a downloaded card has that of the moment. If there are more than
+        ``MAX_POLICIES`` policies, one without an alias is removed: the oldest of those that the token with the most
+        policies has stored.
 
         Raises:
             TooLarge: the surrogate has ``MAX_POLICIES`` policies, and all have aliases.
@@ -234,23 +238,23 @@ def _of_file(file: PolicyFile) -> dict[str, Any]:
 
 
 def _known(connection: Connection, surrogate: int, card: JSON, curve: list[JSON], digest: str) -> int | None:
-    """Return the newest policy version with this card, this learning curve, and a main file of the hash ``digest``;
-    None if there is none.
+    """Return the newest policy version with this card, this learning curve, and a file of the hash ``digest``; None if
+    there is none.
 
     An empty ``curve`` matches any curve, because a downloaded policy has none when it is stored again.
     """
     files = policy_files.c
-    same = sa.select(files.version).where(files.surrogate_id == surrogate, files.digest == digest, files.main)
+    same = sa.select(files.version).where(files.surrogate_id == surrogate, files.digest == digest)
     own = (policies.c.surrogate_id == surrogate) & policies.c.version.in_(same)
     wanted = sa.select(policies.c.version, policies.c.card, policies.c.curve).where(own)
     for row in connection.execute(wanted.order_by(policies.c.version.desc())):
-        if _without_owner(row.card) == _without_owner(card) and curve in ([], row.curve):
+        if _kept(row.card) == _kept(card) and curve in ([], row.curve):
             return int(row.version)
     return None
 
 
-def _without_owner(card: JSON) -> JSON:
-    return {name: value for name, value in card.items() if name != PUSHED_BY}
+def _kept(card: JSON) -> JSON:
+    return {name: value for name, value in card.items() if name not in NOT_KEPT}
 
 
 def _make_place(connection: Connection, surrogate: int, version: int, name: str) -> Freed:
