@@ -77,8 +77,9 @@ def led_to(server_process: ServerProcess, name: str) -> int:
 
 
 def test_a_renewed_policy_replaces_the_old_one_with_a_quarter_of_the_real_steps(
-    renew: Renew, trained: str, server_process: ServerProcess
+    renew: Renew, on_server: Renew, trained: str, server_process: ServerProcess
 ):
+    """Episodes in the changed environment judge the new promise, also for the copy that controllers ask for."""
     said = renew("HeavySwing", "--json")
     assert said.code == 0, said.err
     found = said.json
@@ -89,6 +90,11 @@ def test_a_renewed_policy_replaces_the_old_one_with_a_quarter_of_the_real_steps(
         card = api.policies.get("swing-2", "production")
         assert (card.trusted, card.settings["start_from"]) == (True, "swing@1")
         assert api.surrogate("swing-2").ledger.evaluation > 0
+        assert api.policies.get("swing", "production").origin == f"swing-2@{card.version}"
+        evaluated = on_server("evaluate", "new.zip", "--env", "support.levitation:HeavySwing", "--episodes", "30")
+        assert evaluated.code == 0, evaluated.err
+        now = api.policies.get("swing", "production")
+        assert [(one.own, one.promise_kept) for one in now.evaluations] == [(True, True)]
 
 
 def test_the_alias_goes_back_if_real_episodes_contradict_the_new_promise(
@@ -134,7 +140,7 @@ def test_a_training_does_not_begin_with_a_policy_that_fails_in_the_new_model(
 ):
     """A ball that is 30 % heavier falls. A training that began with its old policy ended at 29 in place of 143."""
     with Api(server_process.url) as api:
-        card = stored_card(api, trained, "1")[1].model_copy(update={"imagined_return": 800.0})
+        card = stored_card(api, trained, "1")[2].model_copy(update={"imagined_return": 800.0})
         (tmp_path / "failing.zip").write_bytes(api.policies.file(trained, 1, "zip"))
         write_card(tmp_path / "failing.zip", card)
         failing = push(api, tmp_path / "failing.zip", trained).policy.version

@@ -21,8 +21,11 @@ from surrogym_client.surrogates.transfer import export_surrogate
 from surrogym_client.transport import Api
 from surrogym_client.transport.priors import PriorCalls
 from surrogym_client.transport.steps import StepCalls
+from surrogym_server.features.policies.routes import DRIFT_EXAMPLE
 from surrogym_shared import wire
 from surrogym_shared.wire.watching import MachineStep
+from surrogym_trainer.policies.card import read_card
+from surrogym_trainer.policies.pushing import push
 from surrogym_trainer.watching.watcher import Watcher
 
 Watch = Callable[..., Said]
@@ -243,8 +246,8 @@ def test_the_watch_command_refuses_a_policy_of_another_surrogate(on_server: Watc
 
 @pytest.fixture
 def second(server_process: ServerProcess, tank: str) -> Iterator[Callable[[bool], str]]:
-    """Makes a surrogate with the name of a renewal of the tank, whose prior is the tank or which has none, and with the
-    tank's policy in production."""
+    """Makes a surrogate with the name of a renewal of the tank, whose prior is the tank or which has none. Its policy
+    is in production, and after a renewal a copy of this policy is the latest of the tank's."""
     name = f"{tank}-2"
     with Api(server_process.url) as api:
 
@@ -252,24 +255,65 @@ def second(server_process: ServerProcess, tank: str) -> Iterator[Callable[[bool]
             api.create_surrogate(name, api.surrogate(tank).spec)
             if renewed:
                 PriorCalls(api.connection).put(name, export_surrogate(api, tank).to_bytes())
-            card = wire.PushedCard(spec=api.surrogate(tank).spec, promise=None, trusted=None, reason="not audited")
-            api.policies.push(name, card, [], "zip", api.policies.file(tank, 1, "zip"))
+            promise = wire.PolicyPromise(median=-2, low=-3, high=-1)
+            card = wire.PushedCard(surrogate=name, spec=api.surrogate(tank).spec, promise=promise, trusted=True)
+            for place in (name, tank)[: 1 + renewed]:
+                api.policies.push(place, card, [], "zip", api.policies.file(tank, 1, "zip"))
             api.policies.put_alias(name, "production", 1)
             return name
 
         yield make
         api.delete_surrogate(name)
+        for policy in api.policies.list(tank)[:-1]:
+            api.policies.delete(tank, policy.version)
 
 
+@pytest.mark.parametrize("which", ["production", "latest"])
 def test_the_watch_command_refuses_a_renewed_policy_at_its_old_surrogate(
-    watch: Watch, policy: Callable[[], Any], second: Callable[[bool], str], tmp_path: Path
+    watch: Watch,
+    policy: Callable[[], Any],
+    second: Callable[[bool], str],
+    tank: str,
+    server_process: ServerProcess,
+    tmp_path: Path,
+    which: str,
 ):
-    """The old model differs from the machine for which the new policy was trained."""
+    """The old model differs from the machine for which the new policy was trained. An older renewed version was
+    compared with it."""
     renewed, before = second(True), policy()
-    said = watch(write(tmp_path / "log.csv", lines(300, seed=5, worn_from=150)))
+    with Api(server_process.url) as api:
+        copy = api.policies.get(tank, "latest").version
+        if which == "production":
+            api.policies.put_alias(tank, which, copy)
+        said = watch(write(tmp_path / "log.csv", lines(300, seed=5, worn_from=150)), "--policy", which)
+        api.policies.put_alias(tank, "production", 1)
     assert said.code == 1
-    assert f"surrogym watch {renewed} --policy production" in said.err
+    assert f"surrogym watch {renewed} --policy {'production' if which == 'production' else 1}" in said.err
     assert policy() == before
+
+
+def test_a_copied_policy_has_the_trust_of_the_policy_of_its_training(
+    on_server: Watch, second: Callable[[bool], str], tank: str, server_process: ServerProcess, tmp_path: Path
+):
+    """A drift of a renewed policy was stored with the new surrogate only, and controllers ask the old one."""
+    renewed = second(True)
+    with Api(server_process.url) as api:
+        copy = api.policies.get(tank, "latest")
+        assert (copy.trusted, copy.origin) == (True, f"{renewed}@1")
+        api.connection.send("POST", f"/v1/surrogates/{renewed}/policies/1/drifts", json.dumps(DRIFT_EXAMPLE).encode())
+        drifted = api.policies.get(tank, "latest")
+        assert (drifted.trusted, drifted.reason) == (False, api.policies.get(renewed, 1).reason)
+        assert "drift: " in on_server("policy", f"{tank}@latest").out
+        assert on_server("policy", "get", f"{tank}@latest", "--out", str(tmp_path / "got.zip")).code == 0
+        card = read_card(tmp_path / "got.zip")
+        assert (card.surrogate, card.trusted) == (renewed, False)
+        assert push(api, tmp_path / "got.zip").policy.version == 1
+        kept = wire.AddEvaluation(first_seed=1, returns=[-2.0] * 30, lengths=[9] * 30, idempotency_key="kept")
+        stored = api.policies.evaluate(renewed, 1, kept)
+        again = api.policies.get(tank, "latest")
+        assert (again.trusted, again.drifted_at, [one.id for one in again.evaluations]) == (True, None, [stored.id])
+        assert api.policies.evaluation(tank, copy.version, stored.id).returns == kept.returns
+        assert api.policies.get(tank, 1).origin is None
 
 
 def test_another_surrogate_with_the_name_of_a_renewal_is_none(

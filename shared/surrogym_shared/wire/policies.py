@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 from surrogym_shared.kinds import Side
 from surrogym_shared.patterns import ALIAS, DIGEST, VISIBLE
 from surrogym_shared.spec import EnvironmentSpec
-from surrogym_shared.wire.base import MAX_MEASURED, Key, Measured, Reply, Request, Vector
+from surrogym_shared.wire.base import MAX_MEASURED, Key, Measured, Reply, Request, SurrogateName, Vector
 
 # Formats of policy files (zip, onnx, pt2) and of videos of policies (mp4, gif).
 PolicyForm = Literal["zip", "onnx", "pt2", "mp4", "gif"]
@@ -104,6 +104,9 @@ class PushedCard(BaseModel):
     model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
 
     algorithm: Text = Field(default="", description="name of the training algorithm")
+    surrogate: SurrogateName | None = Field(
+        default=None, description="surrogate that the policy was trained on; null: not known"
+    )
     spec: EnvironmentSpec | None = Field(default=None, description="specification that the policy was trained for")
     seed: Count | None = Field(default=None, description="seed of the training")
     virtual_steps: Count | None = Field(default=None, description="virtual steps of the training")
@@ -342,6 +345,11 @@ class PolicyView(Reply):
     drifted_at: float | None = Field(
         default=None,
         description="when drift was reported, in seconds since 1970; null if trust does not depend on drift",
+    )
+    origin: str | None = Field(
+        default=None,
+        description="NAME@VERSION of the same policy at the surrogate of its training, if that is another one: its "
+        "evaluations and reports of drift there are in this reply too, and decide on the trust here",
     )
     differs: str | None = Field(
         description="difference between the specification that the policy was trained for and the surrogate's; "

@@ -315,7 +315,7 @@ def _local(
     with TemporaryDirectory() as folder:
         path = Path(folder) / "policy.zip"
         with service.connect(context) as api:
-            found, card = stored_card(api, name, which)
+            name, found, card = stored_card(api, name, which)
             if card.spec is None and spec is None:
                 raise CommandError(
                     f"expected --spec with the specification that {policy} was trained for, because that of {name!r} "

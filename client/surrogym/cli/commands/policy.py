@@ -122,7 +122,7 @@ def get(
     form: Any = out.suffix.lower().removeprefix(".")
     require_place(out)
     with service.connect(context) as api:
-        found, card = stored_card(api, name, which)
+        name, found, card = stored_card(api, name, which)
         try:
             content = api.policies.file(name, found.version, form)
         except UnknownPolicy:
@@ -181,11 +181,16 @@ def parsed(policy: str) -> tuple[str, str]:
     return name, which or "latest"
 
 
-def stored_card(api: Api, name: str, which: str) -> tuple[PolicyDetail, PolicyCard]:
-    """Return a policy that the server stores, and its card. The card contains the surrogate's specification if the
-    policy was trained for this specification, otherwise none."""
-    found, spec = api.policies.get(name, which), api.surrogate(name).spec
-    return found, _card(name, found, spec if found.differs is None else None)
+def stored_card(api: Api, name: str, which: str) -> tuple[str, PolicyDetail, PolicyCard]:
+    """Return a policy that the server stores, with the name of its surrogate, and its card. The card contains the
+    surrogate's specification if the policy was trained for this specification, otherwise none. In place of a copy,
+    return the policy at the surrogate on which it was trained."""
+    found = api.policies.get(name, which)
+    if found.origin is not None:
+        name, which = parsed(found.origin)
+        found = api.policies.get(name, which)
+    spec = api.surrogate(name).spec
+    return name, found, _card(name, found, spec if found.differs is None else None)
 
 
 def _card(name: str, found: PolicyDetail, spec: EnvironmentSpec | None) -> PolicyCard:
@@ -225,6 +230,8 @@ def _words(name: str, policy: PolicyDetail) -> str:
     lines = [f"{name}@{policy.version}{aliases}: {policy.algorithm or 'unknown algorithm'}"]
     if policy.pushed_by is not None:
         lines.append(f"stored by: {policy.pushed_by}")
+    if policy.origin is not None:
+        lines.append(f"trained on another surrogate: its trust is that of {policy.origin}")
     if policy.virtual_steps:  # a planner has none
         lines.append(f"training: {policy.virtual_steps} virtual steps")
     if policy.promise is None:

@@ -101,7 +101,7 @@ def command(
             progress("renew", quiet=output.quiet) as update,
             closing(for_queries(opened, 30.0, given, fallback)) as environment,
         ):
-            spec = renewal.register(budget or _budget(api.surrogate(surrogate)))
+            spec = renewal.register(budget or _budget(api.surrogate(surrogate)), opened)
             say(
                 f"{target} learns with at most {spec.design.budget} real steps beside {base.name}; an audit follows, "
                 f"and {episodes} episodes in {opened}: at most {episodes * (spec.time_limit or 1_000)} real steps",
@@ -210,9 +210,9 @@ class _Renewal:
     stays: bool = False
     judged: Handover | None = None
 
-    def register(self, budget: int) -> EnvironmentSpec:
-        """Create the new surrogate with the old one as its prior, and return its specification. A repetition changes
-        nothing.
+    def register(self, budget: int, env: str) -> EnvironmentSpec:
+        """Create the new surrogate with the old one as its prior, and return its specification, whose environment is
+        ``env``. A repetition changes nothing.
 
         Raises:
             SpecConflict: another surrogate has this name.
@@ -224,7 +224,7 @@ class _Renewal:
         design = self.base.spec.design
         initial = None if design.initial is None else min(design.initial, budget)
         smaller = design.model_copy(update={"budget": budget, "initial": initial})
-        spec = self.base.spec.model_copy(update={"design": smaller})
+        spec = self.base.spec.model_copy(update={"design": smaller, "environment": env})
         created, priors = self.api.create_surrogate(self.target, spec).created, PriorCalls(self.api.connection)
         if not created and priors.get(self.target).about is not None:
             return spec

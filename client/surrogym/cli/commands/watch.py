@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from surrogym_shared.logs.checking import ReadLog
     from surrogym_shared.spec import EnvironmentSpec
     from surrogym_shared.terminal import Update
-    from surrogym_shared.wire import PolicyDetail, PolicyView, SurrogateView
+    from surrogym_shared.wire import PolicyView, SurrogateView
     from surrogym_trainer.evaluation.comparing import StepOfEpisode
     from surrogym_trainer.watching.watcher import Alarm, Watcher
 
@@ -73,7 +73,7 @@ def command(
         raise CommandError(f"expected a policy of {surrogate!r}, got {policy!r}: name the same surrogate twice")
     with service.connect(context) as api:
         view, watched = api.surrogate(surrogate), api.policies.get(surrogate, which)
-        _require_own(api, surrogate, which, watched)
+        _require_own(api, surrogate, which, watched.origin)
         version = watched.version
         if view.fidelity is None:
             raise CommandError(f"{surrogate!r} has no model yet to compare the steps with: let a sampler run first")
@@ -108,20 +108,19 @@ def command(
         raise typer.Exit(1)
 
 
-def _require_own(api: Api, surrogate: str, alias: str, watched: PolicyDetail) -> None:
-    """Raise ``CommandError`` if a renewal has put the watched policy into use, because its promise is that of another
-    model, with which the steps have to be compared."""
-    from surrogym.cli.commands.renew import chain
+def _require_own(api: Api, surrogate: str, which: str, origin: str | None) -> None:
+    """Raise ``CommandError`` if the watched policy is a copy of one of another surrogate (``origin``), because its
+    promise is that of the other model, with which the steps have to be compared."""
+    from surrogym.cli.commands.policy import parsed
     from surrogym.cli.errors import CommandError
 
-    present = chain(api, surrogate, alias)[0].name
-    if present != surrogate:
-        files = {file.digest for file in watched.files}
-        if not files.isdisjoint(file.digest for file in api.policies.get(present, alias).files):
-            raise CommandError(
-                f"expected the surrogate from which {surrogate}@{alias} was trained, got {surrogate!r}: surrogym renew "
-                f"made this policy from {present!r}; next: surrogym watch {present} --policy {alias}"
-            )
+    if origin is not None:
+        home, version = parsed(origin)
+        same = which if which in api.policies.get(home, version).aliases else version
+        raise CommandError(
+            f"expected the surrogate on which {surrogate}@{which} was trained, got {surrogate!r}: it was trained on "
+            f"{home!r}; next: surrogym watch {home} --policy {same}"
+        )
 
 
 def _moved(api: Api, surrogate: str, alias: str, version: int) -> str | None:

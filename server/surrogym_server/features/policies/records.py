@@ -63,6 +63,9 @@ class NewEvaluation:
 
 @dataclass(frozen=True)
 class PolicyRecord:
+    """A policy. A copy of a policy of another surrogate, on which it was trained, has the evaluations and the reports
+    of drift of both. Its ``origin`` is NAME@VERSION there; None for other policies."""
+
     version: int
     created_at: float
     card: JSON
@@ -71,6 +74,7 @@ class PolicyRecord:
     aliases: tuple[str, ...] = ()
     evaluations: tuple[EvaluationRecord, ...] = ()
     drifts: tuple[EvaluationRecord, ...] = ()  # reports of drift, which have no episodes
+    origin: str | None = None
 
 
 Freed = tuple[str, ...]  # names of blobs that no row refers to any more

@@ -319,6 +319,7 @@ def _fields(record: PolicyRecord, card: wire.PushedCard) -> dict[str, Any]:
         "trusted": trusted,
         "reason": reason,
         "drifted_at": None if drift is None else drift.created_at,
+        "origin": record.origin,
         "differs": record.card.get("differs"),
         "pushed_by": record.card.get(PUSHED_BY),
         "files": [

@@ -305,7 +305,7 @@ class PolicyService:
         """
         own = str(self._storage.surrogates.get(name).spec["environment"])
         if not is_name(own):
-            known = (one for policy in self._policies.list(name) for one in policy.evaluations)
+            known = (one for policy in self._policies.list(name) if not policy.origin for one in policy.evaluations)
             named = [(one.id, one.summary["environment"]) for one in known if one.summary.get("environment")]
             own = min(named)[1] if named else environment
         return not environment or is_same(environment, own)

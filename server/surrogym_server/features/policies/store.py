@@ -57,7 +57,7 @@ policy_files = checked(
 OWNED = (policy_files, policy_evaluations)  # tables whose rows may name a blob (stored file)
 # Fields of a card that differ in a policy's downloaded card: its trust is that of the moment of the download, and the
 # others are not sent.
-NOT_KEPT = {PUSHED_BY, "trusted", "reason", "networks"}
+NOT_KEPT = {PUSHED_BY, "trusted", "reason", "networks", "surrogate"}
 
 
 class Policies:
@@ -362,31 +362,61 @@ def _records(
 ) -> list[PolicyRecord]:
     """Return the policies of a surrogate that meet an SQL condition, newest first, with or without learning curves.
 
-    The number of SQL statements does not depend on the number of policies.
+    A copy of a policy of another surrogate has the evaluations and the reports of drift of both. The number of SQL
+    statements does not depend on the number of policies.
     """
     columns = [policies.c.version, policies.c.created_at, policies.c.card, *([policies.c.curve] if curves else [])]
     wanted = sa.select(*columns).where(policies.c.surrogate_id == surrogate, condition)
     rows = connection.execute(wanted.order_by(policies.c.version.desc())).all()
-    files, aliases, evaluations = (
+    files, aliases = (
         _by_version(connection.execute(sa.select(table).where(table.c.surrogate_id == surrogate).order_by(order)))
-        for table, order in (
-            (policy_files, policy_files.c.main.desc()),
-            (policy_aliases, policy_aliases.c.alias),
-            (policy_evaluations, policy_evaluations.c.id),
-        )
+        for table, order in ((policy_files, policy_files.c.main.desc()), (policy_aliases, policy_aliases.c.alias))
     )
-    return [
-        PolicyRecord(
+    origins = _origins(connection, surrogate, rows, files)
+    table = policy_evaluations.c
+    homes = {surrogate, *(origin.id for origin in origins.values())}
+    evaluations: defaultdict[tuple[int, int], list[EvaluationRecord]] = defaultdict(list)
+    for row in connection.execute(sa.select(table).where(table.surrogate_id.in_(homes)).order_by(table.id)):
+        evaluations[row.surrogate_id, row.version].append(_evaluation(row))
+    found = []
+    for row in rows:
+        origin, own = origins.get(row.version), evaluations[surrogate, row.version]
+        there = [] if origin is None else evaluations[origin.id, origin.version]
+        record = PolicyRecord(
             row.version,
             row.created_at,
             row.card,
             row.curve if curves else [],
             tuple(PolicyFile(f.form, f.bytes, f.digest, f.blob, f.main) for f in files[row.version]),
             tuple(a.alias for a in aliases[row.version]),
-            *_told_apart(map(_evaluation, evaluations[row.version])),
+            *_told_apart(sorted([*own, *there], key=lambda one: one.id)),
+            origin=None if origin is None else f"{origin.name}@{origin.version}",
         )
-        for row in rows
-    ]
+        found.append(record)
+    return found
+
+
+def _origins(
+    connection: Connection, surrogate: int, rows: Sequence[Row[Any]], files: Mapping[int, Sequence[Row[Any]]]
+) -> dict[int, Row[Any]]:
+    """Return, by the version of a copy, the policy of another surrogate that it is a copy of: its card names that
+    surrogate as the one of its training, which has a policy with the same file and the same promise."""
+    homes = {home for row in rows if (home := row.card.get("surrogate")) is not None}
+    if not homes:
+        return {}
+    columns = (surrogates.c.id, surrogates.c.name, policies.c.version, policies.c.card, policy_files.c.digest)
+    main = policy_files.c.main & (policy_files.c.version == policies.c.version)
+    main &= policy_files.c.surrogate_id == policies.c.surrogate_id
+    joined = sa.select(*columns).join_from(policies, surrogates, surrogates.c.id == policies.c.surrogate_id)
+    joined = joined.join(policy_files, main)
+    there = joined.where(surrogates.c.name.in_(homes), surrogates.c.id != surrogate)
+    known = connection.execute(there.order_by(policies.c.version.desc())).all()
+    found = {}
+    for row in rows:
+        wanted = (row.card.get("surrogate"), files[row.version][0].digest, row.card.get("promise"))
+        if same := [one for one in known if (one.name, one.digest, one.card.get("promise")) == wanted]:
+            found[row.version] = same[0]
+    return found
 
 
 def _by_version(rows: Iterable[Row[Any]]) -> defaultdict[int, list[Row[Any]]]:
