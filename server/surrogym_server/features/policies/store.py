@@ -373,10 +373,10 @@ def _records(
         for table, order in ((policy_files, policy_files.c.main.desc()), (policy_aliases, policy_aliases.c.alias))
     )
     origins = _origins(connection, surrogate, rows, files)
-    table = policy_evaluations.c
+    table = policy_evaluations
     homes = {surrogate, *(origin.id for origin in origins.values())}
     evaluations: defaultdict[tuple[int, int], list[EvaluationRecord]] = defaultdict(list)
-    for row in connection.execute(sa.select(table).where(table.surrogate_id.in_(homes)).order_by(table.id)):
+    for row in connection.execute(sa.select(table).where(table.c.surrogate_id.in_(homes)).order_by(table.c.id)):
         evaluations[row.surrogate_id, row.version].append(_evaluation(row))
     found = []
     for row in rows:
@@ -404,14 +404,20 @@ def _origins(
     homes = {home for row in rows if (home := row.card.get("surrogate")) is not None}
     if not homes:
         return {}
-    columns = (surrogates.c.id, surrogates.c.name, policies.c.version, policies.c.card, policy_files.c.digest)
+    columns: list[sa.Column[Any]] = [
+        surrogates.c.id,
+        surrogates.c.name,
+        policies.c.version,
+        policies.c.card,
+        policy_files.c.digest,
+    ]
     main = policy_files.c.main & (policy_files.c.version == policies.c.version)
     main &= policy_files.c.surrogate_id == policies.c.surrogate_id
     joined = sa.select(*columns).join_from(policies, surrogates, surrogates.c.id == policies.c.surrogate_id)
     joined = joined.join(policy_files, main)
     there = joined.where(surrogates.c.name.in_(homes), surrogates.c.id != surrogate)
     known = connection.execute(there.order_by(policies.c.version.desc())).all()
-    found = {}
+    found: dict[int, Row[Any]] = {}
     for row in rows:
         wanted = (row.card.get("surrogate"), files[row.version][0].digest, row.card.get("promise"))
         if same := [one for one in known if (one.name, one.digest, one.card.get("promise")) == wanted]:
