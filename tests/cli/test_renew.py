@@ -183,6 +183,38 @@ def test_an_interrupted_renewal_leaves_the_alias_and_continues_with_the_same_sur
     assert led_to(server_process, trained) == second["alias"]["version"]
 
 
+@pytest.mark.parametrize("agree", [True, False])
+def test_a_renewal_that_was_killed_during_its_episodes_continues_with_them(
+    renew: Renew,
+    trained: str,
+    server_process: ServerProcess,
+    handed_over: Callable[..., None],
+    monkeypatch: pytest.MonkeyPatch,
+    agree: bool,
+):
+    """The alias stays with the unconfirmed policy after kill -9. The next run took this policy for the old one."""
+
+    def stopped(*_: Any, **__: Any) -> None:
+        raise KeyboardInterrupt
+
+    handed_over(trusted=True)
+    with monkeypatch.context() as during:
+        during.setattr("surrogym.cli.commands.audit.by_episodes", stopped)
+        assert renew("HeavySwing").code == 130
+    monkeypatch.setattr(AuditedTraining, "train", stopped)
+    judged = Handover(None, None, agree, "so the episodes say")
+    monkeypatch.setattr("surrogym.cli.commands.audit.by_episodes", lambda *_, **__: judged)
+    with Api(server_process.url) as api:
+        unconfirmed, ledger = api.policies.get(trained, "latest").version, api.surrogate("swing-2").ledger
+        api.policies.put_alias(trained, "production", unconfirmed)
+        said = renew("HeavySwing")
+        assert said.code == (0 if agree else 1), said.err
+        assert "swing-2@1 continues with 3 episodes" in said.err
+        assert api.surrogate("swing-2").ledger == ledger
+        assert len(api.policies.list(trained)) == 2
+    assert led_to(server_process, trained) == (unconfirmed if agree else 1)
+
+
 @pytest.mark.parametrize(
     ("options", "named"),
     [

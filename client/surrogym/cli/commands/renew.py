@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -93,6 +93,10 @@ def command(
                 f"{surrogate}@{old.version} production"
             )
         base, target = chain(api, surrogate, alias)
+        unconfirmed = old.origin if (old.origin or "").startswith(f"{target}@") and "replaces" in old.settings else None
+        if unconfirmed is not None:  # a renewal was killed while its episodes ran
+            old = api.policies.get(surrogate, str(old.settings["replaces"]))
+            api.policies.put_alias(surrogate, alias, old.version)
         renewal = _Renewal(api, service.token_for(context), surrogate, alias, old, base, target)
         opened, given = environment_of(env, None, base.spec)
         with (
@@ -102,14 +106,16 @@ def command(
             closing(for_queries(opened, 30.0, given, fallback)) as environment,
         ):
             spec = renewal.register(budget or _budget(api.surrogate(surrogate)), opened)
-            say(
-                f"{target} learns with at most {spec.design.budget} real steps beside {base.name}; an audit follows, "
-                f"and {episodes} episodes in {opened}: at most {episodes * (spec.time_limit or 1_000)} real steps",
-                quiet=output.quiet,
-            )
-            path = out or Path(f"{target}.zip")
-            with _sampling(api, renewal, environment) as check:
-                handover = renewal.train(path, update, check)
+            path, runs = out or Path(f"{target}.zip"), f"{episodes} episodes in {opened}"
+            runs = f"{runs}: at most {episodes * (spec.time_limit or 1_000)} real steps"
+            if unconfirmed is not None:
+                say(f"{unconfirmed} continues with {runs}", quiet=output.quiet)
+                handover = renewal.load(path, unconfirmed)
+            else:
+                learns = f"{target} learns with at most {spec.design.budget} real steps beside {base.name}"
+                say(f"{learns}; an audit follows, and {runs}", quiet=output.quiet)
+                with _sampling(api, renewal, environment) as check:
+                    handover = renewal.train(path, update, check)
             if handover.trusted:
                 renewal.put_into_use(path, opened, episodes, fallback, quiet=output.quiet)
         result = renewal.result(path, handover)
@@ -124,23 +130,18 @@ def chain(api: Api, surrogate: str, alias: str) -> tuple[SurrogateView, str]:
     Renewals of ``arm`` are ``arm-2``, ``arm-3`` and so on. One that was interrupted, or whose policy did not stay, has
     no policy of this alias. A surrogate of such a name that does not have the one before as its prior is no renewal.
     """
-    from surrogym_client.errors import UnknownSurrogate
     from surrogym_client.transport.priors import PriorCalls
 
-    base, number, priors = api.surrogate(surrogate), 2, PriorCalls(api.connection)
-    while True:
-        target = f"{surrogate}-{number}"
-        try:
-            found = api.surrogate(target)
-        except UnknownSurrogate:
-            return base, target
-        about = priors.get(target).about
+    base, number, known = api.surrogate(surrogate), 2, {one.name for one in api.surrogates()}
+    while (target := f"{surrogate}-{number}") in known:
+        about = PriorCalls(api.connection).get(target).about
         in_use = any(alias in one.aliases for one in api.policies.list(target))
         if in_use and about is not None and about.source == base.name:
-            base = found
+            base = api.surrogate(target)
         elif not in_use and (about is None or about.source == base.name):
-            return base, target
+            break
         number += 1
+    return base, target
 
 
 def _budget(view: SurrogateView) -> int:
@@ -153,35 +154,21 @@ def _budget(view: SurrogateView) -> int:
 
 
 @contextmanager
-def _sampling(api: Api, renewal: _Renewal, environment: Environment) -> Iterator[Callable[[], None]]:
+def _sampling(api: Api, renewal: _Renewal, environment: Environment) -> Iterator[Callable[[], object]]:
     """Context in which a sampler answers the queries of the new surrogate. Yields a function that raises the error with
     which the sampler has ended."""
     from surrogym_client.transport import Api
     from surrogym_sampler.queries.settings import SamplerSettings, worker_name
     from surrogym_sampler.queries.worker import Sampler
 
-    failed: list[BaseException] = []
-    with Api(api.url, renewal.token) as own:
-        settings = SamplerSettings(name=worker_name(), wait_seconds=1.0)
+    settings = SamplerSettings(name=worker_name(), wait_seconds=1.0)
+    with Api(api.url, renewal.token) as own, ThreadPoolExecutor(1) as pool:
         sampler = Sampler(own, renewal.target, environment, settings)
-
-        def run() -> None:
-            try:
-                sampler.run()
-            except BaseException as error:
-                failed.append(error)
-
-        def check() -> None:
-            if failed:
-                raise failed[0]
-
-        thread = threading.Thread(target=run, daemon=True)
-        thread.start()
+        running = pool.submit(sampler.run)
         try:
-            yield check
+            yield lambda: running.result() if running.done() else None
         finally:
             sampler.stop()
-            thread.join()
 
 
 @dataclass
@@ -194,6 +181,7 @@ class _Renewal:
         old: policy that the alias names at first.
         base: surrogate that is the prior.
         target: name of the new surrogate.
+        made: version of the new policy in ``target``.
         version: version of the new policy in ``surrogate``; None if it was not put into use.
         stays: whether the alias names the new policy at last.
         judged: judgement of the real episodes; None if there were none.
@@ -206,6 +194,7 @@ class _Renewal:
     old: PolicyDetail
     base: SurrogateView
     target: str
+    made: int = 0
     version: int | None = None
     stays: bool = False
     judged: Handover | None = None
@@ -236,7 +225,7 @@ class _Renewal:
             raise
         return spec
 
-    def train(self, out: Path, update: Update, check: Callable[[], None]) -> Handover:
+    def train(self, out: Path, update: Update, check: Callable[[], object]) -> Handover:
         """Wait for the design, train a policy from the network of the old one, audit it and store it.
 
         Args:
@@ -266,19 +255,31 @@ class _Renewal:
 
         wait_for_design(self.api, self.target, PATIENCE_SECONDS, look)
         with TemporaryDirectory() as folder, HttpSurrogate(self.api.url, self.target, self.token) as port:
-            settings = TrainSettings(algorithm=self._algorithm())
-            if (start := self._network(Path(folder) / "old.zip", port)) is not None:
-                settings = replace(settings, start_from=start)
+            start = self._network(Path(folder) / "old.zip", port)
+            settings = TrainSettings(algorithm=self._algorithm(), start_from=start)
             training = AuditedTraining(
                 self.api, self.target, port, out, settings, audit=AuditSettings(), progress=record, waiting=look
             )
             result, handover = training.train()
-            result = replace(result, settings={**result.settings, "start_from": None if start is None else self.named})
+            begun = {"start_from": start and f"{self.surrogate}@{self.old.version}", "replaces": self.old.version}
+            result = replace(result, settings={**result.settings, **begun})
             spec = port.spec()
         card = card_of(result, handover, surrogate=self.target, spec=spec, url=self.api.url, seed=0, curve=())
         write_card(out, card)
-        push(self.api, out, self.target)
+        self.made = push(self.api, out, self.target).policy.version
         return handover
+
+    def load(self, out: Path, policy: str) -> Handover:
+        """Download a policy that an earlier run has trained and audited, and return its promise and its audit."""
+        from surrogym.cli.commands.policy import parsed, stored_card
+        from surrogym_trainer.policies.card import write_card
+        from surrogym_trainer.training.handover import Handover
+
+        name, found, card = stored_card(self.api, *parsed(policy))
+        out.write_bytes(self.api.policies.file(name, found.version, "zip"))
+        write_card(out, card)
+        self.made = found.version
+        return Handover(card.promise, card.audit, card.trusted is True, card.reason, card.model)
 
     def put_into_use(self, path: Path, env: str, episodes: int, fallback: str | None, *, quiet: bool) -> None:
         """Move the alias to the new policy, run real episodes, and move it back if they contradict the promise, or if
@@ -294,7 +295,7 @@ class _Renewal:
             if not self.stays:
                 self.api.policies.put_alias(self.surrogate, self.alias, self.old.version)
         if self.stays:
-            self.api.policies.put_alias(self.target, self.alias, self.api.policies.get(self.target).version)
+            self.api.policies.put_alias(self.target, self.alias, self.made)
 
     def _episodes(self, path: Path, env: str, episodes: int, fallback: str | None, *, quiet: bool) -> Handover:
         """Run real episodes with the new policy, and judge its promise by them."""
@@ -346,11 +347,6 @@ class _Renewal:
             return None
         now = float(imagined_returns(port, load_policy(path, self.old.algorithm), CHECK_EPISODES, 0).mean())
         return path if now - floor >= KEPT * (earned - floor) else None
-
-    @property
-    def named(self) -> str:
-        """The old policy, as commands take it."""
-        return f"{self.surrogate}@{self.old.version}"
 
     def words_of_interruption(self) -> str:
         return (
