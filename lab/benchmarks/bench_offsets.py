@@ -1,11 +1,16 @@
-"""Steady error of planners and trained policies in plants that differ from the model.
+"""Steady error of planners and trained policies in plants that differ from the model, and at other set points.
 
     python lab/benchmarks/bench_offsets.py --plants tanks reactor --seeds 345 346
+    python lab/benchmarks/bench_offsets.py --plants tanks --seeds 347 348 --set-points
 
 The plants are two tanks, whose lower level is to be 10 cm, and a reactor whose concentration is to be 0.42 mol/l. Each
 seed has one model, learned from any state, and ten episodes in the plant as it was learned, in one whose actuator is
 20 % weaker, and in one that adds 5 % of the action's range to each action. The steady error of an episode is the mean
 distance from the set point over its last 40 steps. The plants have no noise in these episodes.
+
+With ``--set-points`` the specification declares the reward, and the plants stay as they were learned. For each of two
+other set points a planner on the model gets it at run time, and a policy is trained in the same model with a
+specification of this set point. Returns are those of the reward with this set point.
 """
 
 from __future__ import annotations
@@ -28,6 +33,8 @@ from support.changing import Array, Changing, Machine, Parameters
 from support.levitation import TANKS
 from surrogym_server.local import LocalSurrogate
 from surrogym_server.planning import planner_of
+from surrogym_shared.set_points import with_set_points
+from surrogym_shared.spec import DeclaredReward, EnvironmentSpec, Quantity, RewardTerm, Term
 from surrogym_trainer.policies import load_policy
 from surrogym_trainer.policies.predict import Predict
 from surrogym_trainer.training import TrainSettings, train
@@ -42,19 +49,38 @@ class Plant:
     machine: Machine
     coordinate: int  # index of the coordinate
     target: float  # its set point
+    width: float  # error at which the reward is exp(-1/2)
     off: float  # action at which the actuator does nothing
+    others: tuple[float, ...]  # other set points
+
+    @property
+    def name(self) -> str:
+        return list(self.machine.ranges)[self.coordinate]
+
+    def reward(self, q: Array) -> Array:
+        """Return the rewards (n,) of states q (n, C)."""
+        found: Array = np.exp(-0.5 * ((q[:, self.coordinate] - self.target) / self.width) ** 2)
+        return found
+
+    def declared(self) -> EnvironmentSpec:
+        """Return the machine's specification with a declared reward."""
+        error = Term.linear(**{self.name: 1 / self.width}) + Term.constant(-self.target / self.width)
+        reward = DeclaredReward(kind="declared", terms=(RewardTerm(shape="bump", of=(Quantity(term=error),)),))
+        return self.machine.spec.model_copy(update={"reward": reward})
 
 
-PLANTS = {"tanks": Plant(TANKS, 1, 0.0, -1.0), "reactor": Plant(REACTOR, 0, 0.42, 0.0)}
+PLANTS = {
+    "tanks": Plant(TANKS, 1, 0.0, 1.0, -1.0, (-4.0, 4.0)),
+    "reactor": Plant(REACTOR, 0, 0.42, 0.1, 0.0, (0.35, 0.5)),
+}
 CHANGES = {"as learned": (1.0, 0.0), "20 % weaker": (0.8, 0.0), "offset of 5 %": (1.0, 0.1)}  # factor, offset
 
 
-def learned(plant: Plant, seed: int) -> LocalSurrogate:
+def learned(plant: Plant, seed: int, spec: EnvironmentSpec) -> LocalSurrogate:
     """Learn a model of the plant by a design from any state."""
     real = Changing(plant.machine, plant.machine.real, np.random.default_rng([seed, 5]))
-    spec = plant.machine.spec.model_copy(
-        update={"design": plant.machine.spec.design.model_copy(update={"seed": seed, "budget": plant.machine.budget})}
-    )
+    design = spec.design.model_copy(update={"seed": seed, "budget": plant.machine.budget})
+    spec = spec.model_copy(update={"design": design})
     design = surrogym.Design(spec)
     while (query := design.ask()) is not None:
         design.tell(query, real.step_from(np.array(query.coordinates), np.array(query.action)))
@@ -81,11 +107,26 @@ def measured(plant: Plant, acts: Predict, change: str, seed: int) -> tuple[float
     q, total, errors = rng.uniform(low, high, (EPISODES, len(low))), np.zeros(EPISODES), []
     for _ in range(machine.time_limit):
         u = np.asarray(acts(machine.observe(q)), dtype=float).reshape(EPISODES, -1)
-        q, reward, _ = machine.step(q, u, machine.real, rng)
-        total += reward
+        total += plant.reward(q)
+        q = machine.step(q, u, machine.real, rng)[0]
         errors.append(q[:, plant.coordinate] - plant.target)
     steady = np.abs(np.mean(errors[-LAST:], axis=0))
     return float(steady.mean()), float(total.mean())
+
+
+def at_set_points(name: str, seed: int) -> None:
+    """Print a row for each of the other set points of a plant."""
+    plant = PLANTS[name]
+    model = learned(plant, seed, plant.declared())
+    for target in plant.others:
+        points, aimed = {plant.name: target}, replace(plant, target=target)
+        own = LocalSurrogate.from_bytes(with_set_points(model.spec(), points), model.model_file())
+        for policy, acts in {
+            "planner": model.planner(HORIZON, set_points=points),
+            "trained": trained(own, seed),
+        }.items():
+            error, total = measured(aimed, acts, "as learned", seed)
+            print(f"| {name} | {seed} | {target:g} | {policy} | {error:.2g} | {total:.3g} |", flush=True)
 
 
 def main() -> None:
@@ -94,11 +135,18 @@ def main() -> None:
     options.add_argument("--plants", nargs="+", choices=list(PLANTS), default=list(PLANTS))
     options.add_argument("--seeds", nargs="+", type=int, default=[345, 346])
     options.add_argument("--no-training", action="store_true", help="planners alone")
+    options.add_argument("--set-points", action="store_true", help="other set points, in the plant as learned")
     given = options.parse_args()
+    if given.set_points:
+        print("| plant | seed | set point | policy | steady error | return |\n|---|---|---|---|---|---|", flush=True)
+        for name in given.plants:
+            for seed in given.seeds:
+                at_set_points(name, seed)
+        return
     print("| plant | seed | policy | change | steady error | return |\n|---|---|---|---|---|---|", flush=True)
     for name in given.plants:
         for seed in given.seeds:
-            model = learned(PLANTS[name], seed)
+            model = learned(PLANTS[name], seed, PLANTS[name].machine.spec)
             policies: dict[str, Predict] = {"planner": planner_of(model.model, HORIZON)}
             if not given.no_training:
                 policies["trained"] = trained(model, seed)

@@ -3,7 +3,7 @@ surrogym[server]."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Self
 
@@ -104,14 +104,17 @@ class LocalSurrogate:
     def model_file(self) -> bytes:
         return to_bytes(self._model)
 
-    def planner(self, horizon: int, seed: int = 0) -> Planner:
+    def planner(self, horizon: int, seed: int = 0, set_points: Mapping[str, float] | None = None) -> Planner:
         """Return a policy that plans each action by rollouts of ``horizon`` steps, after value iteration on a grid of
         states, which takes some seconds. ``seed`` is that of the changes of actions that it tries.
 
+        ``set_points`` replaces set points of the declared reward, by coordinate: ``{"level": 12}``.
+
         Raises:
-            InvalidInput: the horizon is out of its range, or the model or its environment does not allow planning.
+            InvalidInput: the horizon is out of its range, the reward or the model does not support a set point, or the
+                model or its environment does not allow planning.
         """
-        return planner_of(self._model, horizon, seed)
+        return planner_of(self._model, horizon, seed, set_points)
 
     def open(self, request: OpenSession) -> SessionView:
         if request.model not in ("latest", VERSION):

@@ -8,7 +8,7 @@ steps.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol, Self, TypeVar, runtime_checkable
 
@@ -196,9 +196,9 @@ HORIZON = 12  # default number of steps of each rollout of a planner
 class PlanningPort(SurrogatePort, Protocol):
     """A surrogate in this process, on whose model actions can be planned."""
 
-    def planner(self, horizon: int, seed: int) -> Planning:
+    def planner(self, horizon: int, seed: int, set_points: Mapping[str, float] | None = None) -> Planning:
         """Return a function that plans each action by rollouts of ``horizon`` steps, in which it tries random changes
-        of actions."""
+        of actions. ``set_points`` replaces set points of the declared reward, by coordinate."""
         ...
 
 

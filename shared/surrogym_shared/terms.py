@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,7 +13,16 @@ Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 
-def evaluate(spec: EnvironmentSpec, term: Term, coordinates: Array) -> Array:
+class Named(Protocol):
+    """What terms are evaluated for: a specification, for example."""
+
+    @property
+    def coordinate_names(self) -> tuple[str, ...]:
+        """Names of the C coordinates, in their order."""
+        ...
+
+
+def evaluate(spec: Named, term: Term, coordinates: Array) -> Array:
     """Return the value (n,) of a term at each of n states with coordinates (n, C)."""
     total = np.sum([_part(spec, part, coordinates) for part in term.parts], axis=0)
     if term.low is None and term.high is None:
@@ -24,7 +35,7 @@ def observe(spec: EnvironmentSpec, coordinates: Array) -> Array:
     return np.stack([evaluate(spec, entry.term, coordinates) for entry in spec.observation], axis=1)
 
 
-def holds(spec: EnvironmentSpec, inequality: Inequality, coordinates: Array) -> Bools:
+def holds(spec: Named, inequality: Inequality, coordinates: Array) -> Bools:
     """Return whether an inequality holds at each of n states with coordinates (n, C), as booleans (n,)."""
     compare = {"<": np.less, "<=": np.less_equal, ">": np.greater, ">=": np.greater_equal}[inequality.relation]
     return np.asarray(compare(evaluate(spec, inequality.term, coordinates), inequality.value))
@@ -38,7 +49,7 @@ def terminates(spec: EnvironmentSpec, coordinates: Array) -> Bools:
     return ended
 
 
-def _part(spec: EnvironmentSpec, part: Part, coordinates: Array) -> Array:
+def _part(spec: Named, part: Part, coordinates: Array) -> Array:
     if part.function == "one":
         return np.full(len(coordinates), part.coefficient)
     names = spec.coordinate_names

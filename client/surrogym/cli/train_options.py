@@ -114,23 +114,44 @@ class SessionOptions:
             help="Subtract PENALTY predicted standard deviations from each reward. [default: from the specification]",
         ),
     ] = None
+    set_point: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Set point of a coordinate, as COORDINATE=VALUE, in the place of the value from which the declared "
+            "reward measures the coordinate's error. May be given several times."
+        ),
+    ] = None
 
     def fields(self) -> dict[str, Any]:
         """Return the options that were given, by the names of ``OpenSession``.
 
         Raises:
-            CommandError: an option of particles was given with another variant than ``probabilistic``.
+            CommandError: an option of particles was given with another variant than ``probabilistic``, or a set point
+                is not COORDINATE=VALUE.
         """
         from surrogym.cli.errors import CommandError
         from surrogym_shared.wire import OF_PARTICLES
 
         given = {name: value for name, value in vars(self).items() if value is not None and value is not False}
+        if pairs := given.pop("set_point", None):
+            given["set_points"] = dict(map(_set_point, pairs))
         for name in OF_PARTICLES:
             if name in given and self.variant != "probabilistic":
                 raise CommandError(
                     f"--{name} works with variant probabilistic alone: give --variant probabilistic as well"
                 )
         return given
+
+
+def _set_point(pair: str) -> tuple[str, float]:
+    """Return the coordinate and the value of COORDINATE=VALUE. Raises ``CommandError`` for another text."""
+    from surrogym.cli.errors import CommandError
+
+    name, _, value = pair.rpartition("=")
+    try:
+        return name, float(value)
+    except ValueError:
+        raise CommandError(f"--set-point: expected COORDINATE=VALUE, such as level=12, got {pair!r}") from None
 
 
 @dataclass(frozen=True)

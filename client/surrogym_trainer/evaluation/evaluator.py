@@ -3,7 +3,7 @@ episodes kept the limits of their specification."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
@@ -19,6 +19,8 @@ from surrogym_sampler.original.errors import RAISED, EvaluationFailed, PolicyMis
 from surrogym_sampler.original.fitting import check_policy
 from surrogym_sampler.original.protocol import LONGEST_EPISODE
 from surrogym_shared.limits import left_too_often, limits_of, must_stop, past, room
+from surrogym_shared.logs.rewards import declared_reward
+from surrogym_shared.set_points import with_set_points
 from surrogym_shared.spec import Coordinate, EnvironmentSpec, Success, limits
 from surrogym_shared.terms import holds
 from surrogym_shared.wire import TraceRank
@@ -155,6 +157,26 @@ def _is_equal(one: Trace, other: Trace) -> bool:
     return one.terminated == other.terminated and all(
         np.array_equal(getattr(one, name), getattr(other, name)) for name in ("coordinates", "action", "reward")
     )
+
+
+def for_set_points(result: Evaluation, spec: EnvironmentSpec | None, points: Mapping[str, float]) -> Evaluation:
+    """Return an evaluation whose returns are those of the declared reward with other set points, computed from the
+    states and actions of each step. The traces keep the rewards of the environment. No success is judged.
+
+    Args:
+        result: the episodes.
+        spec: specification with the declared reward.
+        points: set points, by coordinate; empty: the evaluation is returned as it is.
+    """
+    if not points or spec is None:
+        return result
+    aimed, returns = with_set_points(spec, points), []
+    for trace in result.traces:
+        ended = np.zeros(len(trace.reward), dtype=bool)
+        ended[-1:] = trace.terminated
+        before, after = trace.coordinates[:-1], trace.coordinates[1:]
+        returns.append(float(declared_reward(aimed, before, trace.action, after, ended).sum()))
+    return replace(result, returns=np.array(returns), success=None)
 
 
 class EvaluationInterrupted(KeyboardInterrupt):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -64,6 +65,17 @@ class PolicyCard(BaseModel):
     networks: int = 1  # number of networks that the last training began; above 1 if some learned nothing
     settings: dict[str, Any] = Field(default_factory=dict)
     versions: dict[str, str] = Field(default_factory=dict)
+
+    @property
+    def set_points(self) -> dict[str, float]:
+        """Set points that replace those of the specification's reward, by coordinate; empty if there are none."""
+        return set_points_in(self.settings)
+
+
+def set_points_in(settings: Mapping[str, Any]) -> dict[str, float]:
+    """Return the set points, by coordinate, in the settings of a training, as a card and the server have them."""
+    session = settings.get("session")
+    return dict(session.get("set_points") or {}) if isinstance(session, dict) else {}
 
 
 def missing_policy(policy: Path) -> FileNotFoundError:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import zipfile
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, Self
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, Field, ValidationError
 
 from surrogym_client.environments.file_factories import planner_of
 from surrogym_shared.archives import has_entry, read_entries
@@ -25,6 +26,7 @@ class _Head(BaseModel):
     version: Literal[1] = 1
     horizon: int
     seed: int
+    set_points: dict[str, float] = Field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -34,11 +36,13 @@ class PlannerFile:
     surrogate: bytes  # specification and model, as the content of a surrogate's file
     horizon: int  # number of steps of each planned rollout
     seed: int  # seed of the changes of actions that the planner tries
+    set_points: Mapping[str, float] = field(default_factory=dict)  # other set points of the reward, by coordinate
 
     def save(self, path: Path) -> None:
         """Write the planner to a zip file, which contains no code."""
         with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
-            file.writestr(PLANNER_HEAD, _Head(horizon=self.horizon, seed=self.seed).model_dump_json())
+            head = _Head(horizon=self.horizon, seed=self.seed, set_points=dict(self.set_points))
+            file.writestr(PLANNER_HEAD, head.model_dump_json())
             file.writestr(MODEL, self.surrogate)
 
     @classmethod
@@ -47,7 +51,7 @@ class PlannerFile:
         try:
             entries = read_entries(path, MAX_FILE_BYTES)
             head = _Head.model_validate_json(entries[PLANNER_HEAD])
-            return cls(entries[MODEL], head.horizon, head.seed)
+            return cls(entries[MODEL], head.horizon, head.seed, head.set_points)
         except ValidationError as error:
             raise UnusablePolicy(f"{path} is not a planner: {first_fault(error)}; train it again") from error
         except (KeyError, ValueError) as error:
@@ -65,6 +69,6 @@ class PlannerFile:
             UnusablePolicy: the extra ``server`` is missing, or the model does not allow planning; with the reason.
         """
         try:
-            return planner_of(self.surrogate, self.horizon, self.seed)
+            return planner_of(self.surrogate, self.horizon, self.seed, self.set_points)
         except Exception as error:  # errors of the server's package, whose classes the client does not import
             raise UnusablePolicy(str(error)) from error

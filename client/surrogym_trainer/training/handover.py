@@ -36,7 +36,7 @@ from surrogym_trainer.evaluation.audit import (
 )
 from surrogym_trainer.evaluation.baselines import baseline
 from surrogym_trainer.evaluation.comparing import DRAWS, changes_of, compared, steady, steps_of
-from surrogym_trainer.evaluation.evaluator import Evaluation
+from surrogym_trainer.evaluation.evaluator import Evaluation, for_set_points
 from surrogym_trainer.evaluation.imagined import WHOLE
 from surrogym_trainer.evaluation.out_of_distribution import Outside, outside_of, range_left, untestable
 from surrogym_trainer.evaluation.promise import UNNOTICED, promise_of
@@ -206,6 +206,7 @@ def judge_episodes(subject: Subject, result: Evaluation) -> Handover:
     """
     api, spec = subject.api, subject.port.spec()
     view, before = api.surrogate(subject.name), subject.promise()
+    result = for_set_points(result, spec, subject.session.get("set_points") or {})
     steps = steady(spec, [step for step in steps_of(result.traces) if spec.known(step.coordinates)])
     q, u = np.array([step.coordinates for step in steps]), np.array([step.action for step in steps])
     beside = compared(api, spec, view, steps, UNNOTICED * earned(before, subject.floor) / float(result.lengths.mean()))

@@ -23,7 +23,8 @@ class Planner(PolicySearch):
     resumable = False  # it computes its values anew from the latest model
 
     def search(self, task: SearchTask) -> Found:
-        planner = PlannerFile(_file_of(task.port).to_bytes(), self.horizon, task.settings.seed)
+        settings = task.settings
+        planner = PlannerFile(_file_of(task.port).to_bytes(), self.horizon, settings.seed, settings.set_points)
         task.progress(TrainProgress(0, 0, None, 0.0, stage="computes values on a grid"))
         try:
             predict = planner.acting()
@@ -31,7 +32,7 @@ class Planner(PolicySearch):
             raise ValueError(f"algorithm PLANNER: {error}") from error
         imagined, whole = None, True
         try:
-            imagined = float(checked(task.port, predict, task.settings).mean())
+            imagined = float(checked(task.port, predict, settings).mean())
             task.progress(TrainProgress(0, 0, imagined, 0.0, stage="computed values on a grid"))
         except KeyboardInterrupt:
             whole = False

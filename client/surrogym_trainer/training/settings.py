@@ -79,6 +79,11 @@ class TrainSettings:
         return {**fields, **self.session}
 
     @property
+    def set_points(self) -> dict[str, float]:
+        """Set points that replace those of the declared reward, by coordinate."""
+        return dict(self.session.get("set_points", {}))
+
+    @property
     def judging(self) -> dict[str, Any]:
         return self.session if self.judge is None else self.judge
 

@@ -8,6 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from surrogym_shared.port import SurrogatePort
+from surrogym_shared.set_points import with_set_points
 from surrogym_trainer.policies.card import card_path, require_place
 from surrogym_trainer.training.search import (
     Found,
@@ -37,7 +38,8 @@ def train(
         progress: called after every rollout, generation or other unit of the search.
 
     Raises:
-        ValueError: the algorithm is unknown or does not support the action space, or there are too many steps.
+        ValueError: the algorithm is unknown or does not support the action space, there are too many steps, or the
+            reward or the model does not support a set point.
         SurrogymClientError: the surrogate can't be reached, or has no model yet.
         UnusablePolicy: the file to start from is not a policy of the algorithm, or the card would replace another kind
             of file.
@@ -45,6 +47,7 @@ def train(
     """
     require_place(out)
     settings = with_algorithm(settings or TrainSettings(), port.spec())
+    with_set_points(port.spec(), settings.set_points)  # raises an error if the reward does not have them
     search = search_for(settings)
     if search.tracked:
         settings = with_folder(settings, out)

@@ -16,10 +16,16 @@ from surrogym_shared import wire
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.words import counted
 from surrogym_trainer.evaluation.baselines import baseline
-from surrogym_trainer.evaluation.evaluator import Evaluation, EvaluationInterrupted, EvaluationSettings, evaluate
+from surrogym_trainer.evaluation.evaluator import (
+    Evaluation,
+    EvaluationInterrupted,
+    EvaluationSettings,
+    evaluate,
+    for_set_points,
+)
 from surrogym_trainer.evaluation.reporting import as_reported, paired_start, words_of
 from surrogym_trainer.evaluation.videos import record
-from surrogym_trainer.policies.card import write_card
+from surrogym_trainer.policies.card import set_points_in, write_card
 from surrogym_trainer.policies.files import load_policy
 from surrogym_trainer.policies.predict import Acting, Predict
 from surrogym_trainer.training.audited import AuditedTraining
@@ -162,7 +168,8 @@ def run_episodes(
         def tell(share: float, _: int, done: int = done) -> None:
             reporter.at("evaluating", (done + share) / len(controllers))
 
-        results[controller] = _counted(predict, environment, settings, controller, tell, gathered, trained_for)
+        result = _counted(predict, environment, settings, controller, tell, gathered, trained_for)
+        results[controller] = for_set_points(result, trained_for, set_points_in(found.settings))
     paired = paired_start(results["policy"], settings.episodes)
     gathered.evaluations = [
         as_reported(

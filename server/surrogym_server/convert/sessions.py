@@ -38,7 +38,7 @@ def as_tuple(value: Any) -> Any:
     return tuple(value) if isinstance(value, list) else value
 
 
-CONVERTED = {"penalty", "sensor_noise", "residual"}
+CONVERTED = {"penalty", "sensor_noise", "set_points", "residual"}
 # Options of a session that the core takes as they are sent.
 SAME = {field.name for field in fields(VirtualSettings)} & replies.OpenSession.model_fields.keys() - CONVERTED
 
@@ -48,6 +48,7 @@ def opening(request: replies.OpenSession) -> Opening:
         **{name: getattr(request, name) for name in SAME},
         penalty=request.penalty or 0.0,
         sensor_noise=tuple(sorted(request.sensor_noise.items())),
+        set_points=tuple(sorted(request.set_points.items())),
         residual=None if request.residual is None else residual(request.residual),
     )
     return Opening(

@@ -35,7 +35,7 @@ from surrogym_server.environment.actions import policy_actions
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import InvalidInput, NotReset, SurrogymError, TooLarge
 from surrogym_server.models.guard import failure_of
-from surrogym_server.models.port import DynamicsModel
+from surrogym_server.models.port import DynamicsModel, with_set_points
 from surrogym_server.virtual import VirtualSettings, create, in_fastest_form, reward_limits
 from surrogym_server.virtual.sensors import check as check_sensors
 from surrogym_server.virtual.sensors import sensed
@@ -247,8 +247,12 @@ def opened(
         version: version of this model.
         digest: content hash of the request, to recognise a repeat.
         place: suffix of the session's id, which names the process that runs the session.
+
+    Raises:
+        InvalidInput: an option does not fit the environment or the model.
     """
     opening = request.opening
+    with_set_points(model, opening.settings.set_points)  # raises an error if they don't fit
     settings = _limited(resolved(opening, definition), request.rewards, model)
     settings = replace(settings, visited=_starts(settings, definition, request.visited))
     settings = in_fastest_form(settings, model)
@@ -414,8 +418,16 @@ def _step(
 ) -> tuple[Session, StepResult]:
     surrogate, device = session.surrogate_id, session.definition.device
     latest = models.latest(surrogate) if session.model == "latest" else session.model
+    points = session.settings.set_points
     try:
-        return step_session(session, u, mask, stds, lambda version: models.get(surrogate, version, device), latest)
+        return step_session(
+            session,
+            u,
+            mask,
+            stds,
+            lambda version: with_set_points(models.get(surrogate, version, device), points),
+            latest,
+        )
     except SurrogymError:
         raise
     except BaseException as error:

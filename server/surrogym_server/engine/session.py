@@ -384,6 +384,7 @@ def _settings(saved: dict[str, Any], starts: NDArray[Any] | None, device: torch.
     tuples = {
         "reward_limits": None if limits is None else (limits[0], limits[1]),
         "sensor_noise": tuple((name, std) for name, std in noise),
+        "set_points": tuple((name, value) for name, value in saved.get("set_points", ())),
         "residual": None if residual is None else Residual.from_saved(residual),
     }
     states = None if starts is None else torch.from_numpy(starts).to(device)

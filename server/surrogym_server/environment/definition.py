@@ -8,7 +8,7 @@ needs is compiled from them when it is first used, with an index in place of eac
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -22,11 +22,13 @@ from surrogym_server.environment.declared_reward import RewardFunction
 from surrogym_server.environment.distributions import Distribution, quantiles
 from surrogym_server.environment.safety import LimitSet
 from surrogym_server.environment.terms import TermSet, compile_terms
+from surrogym_server.errors import InvalidInput
 from surrogym_server.plugins import Choice
 from surrogym_server.tensors import CPU, cached, to_device
 from surrogym_shared.kinds import RewardTiming
 from surrogym_shared.presets import InputProbability, Moves, Stopping, Tolerance
 from surrogym_shared.rates import Rate
+from surrogym_shared.set_points import reward_for
 from surrogym_shared.spec import (
     REWARD,
     Action,
@@ -136,6 +138,19 @@ class EnvironmentDefinition:
     def with_tolerances(self, tolerances: Mapping[str, float]) -> EnvironmentDefinition:
         """Return the same definition with ``tolerances``, by output name, set; those of other outputs are kept."""
         return replace(self, tolerances=tuple((dict(self.tolerances) | dict(tolerances)).items()))
+
+    def with_set_points(self, points: Iterable[tuple[str, float]]) -> EnvironmentDefinition:
+        """Return the same definition with other set points of the declared reward, given by coordinate.
+
+        Raises:
+            InvalidInput: the reward or the model does not support a set point, with the reason.
+        """
+        if not (given := dict(points)):
+            return self
+        try:
+            return replace(self, reward=reward_for(self, given))
+        except ValueError as error:
+            raise InvalidInput(str(error)) from error
 
     @property
     def moves_observation(self) -> bool:

@@ -15,7 +15,8 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -132,6 +133,36 @@ class DynamicsModel(ABC):
     def on(self, device: torch.device) -> DynamicsModel:
         """Return the same model with its arrays on ``device``."""
         return self if device == self.definition.device else to_device(self, device)
+
+    @cached_property
+    def _by_set_points(self) -> dict[tuple[tuple[str, float], ...], DynamicsModel]:
+        """The models that ``with_set_points`` has made of this one."""
+        return {}
+
+
+MOST_SET_POINTS = 16  # largest number of sets of set points for which a model keeps a copy of itself
+
+
+def with_set_points(model: DynamicsModel, points: tuple[tuple[str, float], ...]) -> DynamicsModel:
+    """Return the same model for other set points of the declared reward, given by coordinate.
+
+    Raises:
+        InvalidInput: the reward or the model does not support a set point, with the reason.
+    """
+    if not points:
+        return model
+    known = model._by_set_points
+    if (found := known.get(points)) is None:
+        of_any: Any = model
+        if not hasattr(model, "__dataclass_fields__"):
+            raise InvalidInput(
+                f"set points: expected a model that is a dataclass, got {type(model).__name__}: leave the set points out"
+            )
+        found = replace(of_any, definition=model.definition.with_set_points(points))
+        while len(known) >= MOST_SET_POINTS:
+            known.pop(next(iter(known)), None)
+        known[points] = found
+    return found
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,7 +14,7 @@ from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.observation_inverse import ObservationInverse
 from surrogym_server.errors import InvalidInput
 from surrogym_server.models.abilities import ArraySteps, CompiledSteps, GridPolicy, PlannedActions, offers
-from surrogym_server.models.port import DynamicsModel
+from surrogym_server.models.port import DynamicsModel, with_set_points
 from surrogym_server.planning.grid import solve, unfit
 from surrogym_shared.spec import BoxAction
 
@@ -35,19 +36,24 @@ STILL = 0.02
 GAIN = 0.1  # share of the error of such a step by which the estimate changes, so noise hardly changes it
 
 
-def planner_of(model: DynamicsModel, horizon: int, seed: int = 0) -> Planner:
+def planner_of(
+    model: DynamicsModel, horizon: int, seed: int = 0, set_points: Mapping[str, float] | None = None
+) -> Planner:
     """Return a planner on a model, after value iteration on a grid, which takes some seconds.
 
     Args:
         model: the model.
         horizon: number of steps of each rollout.
         seed: seed of the changes of actions that the planner tries.
+        set_points: values of coordinates, in the place of those that the declared reward measures errors from.
 
     Raises:
-        InvalidInput: the horizon is out of its range, or the model or its environment does not allow planning.
+        InvalidInput: the horizon is out of its range, the reward or the model does not support a set point, or the
+            model or its environment does not allow planning.
     """
     if type(horizon) is not int or not 1 <= horizon <= MOST_HORIZON:
         raise InvalidInput(f"horizon: expected a whole number of steps from 1 to {MOST_HORIZON}, got {horizon!r}")
+    model = with_set_points(model, tuple((set_points or {}).items()))
     inverse, able, steps = _requirements(model)
     policy = solve(steps, model.terminal_reward, model.definition.time_limit)
     return Planner(model.definition, inverse, able, policy, horizon, seed)

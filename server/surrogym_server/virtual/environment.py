@@ -48,6 +48,7 @@ class VirtualSettings:
     functions: int | None = None
     residual: Residual | None = None  # systematic errors that are added to each prediction; None adds nothing
     process_noise: bool = False  # whether random noise of the learned size (w of eq. 2) is added to each next state
+    set_points: tuple[tuple[str, float], ...] = ()  # other set points of the declared reward, by coordinate
     sensor_noise: SensorNoise = ()  # measurement noise added to observed coordinates; it does not change the state
     reward_limits: tuple[float, float] | None = None  # mean rewards are limited to this range; None: no limits
     # An episode is truncated if the predicted standard deviation of any output exceeds this multiple of the output's

@@ -6,7 +6,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, FiniteFloat, model_validator
 
-from surrogym_shared.checks import LARGEST
+from surrogym_shared.checks import LARGEST, Number
 from surrogym_shared.kinds import Activation
 from surrogym_shared.policy_sizes import MAX_LAYERS, MAX_UNITS
 from surrogym_shared.spec import MAX_DIMENSIONS
@@ -92,6 +92,11 @@ class OpenSession(Request):
         default={},
         description="standard deviation of the measurement error that is added to each named coordinate in "
         "observations. It does not move the state, so this part of the learned noise is left out of ``process_noise``",
+    )
+    set_points: dict[str, Number] = Field(
+        default={},
+        description="set points of coordinates, in the place of the values from which the declared reward measures "
+        "their errors; empty: the reward as declared",
     )
     trust: Annotated[float, Field(gt=0, le=1_000)] | None = Field(
         default=None,

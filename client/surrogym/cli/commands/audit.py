@@ -183,9 +183,10 @@ def _require_fit(predict: Predict, spec: EnvironmentSpec, misfit: str) -> None:
 
 def _of_another(card: PolicyCard) -> PolicyCard:
     """Return a policy's card for an audit on another surrogate than the one of its training: without the fields that
-    hold only for the surrogate of its training, such as the imagined return."""
+    hold only for the surrogate of its training, such as the imagined return. It keeps its set points."""
     empty = {"server": None, "spec": None, "imagined_return": None, "untrained": None, "visited_confidence": ()}
-    return card.model_copy(update={**empty, "settings": {}})
+    kept = {"session": {"set_points": card.set_points}} if card.set_points else {}
+    return card.model_copy(update={**empty, "settings": kept})
 
 
 def _floor(port: SurrogatePort, seed: int, session: dict[str, object]) -> float:

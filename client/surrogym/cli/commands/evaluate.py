@@ -144,6 +144,7 @@ def command(
     Example: surrogym evaluate policy.zip --env Pendulum-v1 --episodes 10 --learn 16
     """
     from surrogym_shared.terminal import give
+    from surrogym_trainer.evaluation.evaluator import for_set_points
     from surrogym_trainer.evaluation.reporting import is_promised
     from surrogym_trainer.policies.files import card_of_policy
 
@@ -159,7 +160,10 @@ def command(
     total = settings.episodes * len(controllers)
     announce = partial(_announce, episodes=total, environment=_named(env, card), quiet=output.quiet)
     run = partial(_run, opener=opener, settings=settings, enter=enter, quiet=output.quiet)
-    reports = _reports(controllers, card.spec, run, announce, enter, settings, policy)
+    reports = [
+        (controller, for_set_points(found, card.spec, card.set_points))
+        for controller, found in _reports(controllers, card.spec, run, announce, enter, settings, policy)
+    ]
     result = reports[0][1]
     promise = card.promise if is_promised(settings, result, card.spec) else None
     expected = promise if _judges(settings.episodes) else None
@@ -184,7 +188,7 @@ def command(
     summary |= {"promise_kept": None if elsewhere else _kept(expected, result)}
     summary |= {"version": version, "disagreements": found and found.as_json()}
     summary |= {} if filmed is None else {"video": str(filmed)}
-    more = [] if result.limits is None else [result.limits.words()]
+    more = _aimed(card) if result.limits is None else [*_aimed(card), result.limits.words()]
     if result.limits is not None and promise is not None and promise.fallback is not None and not elsewhere:
         more.append(result.limits.expected(promise.fallback.low, promise.fallback.high))
     more += [*elsewhere, *(found.in_words(card.spec) if found else [])]
@@ -192,6 +196,12 @@ def command(
     give(summary, lambda: "\n".join([_words(reports, None if elsewhere else promise), *more]), as_json=output.as_json)
     if steps is not None:
         steps.require_stored()
+
+
+def _aimed(card: PolicyCard) -> list[str]:
+    """Return a remark about the set points that the returns are for; empty if they are those of the specification."""
+    points = ", ".join(f"{name} = {value:g}" for name, value in card.set_points.items())
+    return [f"returns are for the set point {points}, by the declared reward of the policy's card"] if points else []
 
 
 def _named(env: str | None, card: PolicyCard) -> str:
