@@ -79,8 +79,8 @@ CHANGES = {"as learned": (1.0, 0.0), "20 % weaker": (0.8, 0.0), "offset of 5 %":
 def learned(plant: Plant, seed: int, spec: EnvironmentSpec) -> LocalSurrogate:
     """Learn a model of the plant by a design from any state."""
     real = Changing(plant.machine, plant.machine.real, np.random.default_rng([seed, 5]))
-    design = spec.design.model_copy(update={"seed": seed, "budget": plant.machine.budget})
-    spec = spec.model_copy(update={"design": design})
+    chosen = spec.design.model_copy(update={"seed": seed, "budget": plant.machine.budget})
+    spec = spec.model_copy(update={"design": chosen})
     design = surrogym.Design(spec)
     while (query := design.ask()) is not None:
         design.tell(query, real.step_from(np.array(query.coordinates), np.array(query.action)))
@@ -121,10 +121,9 @@ def at_set_points(name: str, seed: int) -> None:
     for target in plant.others:
         points, aimed = {plant.name: target}, replace(plant, target=target)
         own = LocalSurrogate.from_bytes(with_set_points(model.spec(), points), model.model_file())
-        for policy, acts in {
-            "planner": model.planner(HORIZON, set_points=points),
-            "trained": trained(own, seed),
-        }.items():
+        policies: dict[str, Predict] = {"planner": model.planner(HORIZON, set_points=points)}
+        policies["trained"] = trained(own, seed)
+        for policy, acts in policies.items():
             error, total = measured(aimed, acts, "as learned", seed)
             print(f"| {name} | {seed} | {target:g} | {policy} | {error:.2g} | {total:.3g} |", flush=True)
 

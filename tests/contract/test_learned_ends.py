@@ -61,6 +61,23 @@ def test_learned_termination_and_declared_reward_are_equal_over_every_transport(
         np.testing.assert_array_equal(ends[name], ends["local"])
 
 
+def test_the_set_points_of_a_session_are_equal_over_every_transport(ports):
+    told = {}
+    for name, port in ports.items():
+        session = port.open(OpenSession(num_envs=4, seed=3, set_points={"pole": 0.05})).id
+        port.reset(session)
+        told[name] = [port.step(session, np.ones(4, dtype=np.int64)) for _ in range(5)]
+        port.close(session)
+        with pytest.raises(Exception, match="expected a number in the sampling range"):
+            port.open(OpenSession(set_points={"pole": 9.0}))
+    pole = ports["local"].spec().observation_names.index("pole")
+    for steps in told.values():
+        for step, same in zip(steps, told["local"], strict=True):
+            np.testing.assert_array_equal(step.reward, same.reward)
+            assert not step.terminated.any()
+            np.testing.assert_allclose(step.reward, -np.abs(step.observation[:, pole] - 0.05), atol=1e-6)
+
+
 @pytest.mark.parametrize("noise", [None, NoiseKey(5)], ids=["most probable", "noisy"])
 def test_a_discrete_policy_rollout_equals_single_steps_over_every_transport(ports, noise):
     policy = random_policy((4, 12, 2), continuous=False)

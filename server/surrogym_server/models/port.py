@@ -156,7 +156,7 @@ def with_set_points(model: DynamicsModel, points: tuple[tuple[str, float], ...])
         of_any: Any = model
         if not hasattr(model, "__dataclass_fields__"):
             raise InvalidInput(
-                f"set points: expected a model that is a dataclass, got {type(model).__name__}: leave the set points out"
+                f"set points: expected a model that is a dataclass, got {type(model).__name__}: leave them out"
             )
         found = replace(of_any, definition=model.definition.with_set_points(points))
         while len(known) >= MOST_SET_POINTS:

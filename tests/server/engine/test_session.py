@@ -93,6 +93,7 @@ def test_a_restored_session_continues_bit_for_bit(
     chosen |= {"autoreset_mode": "same_step", "time_limit": 3, "start_visited": 0.5}
     chosen["visited"] = torch.linspace(-1, 1, 5 * len(definition.coordinates), dtype=torch.float64).reshape(5, -1)
     chosen["sensor_noise"] = ((definition.coordinate_names[0], 0.1),)
+    chosen["set_points"] = ((definition.coordinate_names[0], 0.5),)
     session, _ = reset_session(opened(occupancy=True, **chosen), 11, None, 1)
     results = []
     for _ in range(2):

@@ -18,12 +18,13 @@ from surrogym_server.errors import InvalidInput
 from surrogym_server.local import LocalSurrogate
 from surrogym_server.planning import planner_of
 from surrogym_server.planning.grid import _nodes, solve
-from surrogym_shared.spec import EnvironmentSpec, with_history
+from surrogym_shared.spec import DeclaredReward, EnvironmentSpec, Quantity, RewardTerm, Term, with_history
 from surrogym_trainer.deployment.controller import NotDeployable
 from surrogym_trainer.deployment.reading import controller_of
 from surrogym_trainer.evaluation import imagined_returns
+from surrogym_trainer.evaluation.promise import promise_of
 from surrogym_trainer.policies import load_policy
-from surrogym_trainer.policies.card import UnusablePolicy
+from surrogym_trainer.policies.card import UnusablePolicy, read_card
 from surrogym_trainer.policies.files import load_learner
 from surrogym_trainer.training import TrainSettings, train
 from surrogym_trainer.training.words import words_of_result
@@ -190,6 +191,36 @@ def test_a_training_by_planner_writes_a_file_that_any_reader_of_policies_runs(ha
         load_learner(result.path, "PPO")
     with pytest.raises(NotDeployable, match="is a planner, which has no network; a deterministic feed-forward"):
         controller_of(result.path, pendulum())
+
+
+def turning(speed: float) -> EnvironmentSpec:
+    """A pendulum that is to turn at a speed."""
+    error = Quantity(term=Term.linear(speed=0.5) + Term.constant(-0.5 * speed))
+    reward = DeclaredReward(kind="declared", terms=(RewardTerm(shape="bump", of=(error,)),))
+    return pendulum().model_copy(update={"time_limit": 30, "reward": reward})
+
+
+def test_a_set_point_at_run_time_plans_as_a_model_with_a_specification_of_it(tmp_path):
+    plain, points = local(turning(1.0), 25), {"speed": -2.0}
+    own = LocalSurrogate.from_bytes(turning(-2.0), plain.model_file())
+    shown = np.random.default_rng(0).normal(size=(4, 3)).astype(np.float32)
+    expected = own.planner(5, 3)(shown).tolist()
+    assert plain.planner(5, 3, points)(shown).tolist() == expected != plain.planner(5, 3)(shown).tolist()
+
+    settings = TrainSettings(
+        algorithm="planner", seed=3, session={"set_points": points}, hyperparameters={"horizon": 5}
+    )
+    result = train(plain, tmp_path / "planner.zip", settings)
+    assert load_policy(result.path)(shown).tolist() == expected
+    assert read_card(result.path).set_points == points
+    assert result.imagined_return == train(own, tmp_path / "own.zip", replace(settings, session={})).imagined_return
+    predict = load_policy(result.path)
+    assert promise_of(plain, predict, 0, {"set_points": points}).median > 3 * promise_of(plain, predict, 0).median
+
+    far = replace(settings, session={"set_points": {"speed": 99.0}})
+    with pytest.raises(ValueError, match="set point 'speed': expected a number in the sampling range"):
+        train(plain, tmp_path / "far.zip", far)
+    assert not (tmp_path / "far.zip").exists()
 
 
 def test_a_planner_that_can_not_be_made_leaves_no_file(hanging: LocalSurrogate, tmp_path):
