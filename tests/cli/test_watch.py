@@ -207,23 +207,41 @@ def test_the_watch_command_finds_drift_in_steps_that_the_machine_posts(
     assert said.code == 1
     assert f"/v1/surrogates/{tank}/steps" in said.err
     rows = lines(300, seed=11, worn_from=150)
-    cells = [[float(cell) for cell in row.split(",")] for row in rows]
-    steps = [
-        MachineStep(coordinates=[q], action=[u], next_coordinates=[after[1]], reward=paid)
-        for (_, q, u, paid), after in pairwise(cells)
-    ]
+    steps = _steps(rows)
     with Api(server_process.url) as api:
         calls, machine = StepCalls(api.connection), api.surrogate(tank).spec.environment
         for first in (0, 60, 60, 120, 180, 240):
             calls.add(tank, machine, "pump", first, steps[first : first + 60], period=1.0)
     posted = on_server("watch", tank, *options, "--follow")
+    again = on_server("watch", tank, "--policy", "production")
     logged = on_server("watch", tank, str(write(tmp_path / "log.csv", rows)), *options)
     assert (posted.code, logged.code) == (1, 1)
     assert posted.json["compared"] == logged.json["compared"]
     assert posted.json["drift"] == {**logged.json["drift"], "line": logged.json["drift"]["line"] - 2}
     assert policy()[1] == ledger
-    words = on_server("watch", tank, "--policy", "production")
-    assert f"found in step {posted.json['drift']['line']}" in words.out
+    assert again.code == 1
+    assert "drift of the policy, got none" in again.err
+
+
+def test_posted_steps_are_compared_from_the_latest_confirmation_of_the_promise_on(
+    on_server: Watch, server_process: ServerProcess, policy: Callable[[], Any], tank: str
+):
+    """After trust was regained, the command ended at the same old drift again."""
+    watch = ("watch", tank, "--policy", "production")
+    worn, sound = _steps(lines(200, seed=21, worn_from=100)), _steps(lines(200, seed=22))
+    kept = wire.AddEvaluation(first_seed=1, returns=[-1.0] * 30, lengths=[9] * 30, idempotency_key="after the repair")
+    with Api(server_process.url) as api:
+        calls, machine = StepCalls(api.connection), api.surrogate(tank).spec.environment
+        calls.add(tank, machine, "repaired", 0, worn)
+        found = on_server(*watch)
+        assert "drift, found in step" in found.out, found.err
+        assert api.policies.evaluate(tank, policy()[0].version, kept).promise_kept
+        calls.add(tank, machine, "repaired", len(worn), sound)
+    said = on_server(*watch)
+    assert said.code == 0, said.out
+    assert f"no drift in {len(sound)} real steps" in said.out
+    assert "compares the steps that were posted after 20" in said.err
+    assert policy()[0].trusted
 
 
 def test_the_watch_command_with_follow_refuses_a_log_that_became_shorter(
@@ -367,6 +385,15 @@ def test_the_watch_command_names_an_unknown_surrogate_or_policy(
     said = on_server("watch", name or tank, str(log), "--policy", which)
     assert said.code == 1
     assert (name or which) in said.err
+
+
+def _steps(rows: list[str]) -> list[MachineStep]:
+    """The steps of a log, as a machine posts them."""
+    cells = [[float(cell) for cell in row.split(",")] for row in rows]
+    return [
+        MachineStep(coordinates=[q], action=[u], next_coordinates=[after[1]], reward=paid)
+        for (_, q, u, paid), after in pairwise(cells)
+    ]
 
 
 def _with(row: str, column: int, change: Callable[[float], float]) -> str:

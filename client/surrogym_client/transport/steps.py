@@ -47,10 +47,12 @@ class StepCalls:
         route = self._route(surrogate)
         return parse(AddedSteps, self._connection.send("POST", route, body.model_dump_json().encode()), route)
 
-    def after(self, surrogate: str, id: int = 0) -> list[StreamedStep]:
-        """Return the steps after the one with this id, at most 1,000; empty if there is none yet."""
+    def after(self, surrogate: str, id: int = 0, since: float = 0.0) -> list[StreamedStep]:
+        """Return the steps after the one with this id that the server stored later than ``since`` (s since 1970), at
+        most 1,000; empty if there is none yet."""
         route = self._route(surrogate)
-        return parse(StepPage, self._connection.send("GET", route, params={"after": id}), route).steps
+        params: dict[str, str | int] = {"after": id, "since": str(since)}
+        return parse(StepPage, self._connection.send("GET", route, params=params), route).steps
 
     @staticmethod
     def _route(surrogate: str) -> str:

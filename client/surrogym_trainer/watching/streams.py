@@ -13,12 +13,13 @@ from surrogym_trainer.evaluation.comparing import StepOfEpisode
 LOOK_SECONDS = 1.0  # seconds between two requests for new steps
 
 
-def posted(api: Api, surrogate: str, *, follow: bool) -> Iterator[list[StepOfEpisode]]:
-    """Yield the steps that a machine has posted, in the order in which they came, and with ``follow`` the later ones
-    too, without end. The field ``number`` of each step is its number in its stream. Raises ``SurrogymClientError``."""
+def posted(api: Api, surrogate: str, since: float, *, follow: bool) -> Iterator[list[StepOfEpisode]]:
+    """Yield the steps that a machine has posted after the time ``since`` (s since 1970 by the server's clock), in the
+    order in which they came, and with ``follow`` the later ones too, without end. The field ``number`` of each step is
+    its number in its stream. Raises ``SurrogymClientError``."""
     calls, last = StepCalls(api.connection), 0
     while True:
-        if steps := calls.after(surrogate, last):
+        if steps := calls.after(surrogate, last, since):
             last = steps[-1].id
             yield [_step(one) for one in steps]
         elif follow:

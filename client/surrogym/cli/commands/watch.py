@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from dataclasses import asdict
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     from surrogym_shared.logs.checking import ReadLog
     from surrogym_shared.spec import EnvironmentSpec
     from surrogym_shared.terminal import Update
-    from surrogym_shared.wire import PolicyView, SurrogateView
+    from surrogym_shared.wire import PolicyDetail, PolicyView, SurrogateView
     from surrogym_trainer.evaluation.comparing import StepOfEpisode
     from surrogym_trainer.watching.watcher import Alarm, Watcher
 
@@ -65,7 +66,7 @@ def command(
     Example: surrogym watch pendulum --policy production --follow
     """
     from surrogym.cli.errors import CommandError
-    from surrogym_shared.terminal import on_interrupt, progress
+    from surrogym_shared.terminal import on_interrupt, progress, say
     from surrogym_trainer.watching.watcher import Watcher
 
     name, _, which = policy.rpartition("@")
@@ -74,21 +75,23 @@ def command(
     with service.connect(context) as api:
         view, watched = api.surrogate(surrogate), api.policies.get(surrogate, which)
         _require_own(api, surrogate, which, watched.origin)
-        version = watched.version
+        version, since = watched.version, 0.0 if log else _since(watched)
         if view.fidelity is None:
             raise CommandError(f"{surrogate!r} has no model yet to compare the steps with: let a sampler run first")
         watcher, seen = Watcher(api, view, false_alarm_steps), _Seen()
+        if since:
+            say(f"compares the steps that were posted{_later(since)}", quiet=output.quiet)
         with (
             on_interrupt(lambda: f"interrupted; no drift in {watcher.compared} real steps"),
             progress("watch", quiet=output.quiet) as update,
         ):
-            for _ in _readings(api, view, seen, log, mapping, follow=follow):
+            for _ in _readings(api, view, seen, log, since, mapping, follow=follow):
                 if (alarm := _watched(watcher, seen.steps, update, len(seen.rejected))) is not None:
                     break
             else:
                 alarm = None
         if not watcher.compared + watcher.left_out:
-            raise CommandError(_words_of_none(view, log))
+            raise CommandError(_words_of_none(view, log, since))
         stored = None if alarm is None else _withdrawn(watcher, version, alarm, seen.place)
         moved = None if alarm is None or which not in watched.aliases else _moved(api, surrogate, which, version)
     named = f"{surrogate}@{version}"
@@ -136,14 +139,23 @@ def _moved(api: Api, surrogate: str, alias: str, version: int) -> str | None:
     return f"{surrogate}@{alias} leads to version {now} by now, which was not watched: watch it by the same command"
 
 
+def _since(policy: PolicyDetail) -> float:
+    """Return when an audit or real episodes last confirmed a policy's promise, or drift was reported, in seconds since
+    1970; 0 if none of them did. Earlier steps would give an old drift again."""
+    confirmed = [one.created_at for one in policy.evaluations if one.promise_kept]
+    audited = [policy.created_at] if policy.audit is not None and policy.audit.passed else []
+    return max([0.0, policy.drifted_at or 0.0, *confirmed, *audited])
+
+
 def _readings(
-    api: Api, view: SurrogateView, seen: _Seen, log: Path | None, mapping: Path | None, *, follow: bool
+    api: Api, view: SurrogateView, seen: _Seen, log: Path | None, since: float, mapping: Path | None, *, follow: bool
 ) -> Iterator[None]:
-    """Read real steps from a log, or those that the machine posts, into ``seen``. Yields after each reading."""
+    """Read real steps from a log, or those that the machine posts after the time ``since``, into ``seen``. Yields after
+    each reading."""
     from surrogym_trainer.watching.streams import posted
 
     if log is None:
-        for steps in posted(api, view.name, follow=follow):
+        for steps in posted(api, view.name, since, follow=follow):
             seen.steps, seen.place = steps, "step"
             yield
         return
@@ -152,14 +164,22 @@ def _readings(
         yield
 
 
-def _words_of_none(view: SurrogateView, log: Path | None) -> str:
+def _words_of_none(view: SurrogateView, log: Path | None, since: float) -> str:
     """Return the error message that there are no real steps."""
     if log is not None:
         return f"expected real steps in {log}, got none: give a log with two or more rows of an episode"
     return (
-        f"expected real steps that the machine has posted to {view.name!r}, got none: post them to "
+        f"expected real steps that the machine has posted to {view.name!r}{_later(since)}, got none: post them to "
         f"/v1/surrogates/{view.name}/steps, or give a log"
     )
+
+
+def _later(since: float) -> str:
+    """Return words that only steps after a time (s since 1970) count; empty for 0."""
+    if not since:
+        return ""
+    at = datetime.fromtimestamp(since, UTC)
+    return f" after {at:%Y-%m-%d %H:%M:%S} UTC, the latest audit, confirming evaluation or drift of the policy"
 
 
 def _logs(log: Path, mapping: Path | None, spec: EnvironmentSpec, *, follow: bool) -> Iterator[ReadLog]:

@@ -50,8 +50,11 @@ def read(
     name: str,
     watching: Watching,
     after: Annotated[int, Query(ge=0, le=2**63 - 1, description="id of the last step that is known")] = 0,
+    since: Annotated[
+        float, Query(ge=0, allow_inf_nan=False, description="only later steps, in seconds since 1970")
+    ] = 0,
     limit: Annotated[int, Query(ge=1, le=MOST_READ)] = MOST_READ,
 ) -> StepPage:
     """Read the steps of all streams of a surrogate, in the order in which they came. Only the newest 100,000 are
     kept."""
-    return StepPage(steps=[StreamedStep(**step) for step in watching.page(name, after, limit)])
+    return StepPage(steps=[StreamedStep(**step) for step in watching.page(name, after, since, limit)])

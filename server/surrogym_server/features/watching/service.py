@@ -57,9 +57,10 @@ class WatchingService:
         steps = [_checked(definition, spec, index, step) for index, step in enumerate(body.steps)]
         return self._streams.add(name, body.stream, body.first, steps)
 
-    def page(self, name: str, after: int, limit: int) -> list[JSON]:
-        """Return up to ``limit`` steps with an id above ``after``, in order. Raises ``UnknownSurrogate``."""
-        return self._streams.page(name, after, limit)
+    def page(self, name: str, after: int, since: float, limit: int) -> list[JSON]:
+        """Return up to ``limit`` steps with an id above ``after`` that were stored later than ``since`` (s since 1970),
+        in order. Raises ``UnknownSurrogate``."""
+        return self._streams.page(name, after, since, limit)
 
 
 def _require_own(name: str, spec: EnvironmentSpec, body: AddSteps) -> None:

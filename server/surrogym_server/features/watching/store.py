@@ -82,10 +82,13 @@ class Streams:
                     connection.execute(sa.delete(table).where(table.c.surrogate_id == held.id, table.c.id <= oldest))
             return len(new), following + len(new)
 
-    def page(self, name: str, after: int, limit: int) -> list[JSON]:
-        """Return up to ``limit`` steps with an id above ``after``, in order."""
+    def page(self, name: str, after: int, since: float, limit: int) -> list[JSON]:
+        """Return up to ``limit`` steps with an id above ``after`` that were stored later than ``since`` (s since 1970),
+        in order."""
         table = streamed_steps
         with self._database.read() as connection:
             own = (table.c.surrogate_id == find(connection, name)) & (table.c.id > after)
-            rows = connection.execute(sa.select(table).where(own).order_by(table.c.id).limit(limit))
+            rows = connection.execute(
+                sa.select(table).where(own, table.c.created_at > since).order_by(table.c.id).limit(limit)
+            )
             return [{**row.step, "id": row.id, "stream": row.stream, "number": row.number} for row in rows]

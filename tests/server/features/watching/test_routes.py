@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
@@ -67,6 +68,7 @@ def test_steps_of_a_stream_are_stored_once_in_order_and_never_learned(api: Api, 
     assert [(one.stream, one.number) for one in read] == [("a", i) for i in range(5)] + [("b", 0)]
     assert read[4].next_coordinates == [0.1 + 0.01 * 4, 0.4]
     assert [one.id for one in calls.after(surrogate, read[3].id)] == [read[4].id, read[5].id]
+    assert calls.after(surrogate, since=time.time() + 60) == []
     now = api.surrogate(surrogate)
     assert (now.samples, now.ledger, now.phase) == (before.samples, before.ledger, before.phase)
 
@@ -125,7 +127,7 @@ def test_only_the_newest_steps_of_a_surrogate_are_kept(tmp_path: Path, monkeypat
         streams = storage.part(store.Streams)
         for number in range(5):
             streams.add("one", "a", number, [{"reward": number}])
-        assert [one["number"] for one in streams.page("one", 0, 10)] == [2, 3, 4]
+        assert [one["number"] for one in streams.page("one", 0, 0.0, 10)] == [2, 3, 4]
         assert streams.add("one", "a", 4, [{"reward": 4}]) == (0, 5)
         with pytest.raises(Conflict):
             streams.add("one", "a", 0, [{"reward": 0}])
