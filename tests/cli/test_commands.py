@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from support.machine import Machine, diary_in
+from support.moody import DECLARED
 from surrogym_client.transport import Api
 from surrogym_sampler import original
 from surrogym_sampler.original.loading import with_choices
@@ -281,6 +282,19 @@ def test_the_evaluate_command_reports_that_all_episodes_were_equal(surrogym, mon
     )
     several = surrogym("evaluate", "policy.zip", "--env", "support.moody:Line", "--episodes", "4")
     assert "equal" not in several.out + several.err
+
+
+def test_the_evaluate_command_reports_returns_for_the_set_points_of_the_card(surrogym, monkeypatch, tmp_path):
+    (tmp_path / "policy.zip").write_bytes(stored({}))
+    card = PolicyCard(spec=DECLARED, settings={"session": {"set_points": {"x": 0.25}}})
+    (tmp_path / "policy.json").write_text(card.model_dump_json())
+    monkeypatch.setattr("surrogym_trainer.policies.files.load_policy", lambda *_, **__: lambda o: np.ones((len(o), 1)))
+    arguments = ("evaluate", "policy.zip", "--env", "support.moody:Alike", "--episodes", "1")
+    said = surrogym(*arguments)
+    assert said.code == 0, said.err
+    assert "returns are for the set point x = 0.25, by the declared reward of the policy's card" in said.out
+    # x is 0.25, 0.35, ..., 0.65
+    assert json.loads(surrogym(*arguments, "--json").out)["per_episode"] == [pytest.approx(-1.0)]
 
 
 def _look_at(on_server, pendulum, tmp_path):

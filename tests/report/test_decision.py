@@ -127,6 +127,13 @@ def test_the_report_of_an_evaluated_policy_has_every_section(modelled: Known):
     assert "What could not be read" not in parts
 
 
+def test_the_report_names_the_set_points_of_the_returns(modelled: Known):
+    aimed = policy(settings={"session": {"set_points": {"speed": 1.5}}})
+    parts = told(replace(modelled, policy=aimed, real=evaluation()))
+    assert "set points of the returns speed = 1.5" in parts["What it gives"]
+    assert "set points" not in told(replace(modelled, policy=policy(), real=evaluation()))["What it gives"]
+
+
 def test_the_report_lists_every_real_step_by_purpose(modelled: Known):
     wide = evaluation(4, declared=False, note="starts anywhere", steps=3_000)
     older = policy(version=2, evaluations=[evaluation(5, steps=500)])

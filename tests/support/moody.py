@@ -10,10 +10,13 @@ from surrogym_sampler.original import RealStep
 from surrogym_shared.spec import (
     BoxAction,
     Coordinate,
+    DeclaredReward,
     Design,
     EnvironmentSpec,
     Fixed,
     ObservationEntry,
+    Quantity,
+    RewardTerm,
     Term,
     Uniform,
 )
@@ -27,6 +30,10 @@ SPEC = EnvironmentSpec(
     time_limit=20,
     design=Design(initial=6, budget=6),
 )
+
+
+ERROR = RewardTerm(weight=-1.0, shape="absolute", of=(Quantity(term=Term.linear(x=1)),))
+DECLARED = SPEC.model_copy(update={"reward": DeclaredReward(kind="declared", terms=(ERROR,))})
 
 
 class Line:

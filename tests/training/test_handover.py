@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from support import rail
-from support.moody import SPEC, Line
+from support.moody import DECLARED, SPEC, Line
 from support.server import ServerProcess
 from surrogym.cli import main
 from surrogym_client.errors import UnknownSurrogate
@@ -232,6 +232,21 @@ def test_an_audit_by_whole_episodes_checks_dynamics_and_return(server_process: S
         assert handover.trusted is not changed, handover.reason
         if changed:
             assert handover.reason.startswith("the audit failed: 3 whole episodes earned 2.")
+
+
+def test_whole_episodes_are_judged_by_the_reward_with_the_policys_set_points(
+    server_process: ServerProcess,
+) -> None:
+    def to_the_right(observations: np.ndarray) -> np.ndarray:
+        return np.clip(10 * (0.3 - observations), -1, 1)
+
+    with placed(server_process.url, DECLARED, Line()) as place:
+        aimed = replace(place.subject(), predict=to_the_right, session={"set_points": {"x": 0.3}})
+        result = evaluate(to_the_right, lambda: open_episode("a line", DECLARED, Line), EvaluationSettings(3))
+        handover = judge_episodes(aimed, result)
+        assert handover.trusted, handover.reason
+        assert handover.promise is not None
+        assert handover.promise.median > result.returns.mean() + 2
 
 
 class Broken(Changed):

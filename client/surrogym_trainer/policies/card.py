@@ -78,6 +78,11 @@ def set_points_in(settings: Mapping[str, Any]) -> dict[str, float]:
     return dict(session.get("set_points") or {}) if isinstance(session, dict) else {}
 
 
+def words_of_set_points(points: Mapping[str, float]) -> str:
+    """Return set points in words, such as ``level = 12``; empty if there are none."""
+    return ", ".join(f"{name} = {value:g}" for name, value in points.items())
+
+
 def missing_policy(policy: Path) -> FileNotFoundError:
     """Return the error for a policy file that does not exist. If its name is that of a policy on a server, such as
     ``pendulum@3``, the message has the command that downloads this policy."""

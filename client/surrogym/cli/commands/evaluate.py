@@ -200,7 +200,9 @@ def command(
 
 def _aimed(card: PolicyCard) -> list[str]:
     """Return a remark about the set points that the returns are for; empty if they are those of the specification."""
-    points = ", ".join(f"{name} = {value:g}" for name, value in card.set_points.items())
+    from surrogym_trainer.policies.card import words_of_set_points
+
+    points = words_of_set_points(card.set_points)
     return [f"returns are for the set point {points}, by the declared reward of the policy's card"] if points else []
 
 

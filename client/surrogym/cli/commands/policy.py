@@ -225,6 +225,7 @@ def _from_zip(content: bytes, form: str, algorithm: str) -> bytes:
 
 def _words(name: str, policy: PolicyDetail) -> str:
     from surrogym.cli.columns import columns
+    from surrogym_trainer.policies.card import set_points_in, words_of_set_points
 
     aliases = f", {', '.join(policy.aliases)}" if policy.aliases else ""
     lines = [f"{name}@{policy.version}{aliases}: {policy.algorithm or 'unknown algorithm'}"]
@@ -234,6 +235,8 @@ def _words(name: str, policy: PolicyDetail) -> str:
         lines.append(f"trained on another surrogate: its trust is that of {policy.origin}")
     if policy.virtual_steps:  # a planner has none
         lines.append(f"training: {policy.virtual_steps} virtual steps")
+    if points := words_of_set_points(set_points_in(policy.settings)):
+        lines.append(f"set points: {points}")
     if policy.promise is None:
         lines.append("promise: none was made")
     else:

@@ -180,7 +180,7 @@ def _trainable(
     import the packages of the policy search in the meantime.
 
     Raises:
-        CommandError: the surrogate has no model yet.
+        CommandError: the surrogate has no model yet, or its reward does not have the set points of the settings.
     """
     from surrogym.cli.errors import CommandError
     from surrogym_client.surrogates.waiting import (
@@ -190,11 +190,16 @@ def _trainable(
         words_of_design,
         words_of_uncertainty,
     )
+    from surrogym_shared.set_points import with_set_points
     from surrogym_shared.terminal import say
     from surrogym_trainer.training.search import SEARCHES, name_of
 
     with connect(server, token, wait, quiet=quiet) as api:
         view = awaited_surrogate(api, surrogate, wait, quiet=quiet)
+        try:
+            with_set_points(view.spec, settings.set_points)
+        except ValueError as error:
+            raise CommandError(str(error)) from error
         if wait > 0:
             SEARCHES.get(name_of(settings))
             stays = "interrupted; the design continues on the server; the same command waits again"
