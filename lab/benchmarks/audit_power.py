@@ -46,7 +46,7 @@ from surrogym_trainer.training.handover import AuditSettings, Handover, Subject,
 from surrogym_trainer.training.settings import chosen_for
 
 OFF = 0.2  # of the range of returns
-PATIENCE_SECONDS = 7_200.0
+PATIENCE_SECONDS = 600.0
 SEARCH = {"population": 16, "starts": 6, "units": 4}  # of CMA-ES
 GENERATIONS = 10
 STARTS = 100  # of a real return
