@@ -9,7 +9,7 @@ import hashlib
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import sqrt
+from math import inf, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -18,14 +18,17 @@ from numpy.typing import NDArray
 from surrogym_client.transport import routes
 from surrogym_client.transport.api import Api
 from surrogym_client.transport.routes import parse
+from surrogym_shared.logs.rows import impossible
 from surrogym_shared.spec import BoxAction, EnvironmentSpec, limits
 from surrogym_shared.wire import PolicyView, SurrogateView
 from surrogym_shared.wire.policies import AddDrift
 from surrogym_trainer.evaluation.audit import Compared
 from surrogym_trainer.evaluation.comparing import StepOfEpisode, compared, steady
 from surrogym_trainer.watching.detector import Detector
+from surrogym_trainer.watching.units import OtherUnits, converted, other_units
 
 BATCH = 500  # largest number of real steps that one request to the server contains
+FIRST = 20  # whether steps come in other units is decided by the first steps, at least this number
 KEPT = 2_000  # a drift is described from at most this number of latest steps
 QUARTERS = ("lowest", "second", "third", "highest")
 # errors count as concentrated in a quarter of an input's range if the quarter adds more than this to the relative
@@ -112,6 +115,8 @@ class Watcher:
         # for each of the latest steps: errors (O,) and predicted standard deviations (O,) of O outputs, and inputs
         # (C + F,)
         self._recent: deque[tuple[Array, Array, Array]] = deque(maxlen=KEPT)
+        self._first: list[StepOfEpisode] = []  # the first steps, at most ``FIRST``
+        self._found: Alarm | None = None
         self._inputs = _inputs_of(view.spec)
         self._visits = np.zeros((len(self._inputs), len(QUARTERS)))
         # number of steps that were not compared, because a constant coordinate changed or a lag was not known
@@ -129,8 +134,8 @@ class Watcher:
         return 0.0 if self._detector is None else self._detector.evidence
 
     def take(self, steps: Sequence[StepOfEpisode]) -> Alarm | None:
-        """Compare at most ``BATCH`` steps, and return the alarm if there is one. The ``number`` of each step is its
-        line in the log.
+        """Compare at most ``BATCH`` steps, and return the alarm if there is one, now or before. The ``number`` of each
+        step is its line in the log.
 
         Raises:
             SurrogymClientError: the server can't be reached, or refuses a request.
@@ -138,8 +143,9 @@ class Watcher:
         spec = self._view.spec
         usable = steady(spec, [step for step in steps if spec.known(step.coordinates)])
         self.left_out += len(steps) - len(usable)
-        if not usable:
-            return None
+        self._first += usable[: FIRST - len(self._first)]
+        if self._found is not None or not usable:
+            return self._found
         beside = compared(self._api, spec, self._view, usable)
         if self._detector is None:
             self._detector = Detector(beside.claimed_alone, self._tolerances(beside.names), self._false_alarm_steps)
@@ -149,8 +155,36 @@ class Watcher:
             self._recent.append((errors[i], beside.deviations[i], inputs[i]))
             self._visits[np.arange(len(self._inputs)), self._quarters(inputs[i : i + 1])[0]] += 1
             if (drift := self._detector.step(errors[i], beside.deviations[i])) is not None:
-                return self._alarm(beside, drift.output, drift.shifted, drift.steps, step.number)
+                self._found = self._alarm(beside, drift.output, drift.shifted, drift.steps, step.number)
+                return self._found
         return None
+
+    def other_units(self) -> tuple[OtherUnits | None, bool]:
+        """Return the units in which the first steps seem to come, in place of a drift that is there from the start, and
+        whether that is certain. It is uncertain while fewer than ``FIRST`` steps were taken."""
+        if self._found is None or not self._found.from_the_start:
+            return None, True
+        spec, steps = self._view.spec, self._first
+        beside = compared(self._api, spec, self._view, steps)
+        paid = np.array([one.reward for one in steps])
+        if "reward" in beside.names:
+            paid = paid - beside.errors[:, list(beside.names).index("reward")]
+        return other_units(spec, steps, paid, self._misfit), len(steps) == FIRST
+
+    def _misfit(self, scale: Array, shift: Array) -> float:
+        """Return the negative log-likelihood of the first steps after their conversion by ``scale`` (C + F + 1,) and
+        ``shift`` (C + F + 1,), without a constant; infinity if they give an alarm, or if a value is impossible."""
+        spec, steps = self._view.spec, converted(self._first, scale, shift)
+        if any(impossible(spec, q) for one in steps for q in (one.coordinates, one.next_coordinates)):
+            return inf
+        bounds = spec.action.ranges
+        if not all(low <= u <= high for one in steps for u, (low, high) in zip(one.action, bounds, strict=True)):
+            return inf
+        other = Watcher(self._api, self._view, self._false_alarm_steps)
+        if other.take(steps) is not None or other.compared < len(steps):
+            return inf
+        beside = compared(self._api, spec, self._view, steps)
+        return float(((beside.errors / beside.claimed) ** 2 / 2 + np.log(beside.claimed)).sum())
 
     def withdraw(self, version: int, alarm: Alarm) -> PolicyView:
         """Report a drift for a version of the policy, so that its promise is no longer trusted. Returns the policy."""

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from surrogym_shared.terminal import Update
     from surrogym_shared.wire import PolicyDetail, PolicyView, SurrogateView
     from surrogym_trainer.evaluation.comparing import StepOfEpisode
+    from surrogym_trainer.watching.units import OtherUnits
     from surrogym_trainer.watching.watcher import Alarm, Watcher
 
 SHOWN = 8  # at most this number of unusable rows is printed
@@ -58,8 +59,9 @@ def command(
 
     The steps come from a log, or from the machine, which posts them to the server. Each step is compared with the
     model's prediction. No model learns from it. If the machine has changed, the command says which output differs, by
-    how much and where, and ends with exit status 1. The policy's promised return is not trusted from then on. The model
-    should fit the machine at first: surrogym audit tests that.
+    how much and where, and ends with exit status 1. The policy's promised return is not trusted from then on. If the
+    first steps come in other units, it says so, and ends with exit status 2. The model should fit the machine at first:
+    surrogym audit tests that.
 
     Example: surrogym watch pendulum log.csv --policy production --follow
 
@@ -85,11 +87,7 @@ def command(
             on_interrupt(lambda: f"interrupted; no drift in {watcher.compared} real steps"),
             progress("watch", quiet=output.quiet) as update,
         ):
-            for _ in _readings(api, view, seen, log, since, mapping, follow=follow):
-                if (alarm := _watched(watcher, seen.steps, update, len(seen.rejected))) is not None:
-                    break
-            else:
-                alarm = None
+            alarm, units = _found(watcher, seen, _readings(api, view, seen, log, since, mapping, follow=follow), update)
         if not watcher.compared + watcher.left_out:
             raise CommandError(_words_of_none(view, log, since))
         stored = None if alarm is None else _withdrawn(watcher, version, alarm, seen.place)
@@ -103,12 +101,14 @@ def command(
         "evidence": watcher.evidence,
         "rejected": [{"line": line, "reason": reason} for line, reason in seen.rejected.items()],
         "notes": list(seen.notes),
+        "other_units": None if units is None else units.words(),
         "drift": None if alarm is None else {**asdict(alarm), "region": alarm.region and alarm.region._asdict()},
         "trusted": None if stored is None else stored.trusted,
     }
-    output.give(result, lambda: "\n".join([*_words(seen, watcher, alarm), *_words_of_trust(stored, named, moved)]))
-    if alarm is not None:
-        raise typer.Exit(1)
+    trust = _words_of_trust(stored, named, moved)
+    output.give(result, lambda: "\n".join([*_words(seen, watcher, alarm, units), *trust]))
+    if alarm is not None or units is not None:
+        raise typer.Exit(1 if units is None else 2)
 
 
 def _require_own(api: Api, surrogate: str, which: str, origin: str | None) -> None:
@@ -221,6 +221,20 @@ class _Seen:
         self.notes = (*read.notes, *([ends] if read.steps.ends else []))
 
 
+def _found(
+    watcher: Watcher, seen: _Seen, readings: Iterator[None], update: Update
+) -> tuple[Alarm | None, OtherUnits | None]:
+    """Compare the steps of all readings with the model up to a drift. Return the alarm, or the other units in which the
+    steps seem to come; both None without a drift."""
+    alarm = None
+    for _ in readings:
+        if (alarm := _watched(watcher, seen.steps, update, len(seen.rejected))) is not None:
+            units, certain = watcher.other_units()
+            if units is None or certain:
+                return (alarm, None) if units is None else (None, units)
+    return alarm, None
+
+
 def _watched(watcher: Watcher, steps: list[StepOfEpisode], update: Update, rejected: int) -> Alarm | None:
     """Compare steps with the model. Return the alarm at the first drift; None if there is none in these steps."""
     from surrogym_trainer.watching.watcher import BATCH
@@ -258,7 +272,7 @@ def _words_of_trust(stored: PolicyView | None, named: str, moved: str | None) ->
     return [f"{named} {trust}; next: surrogym policy show {named}", *([moved] if moved else [])]
 
 
-def _words(seen: _Seen, watcher: Watcher, alarm: Alarm | None) -> list[str]:
+def _words(seen: _Seen, watcher: Watcher, alarm: Alarm | None, units: OtherUnits | None) -> list[str]:
     from surrogym_shared.words import counted
 
     lines = [*seen.notes]
@@ -267,6 +281,8 @@ def _words(seen: _Seen, watcher: Watcher, alarm: Alarm | None) -> list[str]:
         lines += [f"  line {line}: {reason}" for line, reason in list(seen.rejected.items())[:SHOWN]]
     if watcher.left_out:
         lines.append(f"{counted(watcher.left_out, 'step')} left out, in which a constant changed or a lag is not known")
+    if units is not None:
+        return [*lines, f"{units.words()}; convert the steps: the policy's trust is unchanged"]
     if alarm is None:
         return [*lines, f"no drift in {counted(watcher.compared, 'real step')}"]
     found = f"drift, found in {seen.place} {alarm.line} after {counted(alarm.compared, 'real step')}: {alarm.words()}"
