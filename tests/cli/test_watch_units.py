@@ -49,10 +49,9 @@ def swing(server_process: ServerProcess, tmp_path_factory: pytest.TempPathFactor
 @pytest.fixture
 def post(swing: str, server_process: ServerProcess) -> Iterator[Callable[[Plant, Change, int], None]]:
     """Posts steps of a pendulum whose values are changed. Real episodes make the next test begin after them."""
-    stream = uuid.uuid4().hex
 
     def send(plant: Plant, change: Change, batch: int) -> None:
-        rng, q, steps = np.random.default_rng(7), np.array([3.0, 0.0]), []
+        rng, q, steps, stream = np.random.default_rng(7), np.array([3.0, 0.0]), [], uuid.uuid4().hex
         for _ in range(60):
             u = rng.uniform(-1, 1, 1)
             moved = plant.step_from(q, u)
@@ -68,7 +67,8 @@ def post(swing: str, server_process: ServerProcess) -> Iterator[Callable[[Plant,
 
     yield send
     with Api(server_process.url) as api:
-        kept = wire.AddEvaluation(first_seed=1, returns=[-1.0] * 30, lengths=[9] * 30, idempotency_key=stream)
+        again = {"first_seed": 1, "returns": [-1.0] * 30, "lengths": [9] * 30, "idempotency_key": uuid.uuid4().hex}
+        kept = wire.AddEvaluation.model_validate(again)
         api.policies.evaluate(swing, 1, kept)
 
 
@@ -100,6 +100,18 @@ def test_steps_in_other_units_are_refused_and_the_policy_stays_trusted(
     assert named in as_json.json["other_units"]
     with Api(server_process.url) as api:
         assert api.policies.get(swing, 1).trusted is True
+
+
+def test_a_later_stream_in_the_right_units_is_watched(
+    on_server: Watch, swing: str, post: Callable[[Plant, Change, int], None], tmp_path: Path
+):
+    """The program that posted degrees was mended, and began another stream."""
+    post(Swing(), lambda row: row * [DEGREES, 1, 1, 1], 60)
+    post(Swing(), lambda row: row, 60)
+    said = on_server("watch", swing, "--policy", "1")
+    assert said.code == 0, said.out + said.err
+    assert "is left out: angle seems to come in other units: seen = 57.3 times expected" in said.out
+    assert "no drift in 60 real steps" in said.out
 
 
 def test_a_machine_that_changed_before_the_first_step_is_a_drift(

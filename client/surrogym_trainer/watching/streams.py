@@ -13,22 +13,22 @@ from surrogym_trainer.evaluation.comparing import StepOfEpisode
 LOOK_SECONDS = 1.0  # seconds between two requests for new steps
 
 
-def posted(api: Api, surrogate: str, since: float, *, follow: bool) -> Iterator[list[StepOfEpisode]]:
+def posted(api: Api, surrogate: str, since: float, *, follow: bool) -> Iterator[list[StreamedStep]]:
     """Yield the steps that a machine has posted after the time ``since`` (s since 1970 by the server's clock), in the
-    order in which they came, and with ``follow`` the later ones too, without end. The field ``number`` of each step is
-    its number in its stream. Raises ``SurrogymClientError``."""
+    order in which they came, and with ``follow`` the later ones too, without end. Raises ``SurrogymClientError``."""
     calls, last = StepCalls(api.connection), 0
     while True:
         if steps := calls.after(surrogate, last, since):
             last = steps[-1].id
-            yield [_step(one) for one in steps]
+            yield steps
         elif follow:
             time.sleep(LOOK_SECONDS)
         else:
             return
 
 
-def _step(one: StreamedStep) -> StepOfEpisode:
+def step_of(one: StreamedStep) -> StepOfEpisode:
+    """Return a posted step, whose field ``number`` is its number in its stream."""
     return StepOfEpisode(
         episode=0,
         number=one.number,

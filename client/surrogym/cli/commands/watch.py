@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from dataclasses import asdict
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,7 +15,7 @@ from surrogym.cli.groups import Output, Service
 from surrogym.cli.options import names_of_surrogates
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
 
     from surrogym_client.transport import Api
     from surrogym_shared.logs.checking import ReadLog
@@ -69,6 +70,7 @@ def command(
     """
     from surrogym.cli.errors import CommandError
     from surrogym_shared.terminal import on_interrupt, progress, say
+    from surrogym_trainer.watching.units import OtherUnits
     from surrogym_trainer.watching.watcher import Watcher
 
     name, _, which = policy.rpartition("@")
@@ -80,14 +82,21 @@ def command(
         version, since = watched.version, 0.0 if log else _since(watched)
         if view.fidelity is None:
             raise CommandError(f"{surrogate!r} has no model yet to compare the steps with: let a sampler run first")
-        watcher, seen = Watcher(api, view, false_alarm_steps), _Seen()
+        watcher, seen, other = Watcher(api, view, false_alarm_steps), _Seen(), dict[str, OtherUnits]()
         if since:
             say(f"compares the steps that were posted{_later(since)}", quiet=output.quiet)
         with (
             on_interrupt(lambda: f"interrupted; no drift in {watcher.compared} real steps"),
             progress("watch", quiet=output.quiet) as update,
         ):
-            alarm, units = _found(watcher, seen, _readings(api, view, seen, log, since, mapping, follow=follow), update)
+            posts = partial(_posts, api, surrogate, since, other, follow=follow)
+            read = posts if log is None else partial(_read, log, mapping, view.spec, follow=follow)
+            while True:
+                alarm, units = _found(watcher, seen, read(seen), update)
+                if units is None or len(seen.streams) < 2:
+                    break
+                other[seen.streams[0]] = units  # a later stream may be right
+                watcher, seen = Watcher(api, view, false_alarm_steps), _Seen()
         if not watcher.compared + watcher.left_out:
             raise CommandError(_words_of_none(view, log, since))
         stored = None if alarm is None else _withdrawn(watcher, version, alarm, seen.place)
@@ -147,19 +156,25 @@ def _since(policy: PolicyDetail) -> float:
     return max([0.0, policy.drifted_at or 0.0, *confirmed, *audited])
 
 
-def _readings(
-    api: Api, view: SurrogateView, seen: _Seen, log: Path | None, since: float, mapping: Path | None, *, follow: bool
+def _posts(
+    api: Api, surrogate: str, since: float, other: Mapping[str, OtherUnits], seen: _Seen, *, follow: bool
 ) -> Iterator[None]:
-    """Read real steps from a log, or those that the machine posts after the time ``since``, into ``seen``. Yields after
-    each reading."""
-    from surrogym_trainer.watching.streams import posted
+    """Read the steps that the machine posts after the time ``since`` into ``seen``, without those of the streams
+    ``other``. Yields after each reading."""
+    from surrogym_trainer.watching.streams import posted, step_of
 
-    if log is None:
-        for steps in posted(api, view.name, since, follow=follow):
-            seen.steps, seen.place = steps, "step"
-            yield
-        return
-    for read in _logs(log, mapping, view.spec, follow=follow):
+    seen.place = "step"
+    seen.notes = tuple(f"stream {stream!r} is left out: {units.words()}" for stream, units in other.items())
+    for steps in posted(api, surrogate, since, follow=follow):
+        seen.streams += [one.stream for one in steps if one.stream not in other]
+        seen.streams = [*dict.fromkeys(seen.streams)]
+        seen.steps = [step_of(one) for one in steps if one.stream not in other]
+        yield
+
+
+def _read(log: Path, mapping: Path | None, spec: EnvironmentSpec, seen: _Seen, *, follow: bool) -> Iterator[None]:
+    """Read a log into ``seen``. Yields after each reading."""
+    for read in _logs(log, mapping, spec, follow=follow):
         seen.add(read)
         yield
 
@@ -200,6 +215,7 @@ class _Seen:
         self.steps: list[StepOfEpisode] = []  # usable steps that the last reading of the log added
         self.rejected: dict[int, str] = {}  # for each unusable row so far, the reason, by the row's line number
         self.notes: tuple[str, ...] = ()
+        self.streams: list[str] = []  # streams of the posted steps, in the order of their first steps
         self.place = "line"  # what the number of a step counts
         self._line = 0
 
