@@ -13,14 +13,19 @@ log-likelihood ratio of each step, which gives an alarm at the logarithm of 10,0
 show a change at once: their noise is taken to be the smallest that the watcher's detector knows, a tenth of the
 tolerance.
 
+With ``--units`` instead, healthy steps are converted to other units from the first step on, and the plants have changed
+before it: how often the watcher names the unit, and how often it takes a change for one.
+
 Run it by::
 
     python lab/benchmarks/watch_drift.py --first-seed 460 --seeds 3 --oracle
+    python lab/benchmarks/watch_drift.py --first-seed 460 --seeds 3 --units
 """
 
 from __future__ import annotations
 
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -47,6 +52,7 @@ from surrogym_shared.spec import Design
 from surrogym_shared.wire import SurrogateView
 from surrogym_trainer.evaluation.comparing import StepOfEpisode
 from surrogym_trainer.watching.detector import NEGLIGIBLE
+from surrogym_trainer.watching.units import DEGREES, converted
 from surrogym_trainer.watching.watcher import BATCH, Alarm, Watcher
 
 HEALTHY = 7_000  # steps of the unchanged plant, for each plant and seed
@@ -72,6 +78,7 @@ CHANGES: Mapping[str, Change] = {
     "slow fouling": lambda machine, since: {"pump": machine.real["pump"] * 0.999**since},
     "worn actuator": lambda machine, _: {"pump": 0.8 * machine.real["pump"]},
 }
+DEAD: Mapping[str, Change] = {"dead actuator": lambda *_: {"pump": 0.0}, "a tenth": lambda *_: {"pump": 0.1}}
 NEEDS = {"mass +30 %": "mass", "friction x 2": "friction"}  # parameter that a plant has or not
 
 
@@ -294,6 +301,33 @@ def false_alarms(case: Case, seed: int, count: int) -> list[str]:
     return found
 
 
+def units_of(case: Case, seed: int) -> Counter[str]:
+    """Counts of converted steps and of plants that had changed before the first step: how many give an alarm, and in
+    how many of these the watcher names the right unit, another one, or a unit in place of a change."""
+    machine, found = case.machine, Counter[str]()
+    width = len(machine.ranges) + machine.actions + 1
+    healthy = stream_of(case, None, 0, AFTER, seed).steps
+    factors = (10.0, DEGREES, 1_000.0, 0.001)
+    tried: list[tuple[tuple[int, ...], float]] = [((i,), one) for i in range(len(machine.ranges)) for one in factors]
+    tried += [((width - 1,), factor) for factor in (1_000.0, -1.0, 0.01)] + [((width - 2,), 0.01)]
+    tried += [((0, 1), DEGREES)] if machine.angles else []
+    for places, factor in tried:
+        scale = np.ones(width)
+        scale[list(places)] = factor
+        watcher = case.watcher()
+        if first_alarm(watcher, converted(healthy, scale, np.zeros(width))) is not None:
+            units, names = watcher.other_units()[0], [*machine.ranges, "action 0", "reward"]
+            right = units is not None and units.names == tuple(names[place] for place in places)
+            right = right and units is not None and bool(np.isclose(units.factor, factor, rtol=0.01))
+            found.update(["converted", "right unit" if right else "no unit" if units is None else "another unit"])
+    for number, (name, change) in enumerate({**CHANGES, **DEAD}.items()):
+        if NEEDS.get(name, "pump") in machine.real:
+            watcher = case.watcher()
+            if first_alarm(watcher, stream_of(case, change, 0, AFTER, seed + 1_000 * (number + 1)).steps) is not None:
+                found.update(["changed", *(["changed, but a unit"] if watcher.other_units()[0] else [])])
+    return found
+
+
 def table(rows: Sequence[Row], *, oracle: bool) -> str:
     head = [
         *("plant", "change", "runs", f"found within {AIM}", "steps: median, most", "of these show it"),
@@ -332,7 +366,14 @@ def main() -> None:
     made.add_argument("--first-seed", type=int, default=400)
     made.add_argument("--seeds", type=int, default=3)
     made.add_argument("--oracle", action="store_true", help="show what a detector finds that knows both plants")
+    made.add_argument("--units", action="store_true", help="show how steps in other units are told from a change")
     options = started(made)
+    if options.units:
+        seeds = range(options.first_seed, options.first_seed + (1 if options.quick else options.seeds))
+        counts = {f"{m.name} {seed}": units_of(fitted(m, seed), seed) for m in PLANTS for seed in seeds}
+        print(dict(sum(counts.values(), Counter())))
+        write(options.out, "watch-units", counts)
+        return
     rows: list[Row] = []
     wrong: dict[str, list[str]] = {}
     steps = 500 if options.quick else HEALTHY

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from support.levitation import PENDULUM, Swing
+from support.rated import RATED, RatedRail
 from support.saying import Said
 from support.server import ServerProcess
 from surrogym.cli.commands.policy import stored_card
@@ -213,6 +214,34 @@ def test_a_renewal_that_was_killed_during_its_episodes_continues_with_them(
         assert api.surrogate("swing-2").ledger == ledger
         assert len(api.policies.list(trained)) == 2
     assert led_to(server_process, trained) == (unconfirmed if agree else 1)
+
+
+def test_a_surrogate_with_lags_is_renewed(
+    on_server: Renew,
+    server_process: ServerProcess,
+    handed_over: Callable[..., None],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    name: str,
+):
+    """The documentation denied it, but only a simulator can't be the prior: it can't be set to a past."""
+    handed_over(trusted=True)
+    agreed = Handover(None, None, True, "so it was said")
+    monkeypatch.setattr("surrogym.cli.commands.audit.by_episodes", lambda *_, **__: agreed)
+    spec = RATED.model_copy(update={"design": Design(initial=12, budget=12)})
+    with Api(server_process.url) as api, HttpSurrogate(server_process.url, name) as port:
+        api.create_surrogate(name, spec)
+        Sampler(api, name, RatedRail(), SamplerSettings(until_done=True, wait_seconds=1.0)).run()
+        wait_for_design(api, name, 120)
+        train(port, tmp_path / "old.zip", TrainSettings(algorithm="FASTPPO", total_steps=4_096, prolong=False))
+        push(api, tmp_path / "old.zip", name)
+        api.policies.put_alias(name, "production", 1)
+        options = ("--policy", "production", "--env", "support.rated:RatedRail", "--json")
+        said = on_server("renew", name, *options, "--out", str(tmp_path / "new.zip"))
+        for one in (name, f"{name}-2"):
+            api.delete_surrogate(one)
+    assert said.code == 0, said.err
+    assert (said.json["prior"], said.json["renewed"]) == (name, True)
 
 
 @pytest.mark.parametrize(
