@@ -2,11 +2,15 @@
 
     python lab/benchmarks/bench_offsets.py --plants tanks reactor --seeds 345 346
     python lab/benchmarks/bench_offsets.py --plants tanks --seeds 347 348 --set-points
+    python lab/benchmarks/bench_offsets.py --plants rotary --seeds 346
 
 The plants are two tanks, whose lower level is to be 10 cm, and a reactor whose concentration is to be 0.42 mol/l. Each
 seed has one model, learned from any state, and ten episodes in the plant as it was learned, in one whose actuator is
 20 % weaker, and in one that adds 5 % of the action's range to each action. The steady error of an episode is the mean
 distance from the set point over its last 40 steps. The plants have no noise in these episodes.
+
+The rotary pendulum of ``audit_resets.py``, whose arm is to rest at 0 rad, is learned from resets. It has six coordinates
+with its lags, too many for a planner, so it has a trained policy alone.
 
 With ``--set-points`` the specification declares the reward, and the plants stay as they were learned. For each of two
 other set points a planner on the model gets it at run time, and a policy is trained in the same model with a
@@ -21,20 +25,25 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 
 import numpy as np
 import torch
+from audit_resets import WHOLE, Rotary, learn
 from bench_kept_limits import REACTOR
 
 import surrogym
 from support.changing import Array, Changing, Machine, Parameters
 from support.levitation import TANKS
+from surrogym_sampler.original.episodes import RolloutEpisode
+from surrogym_sampler.original.rollouts import FromReset
 from surrogym_server.local import LocalSurrogate
 from surrogym_server.planning import planner_of
 from surrogym_shared.set_points import with_set_points
 from surrogym_shared.spec import DeclaredReward, EnvironmentSpec, Quantity, RewardTerm, Term
+from surrogym_trainer.evaluation.evaluator import EvaluationSettings, evaluate
 from surrogym_trainer.policies import load_policy
 from surrogym_trainer.policies.predict import Predict
 from surrogym_trainer.training import TrainSettings, train
@@ -128,10 +137,32 @@ def at_set_points(name: str, seed: int) -> None:
             print(f"| {name} | {seed} | {target:g} | {policy} | {error:.2g} | {total:.3g} |", flush=True)
 
 
+class WeakerRotary(Rotary):
+    TORQUE = 0.8 * Rotary.TORQUE
+
+
+class OffsetRotary(Rotary):
+    def step(self, action: Any) -> tuple[Array, float, bool, bool, dict[str, Any]]:
+        return super().step(np.asarray(action) + 0.1)
+
+
+def of_rotary(seed: int) -> None:
+    """Print the rows of a policy that is trained in a model of the rotary pendulum."""
+    with TemporaryDirectory() as folder:
+        learn("rotary", seed, Path(folder))
+        acts = load_policy(Path(folder) / f"{WHOLE}.zip", SEARCH)
+    for change, kind in zip(CHANGES, (Rotary, WeakerRotary, OffsetRotary), strict=True):
+        settings = EvaluationSettings(EPISODES, first_seed=1_000 * seed, parallel=EPISODES)
+        found = evaluate(acts, lambda kind=kind: RolloutEpisode(FromReset(kind())), settings)  # type: ignore[misc]
+        error = np.mean([abs(trace.coordinates[-LAST:, 0].mean()) for trace in found.traces])
+        returned = found.returns.mean()
+        print(f"| rotary | {seed} | trained | {change} | {error:.2g} | {returned:.3g} |", flush=True)
+
+
 def main() -> None:
     torch.set_num_threads(1)
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    options.add_argument("--plants", nargs="+", choices=list(PLANTS), default=list(PLANTS))
+    options.add_argument("--plants", nargs="+", choices=[*PLANTS, "rotary"], default=list(PLANTS))
     options.add_argument("--seeds", nargs="+", type=int, default=[345, 346])
     options.add_argument("--no-training", action="store_true", help="planners alone")
     options.add_argument("--set-points", action="store_true", help="other set points, in the plant as learned")
@@ -145,6 +176,9 @@ def main() -> None:
     print("| plant | seed | policy | change | steady error | return |\n|---|---|---|---|---|---|", flush=True)
     for name in given.plants:
         for seed in given.seeds:
+            if name == "rotary":
+                of_rotary(seed)
+                continue
             model = learned(PLANTS[name], seed, PLANTS[name].machine.spec)
             policies: dict[str, Predict] = {"planner": planner_of(model.model, HORIZON)}
             if not given.no_training:
