@@ -9,8 +9,8 @@ seed has one model, learned from any state, and ten episodes in the plant as it 
 20 % weaker, and in one that adds 5 % of the action's range to each action. The steady error of an episode is the mean
 distance from the set point over its last 40 steps. The plants have no noise in these episodes.
 
-The rotary pendulum of ``audit_resets.py``, whose arm is to rest at 0 rad, is learned from resets. It has six coordinates
-with its lags, too many for a planner, so it has a trained policy alone.
+The rotary pendulum of ``audit_resets.py``, whose arm is to rest at 0 rad, is learned from resets. With its lags it has
+five coordinates, too many for a planner, so it has a trained policy alone.
 
 With ``--set-points`` the specification declares the reward, and the plants stay as they were learned. For each of two
 other set points a planner on the model gets it at run time, and a policy is trained in the same model with a

@@ -13,7 +13,17 @@ from typing import Protocol
 import numpy as np
 
 from surrogym_shared.checks import require
-from surrogym_shared.spec import Coordinate, DeclaredReward, EnvironmentSpec, Inequality, Part, Quantity, Reward, limits
+from surrogym_shared.spec import (
+    Coordinate,
+    DeclaredReward,
+    EnvironmentSpec,
+    Inequality,
+    Part,
+    Quantity,
+    Reward,
+    Term,
+    limits,
+)
 from surrogym_shared.terms import holds
 
 SAME = 1e-9  # set points that differ by at most this share of the coordinate's sampling range are equal
@@ -135,9 +145,16 @@ def _error(quantity: Quantity) -> tuple[str, float, float] | None:
     """Return the coordinate's name, the slope and the constant of a quantity slope * coordinate + constant that can be
     0 within the limits of its term; None for other quantities."""
     term = quantity.term
-    if term is None or any(quantity.action) or any(part.function not in ("one", "linear") for part in term.parts):
+    if term is None or any(quantity.action):
         return None
-    if (term.low is not None and term.low >= 0) or (term.high is not None and term.high <= 0):
+    one_sided = (term.low is not None and term.low >= 0) or (term.high is not None and term.high <= 0)
+    return None if one_sided else line_of(term)
+
+
+def line_of(term: Term) -> tuple[str, float, float] | None:
+    """Return the coordinate's name, the slope and the constant of a term slope * coordinate + constant; None for other
+    terms. Limits of the term are ignored."""
+    if any(part.function not in ("one", "linear") for part in term.parts):
         return None
     slopes: dict[str, float] = {}
     for part in term.parts:

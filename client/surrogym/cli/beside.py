@@ -70,7 +70,7 @@ class Beside:
         """
         from surrogym_sampler.original.fitting import check_policy
 
-        found: dict[Controller, Callable[[], Acting]] = {"policy": lambda: reading.load(policy, card)}
+        found: dict[Controller, Callable[[], Acting]] = {"policy": lambda: reading.acting(policy, card)}
         compare = self.compare
         if compare is not None:
             found[compare] = lambda: _baseline(opener, compare)
@@ -115,7 +115,7 @@ def reference_of(given: str, reading: PolicyReading) -> Acting:
     from surrogym_trainer.policies.card import read_card
 
     if Path(given).exists():
-        return reading.load(Path(given), read_card(Path(given)))
+        return reading.acting(Path(given), read_card(Path(given)))
     if ":" not in given:
         raise CommandError(f"--reference: expected a policy file that exists, or package.module:name, got {given!r}")
     return load_reference(given)

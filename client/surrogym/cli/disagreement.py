@@ -180,11 +180,13 @@ class Imagining:
         output a constant and a factor for each of P inputs."""
         from surrogym_client.transport import HttpSurrogate
         from surrogym_trainer.evaluation.comparing import EFFECT_STARTS, changes_of
+        from surrogym_trainer.policies.integrals import with_integrals
         from surrogym_trainer.training.cards import session_of
 
         assert view.model_version is not None
         session = session_of(self.card, view)
-        with HttpSurrogate(api.url, view.name, self.token) as port:
+        with HttpSurrogate(api.url, view.name, self.token) as http:
+            port = with_integrals(http, self.card.integral, self.card.set_points)
             return changes_of(
                 port, self.load(), self.seed, session, view.model_version, shifted, weights, EFFECT_STARTS
             )

@@ -18,7 +18,7 @@ from surrogym.cli.options import AsJson, Quiet, Server, Token, TokenFile, TrustP
 if TYPE_CHECKING:
     from surrogym_client.transport import Api
     from surrogym_trainer.policies.card import PolicyCard
-    from surrogym_trainer.policies.predict import Predict
+    from surrogym_trainer.policies.predict import Acting, Predict
 
 
 @dataclass(frozen=True)
@@ -69,6 +69,12 @@ class PolicyReading:
         from surrogym_trainer.policies.files import load_policy
 
         return load_policy(policy, self.algorithm or card.algorithm, trust=self.trust_policy)
+
+    def acting(self, policy: Path, card: PolicyCard) -> Acting:
+        """Load the policy as a controller of the original environment. Raises the errors of ``load_policy``."""
+        from surrogym_trainer.policies.integrals import acting_with_integrals
+
+        return acting_with_integrals(self.load(policy, card), card.spec, card.integral, card.set_points)
 
 
 def add(app: typer.Typer, name: str, command: Callable[..., None]) -> None:

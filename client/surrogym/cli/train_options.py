@@ -53,6 +53,14 @@ class SearchOptions:
         typer.Option("--set", help="Hyperparameter of the algorithm, as NAME=VALUE. May be given several times."),
     ] = None
     seed: Annotated[int, typer.Option(min=0, help="Seed of the policy and of the virtual environment.")] = 0
+    integral: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Coordinate whose error from the set point of the declared reward the policy also sees, summed over "
+            "the episode. So it holds the set point with a weaker pump or an offset. May be given several times. Not "
+            "with planner."
+        ),
+    ] = None
 
     def hyperparameters(self) -> dict[str, Any]:
         """Return the hyperparameters of ``--set`` by name. Values are parsed as JSON, or are text if that fails."""

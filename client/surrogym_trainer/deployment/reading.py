@@ -73,6 +73,11 @@ def controller_of(
     if policy.suffix.lower() == ONNX:
         raise NotDeployable(f"{policy} is an export without its network: expected the policy's zip file; {CAN}")
     card = read_card(policy)
+    if card.integral:
+        raise NotDeployable(
+            f"{policy} sees the integral of the error of {', '.join(card.integral)}, which a controller does not "
+            "compute yet: train it without --integral"
+        )
     meant = spec or card.spec
     if meant is None:
         raise NotDeployable(

@@ -71,6 +71,11 @@ class PolicyCard(BaseModel):
         """Set points that replace those of the specification's reward, by coordinate; empty if there are none."""
         return set_points_in(self.settings)
 
+    @property
+    def integral(self) -> tuple[str, ...]:
+        """Coordinates whose errors the policy also sees, summed over the episode; empty if there are none."""
+        return tuple(self.settings.get("integral") or ())
+
 
 def set_points_in(settings: Mapping[str, Any]) -> dict[str, float]:
     """Return the set points, by coordinate, in the settings of a training, as a card and the server have them."""

@@ -13,6 +13,7 @@ from surrogym_shared.wire import SurrogateView
 from surrogym_trainer.evaluation.audit import AUDIT_STEPS, UNSURE, disappointed, wider
 from surrogym_trainer.policies.evidence import Audit
 from surrogym_trainer.policies.files import load_policy
+from surrogym_trainer.policies.integrals import with_integrals
 from surrogym_trainer.training.closed_loop import Candidates, ClosedLoop, LoopSettings, visit
 from surrogym_trainer.training.handover import MOST_AUDITS, AuditSettings, Handover, Subject, hand_over
 from surrogym_trainer.training.search import search_for, with_algorithm
@@ -66,6 +67,9 @@ class AuditedTraining:
     candidates: Candidates = field(default_factory=Candidates, init=False)
     # Number of rounds (train a policy, then query where it goes) that took no real step.
     _unspent: int = field(default=0, init=False)
+
+    def __post_init__(self) -> None:
+        self.port = with_integrals(self.port, self.settings.integral, self.settings.set_points)
 
     def train(self) -> tuple[TrainResult, Handover]:
         """Train and audit, and train further if the audit fails or lowers the promise clearly.

@@ -24,6 +24,11 @@ class Planner(PolicySearch):
 
     def search(self, task: SearchTask) -> Found:
         settings = task.settings
+        if settings.integral:
+            raise ValueError(
+                "algorithm PLANNER: expected no integral, because a planner corrects lasting disturbances itself, got "
+                f"{', '.join(settings.integral)}"
+            )
         planner = PlannerFile(_file_of(task.port).to_bytes(), self.horizon, settings.seed, settings.set_points)
         task.progress(TrainProgress(0, 0, None, 0.0, stage="computes values on a grid"))
         try:

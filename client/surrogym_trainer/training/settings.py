@@ -61,6 +61,8 @@ class TrainSettings:
     # session fields of the episodes that compare policies; None takes those of the training
     judge: dict[str, Any] | None = None
     hyperparameters: dict[str, Any] = field(default_factory=dict)
+    # coordinates whose errors from their set points the policy also sees, summed over the episode (see ``Integrals``)
+    integral: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if type(self.threads) is not int or not 1 <= self.threads <= MOST_THREADS:

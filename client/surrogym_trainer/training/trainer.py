@@ -10,6 +10,7 @@ from pathlib import Path
 from surrogym_shared.port import SurrogatePort
 from surrogym_shared.set_points import with_set_points
 from surrogym_trainer.policies.card import card_path, require_place
+from surrogym_trainer.policies.integrals import with_integrals
 from surrogym_trainer.training.search import (
     Found,
     Progress,
@@ -39,7 +40,7 @@ def train(
 
     Raises:
         ValueError: the algorithm is unknown or does not support the action space, there are too many steps, or the
-            reward or the model does not support a set point.
+            reward or the model does not support a set point or an integral.
         SurrogymClientError: the surrogate can't be reached, or has no model yet.
         UnusablePolicy: the file to start from is not a policy of the algorithm, or the card would replace another kind
             of file.
@@ -48,6 +49,7 @@ def train(
     require_place(out)
     settings = with_algorithm(settings or TrainSettings(), port.spec())
     with_set_points(port.spec(), settings.set_points)  # raises an error if the reward does not have them
+    port = with_integrals(port, settings.integral, settings.set_points)
     search = search_for(settings)
     if search.tracked:
         settings = with_folder(settings, out)

@@ -27,6 +27,7 @@ from surrogym_trainer.evaluation.reporting import as_reported, paired_start, wor
 from surrogym_trainer.evaluation.videos import record
 from surrogym_trainer.policies.card import set_points_in, write_card
 from surrogym_trainer.policies.files import load_policy
+from surrogym_trainer.policies.integrals import acting_with_integrals
 from surrogym_trainer.policies.predict import Acting, Predict
 from surrogym_trainer.training.audited import AuditedTraining
 from surrogym_trainer.training.cards import card_of
@@ -160,8 +161,10 @@ def run_episodes(
     found = api.policies.get(surrogate, task.policy)
     gathered.version = found.version
     settings = EvaluationSettings(task.episodes, task.first_seed, task.wide)
-    controllers = _controllers(task, environment, _loaded(api, surrogate, found, folder))
     trained_for = api.surrogate(surrogate).spec
+    points, integral = set_points_in(found.settings), tuple(found.settings.get("integral") or ())
+    policy = acting_with_integrals(_loaded(api, surrogate, found, folder), trained_for, integral, points)
+    controllers = _controllers(task, environment, policy)
     results: dict[wire.Controller, Evaluation] = {}
     for done, (controller, predict) in enumerate(controllers.items()):
 
@@ -169,7 +172,7 @@ def run_episodes(
             reporter.at("evaluating", (done + share) / len(controllers))
 
         result = _counted(predict, environment, settings, controller, tell, gathered, trained_for)
-        results[controller] = for_set_points(result, trained_for, set_points_in(found.settings))
+        results[controller] = for_set_points(result, trained_for, points)
     paired = paired_start(results["policy"], settings.episodes)
     gathered.evaluations = [
         as_reported(
@@ -188,7 +191,7 @@ def run_episodes(
         gathered.video, gathered.lacks = _filmed(environment, results["policy"], settings, path)
 
 
-def _controllers(task: wire.EvaluateTask, environment: Environment, policy: Predict) -> dict[wire.Controller, Acting]:
+def _controllers(task: wire.EvaluateTask, environment: Environment, policy: Acting) -> dict[wire.Controller, Acting]:
     """Return the controllers to run, by kind, the policy first."""
     controllers: dict[wire.Controller, Acting] = {"policy": policy}
     if task.compare is not None:

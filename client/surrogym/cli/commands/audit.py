@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from surrogym_shared.wire import SurrogateView
     from surrogym_trainer.evaluation.evaluator import EvaluationSettings
     from surrogym_trainer.policies.card import PolicyCard
-    from surrogym_trainer.policies.predict import Predict
+    from surrogym_trainer.policies.predict import Acting, Predict
     from surrogym_trainer.training.handover import Handover, Subject
 
 
@@ -75,6 +75,7 @@ def command(
     from surrogym_shared.terminal import progress
     from surrogym_trainer.evaluation.evaluator import EvaluationSettings
     from surrogym_trainer.policies.card import read_card, write_card
+    from surrogym_trainer.policies.integrals import with_integrals
     from surrogym_trainer.training.cards import session_of
     from surrogym_trainer.training.handover import AuditSettings, Subject, hand_over
     from surrogym_trainer.training.words import words_of_handover
@@ -86,13 +87,14 @@ def command(
     predict, asked = reading.load(policy, card), AuditSettings(steps=steps, seed=seed)
     with (
         service.connect(context) as api,
-        HttpSurrogate(api.url, name, service.token_for(context)) as port,
+        HttpSurrogate(api.url, name, service.token_for(context)) as http,
         progress("audit", quiet=output.quiet) as update,
     ):
         view = api.surrogate(name)
-        _require_fit(predict, view.spec, f"{policy} does not fit {name!r}")
         if card.surrogate not in (None, name):
             card = _of_another(card)
+        port = with_integrals(http, card.integral, card.set_points)
+        _require_fit(predict, port.spec(), f"{policy} does not fit {name!r}")
         session = session_of(card, view)
         floor = _floor(port, seed, session) if card.untrained is None else card.untrained
         subject = Subject(api, name, port, predict, session, floor, seed)
@@ -132,9 +134,13 @@ def by_episodes(
     from surrogym_shared.terminal import say
     from surrogym_shared.words import counted
     from surrogym_trainer.evaluation.evaluator import EvaluationInterrupted, evaluate
+    from surrogym_trainer.policies.integrals import IntegralPort
     from surrogym_trainer.training.handover import judge_episodes
 
+    acting: Acting = subject.predict
     spec = subject.port.spec()
+    if isinstance(subject.port, IntegralPort):
+        acting, spec = subject.port.acting(subject.predict), subject.port.port.spec()
     if subject.api.surrogate(subject.name).fidelity is None:
         raise CommandError(f"{subject.name!r} has no model yet: wait until a sampler has answered its first queries")
     most = settings.episodes * (spec.time_limit or LONGEST_EPISODE)
@@ -142,7 +148,7 @@ def by_episodes(
     say(f"the audit takes {count} in {env}: at most {most} real steps", quiet=quiet)
     note, taken = f"audit, {count} from seed {settings.first_seed}", 0
     try:
-        result = evaluate(subject.predict, opener, settings, trained_for=spec)
+        result = evaluate(acting, opener, settings, trained_for=spec)
         taken = result.steps
     except (EvaluationFailed, EvaluationInterrupted) as error:
         taken = error.steps
@@ -183,9 +189,9 @@ def _require_fit(predict: Predict, spec: EnvironmentSpec, misfit: str) -> None:
 
 def _of_another(card: PolicyCard) -> PolicyCard:
     """Return a policy's card for an audit on another surrogate than the one of its training: without the fields that
-    hold only for the surrogate of its training, such as the imagined return. It keeps its set points."""
+    hold only for the surrogate of its training, such as the imagined return. It keeps its set points and integrals."""
     empty = {"server": None, "spec": None, "imagined_return": None, "untrained": None, "visited_confidence": ()}
-    kept = {"session": {"set_points": card.set_points}} if card.set_points else {}
+    kept = {"session": {"set_points": card.set_points}, "integral": card.integral}
     return card.model_copy(update={**empty, "settings": kept})
 
 

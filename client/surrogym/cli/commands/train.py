@@ -120,6 +120,7 @@ def _settings(search: SearchOptions, session: SessionOptions, start: StartOption
         tensorboard=log.tensorboard,
         hyperparameters=hyperparameters,
         session=given,
+        integral=tuple(search.integral or ()),
         **vars(start),
     )
 
@@ -180,7 +181,7 @@ def _trainable(
     import the packages of the policy search in the meantime.
 
     Raises:
-        CommandError: the surrogate has no model yet, or its reward does not have the set points of the settings.
+        CommandError: the surrogate has no model yet, or its reward lacks a set point or an integral of the settings.
     """
     from surrogym.cli.errors import CommandError
     from surrogym_client.surrogates.waiting import (
@@ -192,12 +193,15 @@ def _trainable(
     )
     from surrogym_shared.set_points import with_set_points
     from surrogym_shared.terminal import say
+    from surrogym_trainer.policies.integrals import Integrals
     from surrogym_trainer.training.search import SEARCHES, name_of
 
     with connect(server, token, wait, quiet=quiet) as api:
         view = awaited_surrogate(api, surrogate, wait, quiet=quiet)
         try:
             with_set_points(view.spec, settings.set_points)
+            if settings.integral:
+                Integrals.of(view.spec, settings.integral, settings.set_points)
         except ValueError as error:
             raise CommandError(str(error)) from error
         if wait > 0:
