@@ -220,7 +220,7 @@ def test_the_watch_command_finds_drift_in_steps_that_the_machine_posts(
     assert posted.json["drift"] == {**logged.json["drift"], "line": logged.json["drift"]["line"] - 2}
     assert policy()[1] == ledger
     assert again.code == 1
-    assert "drift of the policy, got none" in again.err
+    assert "UTC, when drift was reported, got none" in again.err
 
 
 def test_posted_steps_are_compared_from_the_latest_confirmation_of_the_promise_on(
@@ -240,7 +240,8 @@ def test_posted_steps_are_compared_from_the_latest_confirmation_of_the_promise_o
     said = on_server(*watch)
     assert said.code == 0, said.out
     assert f"no drift in {len(sound)} real steps" in said.out
-    assert "compares the steps that were posted after 20" in said.err
+    assert "compares the steps posted since 20" in said.err
+    assert "UTC, when real episodes kept the promise" in said.err
     assert policy()[0].trusted
 
 

@@ -79,12 +79,12 @@ def command(
     with service.connect(context) as api:
         view, watched = api.surrogate(surrogate), api.policies.get(surrogate, which)
         _require_own(api, surrogate, which, watched.origin)
-        version, since = watched.version, 0.0 if log else _since(watched)
+        version, (since, later) = watched.version, (0.0, "") if log else _since(watched)
         if view.fidelity is None:
             raise CommandError(f"{surrogate!r} has no model yet to compare the steps with: let a sampler run first")
         watcher, seen, other = Watcher(api, view, false_alarm_steps), _Seen(), dict[str, OtherUnits]()
-        if since:
-            say(f"compares the steps that were posted{_later(since)}", quiet=output.quiet)
+        if later:
+            say(f"compares the steps posted{later}", quiet=output.quiet)
         with (
             on_interrupt(lambda: f"interrupted; no drift in {watcher.compared} real steps"),
             progress("watch", quiet=output.quiet) as update,
@@ -98,7 +98,7 @@ def command(
                 other[seen.streams[0]] = units  # a later stream may be right
                 watcher, seen = Watcher(api, view, false_alarm_steps), _Seen()
         if not watcher.compared + watcher.left_out:
-            raise CommandError(_words_of_none(view, log, since))
+            raise CommandError(_words_of_none(view, log, later))
         stored = None if alarm is None else _withdrawn(watcher, version, alarm, seen.place)
         moved = None if alarm is None or which not in watched.aliases else _moved(api, surrogate, which, version)
     named = f"{surrogate}@{version}"
@@ -148,12 +148,18 @@ def _moved(api: Api, surrogate: str, alias: str, version: int) -> str | None:
     return f"{surrogate}@{alias} leads to version {now} by now, which was not watched: watch it by the same command"
 
 
-def _since(policy: PolicyDetail) -> float:
+def _since(policy: PolicyDetail) -> tuple[float, str]:
     """Return when an audit or real episodes last confirmed a policy's promise, or drift was reported, in seconds since
-    1970; 0 if none of them did. Earlier steps would give an old drift again."""
-    confirmed = [one.created_at for one in policy.evaluations if one.promise_kept]
-    audited = [policy.created_at] if policy.audit is not None and policy.audit.passed else []
-    return max([0.0, policy.drifted_at or 0.0, *confirmed, *audited])
+    1970, and in words; 0 and no words if none of them did. Earlier steps would give an old drift again."""
+    events = [(one.created_at, "real episodes kept the promise") for one in policy.evaluations if one.promise_kept]
+    if policy.audit is not None and policy.audit.passed:
+        events.append((policy.created_at, "an audit passed"))
+    if policy.drifted_at is not None:
+        events.append((policy.drifted_at, "drift was reported"))
+    if not events:
+        return 0.0, ""
+    at, what = max(events)
+    return at, f" since {datetime.fromtimestamp(at, UTC):%Y-%m-%d %H:%M:%S} UTC, when {what}"
 
 
 def _posts(
@@ -179,22 +185,14 @@ def _read(log: Path, mapping: Path | None, spec: EnvironmentSpec, seen: _Seen, *
         yield
 
 
-def _words_of_none(view: SurrogateView, log: Path | None, since: float) -> str:
+def _words_of_none(view: SurrogateView, log: Path | None, later: str) -> str:
     """Return the error message that there are no real steps."""
     if log is not None:
         return f"expected real steps in {log}, got none: give a log with two or more rows of an episode"
     return (
-        f"expected real steps that the machine has posted to {view.name!r}{_later(since)}, got none: post them to "
+        f"expected real steps that the machine has posted to {view.name!r}{later}, got none: post them to "
         f"/v1/surrogates/{view.name}/steps, or give a log"
     )
-
-
-def _later(since: float) -> str:
-    """Return words that only steps after a time (s since 1970) count; empty for 0."""
-    if not since:
-        return ""
-    at = datetime.fromtimestamp(since, UTC)
-    return f" after {at:%Y-%m-%d %H:%M:%S} UTC, the latest audit, confirming evaluation or drift of the policy"
 
 
 def _logs(log: Path, mapping: Path | None, spec: EnvironmentSpec, *, follow: bool) -> Iterator[ReadLog]:
