@@ -226,7 +226,8 @@ class _Renewal:
         return spec
 
     def train(self, out: Path, update: Update, check: Callable[[], object]) -> Handover:
-        """Wait for the design, train a policy from the network of the old one, audit it and store it.
+        """Wait for the design, train a policy from the network of the old one with its set points and integrals, audit
+        it and store it.
 
         Args:
             out: file for the policy.
@@ -238,6 +239,7 @@ class _Renewal:
         from surrogym_client.surrogates.waiting import share_of_design, wait_for_design, words_of_design
         from surrogym_client.transport import HttpSurrogate
         from surrogym_trainer.policies.card import write_card
+        from surrogym_trainer.policies.integrals import with_integrals
         from surrogym_trainer.policies.pushing import push
         from surrogym_trainer.training.audited import AuditedTraining
         from surrogym_trainer.training.cards import card_of
@@ -254,16 +256,20 @@ class _Renewal:
             update(None, words_of(asdict(now)))
 
         wait_for_design(self.api, self.target, PATIENCE_SECONDS, look)
-        with TemporaryDirectory() as folder, HttpSurrogate(self.api.url, self.target, self.token) as port:
+        integral = tuple(self.old.settings.get("integral") or ())
+        with TemporaryDirectory() as folder, HttpSurrogate(self.api.url, self.target, self.token) as http:
+            port = with_integrals(http, integral, self._aimed().get("set_points", {}))
             start = self._network(Path(folder) / "old.zip", port)
-            settings = TrainSettings(algorithm=self._algorithm(), start_from=start)
+            settings = TrainSettings(
+                algorithm=self._algorithm(), start_from=start, integral=integral, session=self._aimed()
+            )
             training = AuditedTraining(
                 self.api, self.target, port, out, settings, audit=AuditSettings(), progress=record, waiting=look
             )
             result, handover = training.train()
             begun = {"start_from": start and f"{self.surrogate}@{self.old.version}", "replaces": self.old.version}
             result = replace(result, settings={**result.settings, **begun})
-            spec = port.spec()
+            spec = http.spec()
         card = card_of(result, handover, surrogate=self.target, spec=spec, url=self.api.url, seed=0, curve=())
         write_card(out, card)
         self.made = push(self.api, out, self.target).policy.version
@@ -305,16 +311,25 @@ class _Renewal:
         from surrogym_trainer.evaluation.evaluator import EvaluationSettings
         from surrogym_trainer.policies.card import read_card
         from surrogym_trainer.policies.files import load_policy
+        from surrogym_trainer.policies.integrals import with_integrals
         from surrogym_trainer.training.cards import session_of
         from surrogym_trainer.training.handover import Subject
 
         card = read_card(path)
         opener = opener_for_policy(env, None, card, fallback, quiet=quiet)
-        with HttpSurrogate(self.api.url, self.target, self.token) as port:
+        with HttpSurrogate(self.api.url, self.target, self.token) as http:
+            port = with_integrals(http, card.integral, card.set_points)
             session = session_of(card, self.api.surrogate(self.target))
             predict = load_policy(path, card.algorithm)
             subject = Subject(self.api, self.target, port, predict, session, card.untrained)
             return by_episodes(subject, env, opener, EvaluationSettings(episodes), quiet=quiet)
+
+    def _aimed(self) -> dict[str, Any]:
+        """Return the option of a session with the set points of the old policy; empty if they are the reward's."""
+        from surrogym_trainer.policies.card import set_points_in
+
+        points = set_points_in(self.old.settings)
+        return {"set_points": points} if points else {}
 
     def _algorithm(self) -> str | None:
         """Return the policy search of the old policy; None, which is the default search, if it is another program's."""
@@ -345,7 +360,8 @@ class _Renewal:
             restored(path, spec, units_of(spec))
         except (UnknownPolicy, UnusablePolicy):  # there is only a file of another form, or one of another training
             return None
-        now = float(imagined_returns(port, load_policy(path, self.old.algorithm), CHECK_EPISODES, 0).mean())
+        old = load_policy(path, self.old.algorithm)
+        now = float(imagined_returns(port, old, CHECK_EPISODES, 0, **self._aimed()).mean())
         return path if now - floor >= KEPT * (earned - floor) else None
 
     def words_of_interruption(self) -> str:
