@@ -326,6 +326,9 @@ def test_a_copied_policy_has_the_trust_of_the_policy_of_its_training(
         assert on_server("policy", "get", f"{tank}@latest", "--out", str(tmp_path / "got.zip")).code == 0
         card = read_card(tmp_path / "got.zip")
         assert (card.surrogate, card.trusted) == (renewed, False)
+        deployed = on_server("deploy", f"{tank}@latest", "--target", "c", "--out", str(tmp_path / "c"))
+        assert "not trusted" in deployed.out, deployed.err
+        assert (tmp_path / "c" / f"{tank.replace('-', '_')}_controller.c").exists()
         assert push(api, tmp_path / "got.zip").policy.version == 1
         kept = wire.AddEvaluation(first_seed=1, returns=[-2.0] * 30, lengths=[9] * 30, idempotency_key="kept")
         stored = api.policies.evaluate(renewed, 1, kept)

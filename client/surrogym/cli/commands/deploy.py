@@ -315,13 +315,14 @@ def _local(
     with TemporaryDirectory() as folder:
         path = Path(folder) / "policy.zip"
         with service.connect(context) as api:
-            name, found, card = stored_card(api, name, which)
+            home, found, card = stored_card(api, name, which)
             if card.spec is None and spec is None:
                 raise CommandError(
-                    f"expected --spec with the specification that {policy} was trained for, because that of {name!r} "
+                    f"expected --spec with the specification that {policy} was trained for, because that of {home!r} "
                     f"differs in {found.differs}"
                 )
-            path.write_bytes(api.policies.file(name, found.version, "zip"))
+            path.write_bytes(api.policies.file(home, found.version, "zip"))
+        card = card.model_copy(update={"surrogate": name})  # a renewed controller keeps the names of its functions
         write_card(path, card)
         yield LocalPolicy(path, card, spec, context, reading, service, output)
 
