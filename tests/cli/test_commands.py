@@ -297,6 +297,22 @@ def test_the_evaluate_command_reports_returns_for_the_set_points_of_the_card(sur
     assert json.loads(surrogym(*arguments, "--json").out)["per_episode"] == [pytest.approx(-1.0)]
 
 
+def test_the_evaluate_command_shows_a_policy_the_integrals_of_its_card(surrogym, monkeypatch, tmp_path):
+    shown = []
+
+    def policy(observations):
+        shown.append(observations[0].tolist())
+        return np.full((len(observations), 1), -0.5)
+
+    (tmp_path / "policy.zip").write_bytes(stored({}))
+    (tmp_path / "policy.json").write_text(PolicyCard(spec=DECLARED, settings={"integral": ["x"]}).model_dump_json())
+    monkeypatch.setattr("surrogym_trainer.policies.files.load_policy", lambda *_, **__: policy)
+    said = surrogym("evaluate", "policy.zip", "--env", "support.moody:Alike", "--episodes", "1")
+    assert said.code == 0, said.err
+    # An error of 0.1, which is 5 % of the sampling range, counts 1, and the sum is clipped to 1.
+    assert np.round(shown, 6).tolist() == [[0.25, 0], [0.2, 1], [0.15, 1], [0.1, 1], [0.05, 1]]
+
+
 def _look_at(on_server, pendulum, tmp_path):
     """The policy that the server keeps, by its commands."""
     assert "production leads to version 1" in on_server("policy", "alias", f"{pendulum}@1", "production").out

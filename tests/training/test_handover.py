@@ -18,17 +18,20 @@ from support import rail
 from support.moody import DECLARED, SPEC, Line
 from support.server import ServerProcess
 from surrogym.cli import main
+from surrogym.cli.commands.audit import by_episodes
 from surrogym_client.errors import UnknownSurrogate
 from surrogym_client.surrogates import waiting
 from surrogym_client.surrogates.waiting import wait_for_design
 from surrogym_client.transport import Api, HttpSurrogate
 from surrogym_sampler.original import RealStep
+from surrogym_sampler.original.episode import Episode
 from surrogym_sampler.original.episodes import open_episode
 from surrogym_sampler.queries import Sampler, SamplerSettings
 from surrogym_shared.network import Network
 from surrogym_shared.spec import Design, EnvironmentSpec, ModelChoice
 from surrogym_trainer.evaluation.evaluator import EvaluationSettings, evaluate
 from surrogym_trainer.policies.card import PolicyCard, read_card, write_card
+from surrogym_trainer.policies.integrals import with_integrals
 from surrogym_trainer.training import TrainSettings
 from surrogym_trainer.training.audited import AuditedTraining
 from surrogym_trainer.training.handover import NO_SAMPLER, AuditSettings, Subject, hand_over, judge_episodes, way_of
@@ -247,6 +250,23 @@ def test_whole_episodes_are_judged_by_the_reward_with_the_policys_set_points(
         assert handover.trusted, handover.reason
         assert handover.promise is not None
         assert handover.promise.median > result.returns.mean() + 2
+
+
+def test_whole_episodes_show_a_policy_its_integrals_as_the_model_does(server_process: ServerProcess) -> None:
+    def back(observations: np.ndarray) -> np.ndarray:
+        assert observations.shape[1] == 2
+        return np.clip(-10 * observations[:, :1], -1, 1)
+
+    with placed(server_process.url, DECLARED, Line()) as place:
+        port = with_integrals(place.port, ("x",), {})
+        subject = replace(place.subject(), predict=back, port=port)
+        assert hand_over(subject, AUDIT).trusted
+
+        def opener() -> Episode:
+            return open_episode("a line", DECLARED, Line)
+
+        handover = by_episodes(subject, "a line", opener, EvaluationSettings(3), quiet=True)
+        assert handover.trusted, handover.reason
 
 
 class Broken(Changed):

@@ -159,8 +159,8 @@ def with_set_points(model: DynamicsModel, points: tuple[tuple[str, float], ...])
                 f"set points: expected a model that is a dataclass, got {type(model).__name__}: leave them out"
             )
         found = replace(of_any, definition=model.definition.with_set_points(points))
-        while len(known) >= MOST_SET_POINTS:
-            known.pop(next(iter(known)), None)
+        if len(known) >= MOST_SET_POINTS:
+            known.clear()
         known[points] = found
     return found
 
