@@ -77,7 +77,7 @@ def post(swing: str, server_process: ServerProcess) -> Iterator[Callable[[Plant,
     [
         (lambda row: row * [DEGREES, 1, 1, 1], "angle seems to come in other units: seen = 57.3 times expected"),
         (lambda row: row * [DEGREES, DEGREES, 1, 1], "angle and speed seem to come in other units: seen = 57.3 times"),
-        (lambda row: row * [1, 1, 1, 1_000], "reward seems to come in other units: seen = 1e+03 times expected"),
+        (lambda row: row * [1, 1, 1, 1_000], "reward seems to come in other units: seen = 1000 times expected"),
         (lambda row: row * [1, 1, 0.01, 1], "action 0 seems to come in other units: seen = 0.01 times expected"),
     ],
     ids=["degrees", "degrees per second", "rewards", "actions"],

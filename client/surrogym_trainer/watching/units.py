@@ -32,7 +32,7 @@ class OtherUnits(NamedTuple):
 
     def words(self) -> str:
         seem = "seems" if len(self.names) == 1 else "seem"
-        return f"{' and '.join(self.names)} {seem} to come in other units: seen = {self.factor:.3g} times expected"
+        return f"{' and '.join(self.names)} {seem} to come in other units: seen = {self.factor:.4g} times expected"
 
 
 def other_units(
