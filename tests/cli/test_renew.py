@@ -94,6 +94,9 @@ def test_a_renewed_policy_replaces_the_old_one_with_a_quarter_of_the_real_steps(
         assert api.policies.get("swing", "production").origin == f"swing-2@{card.version}"
         evaluated = on_server("evaluate", "new.zip", "--env", "support.levitation:HeavySwing", "--episodes", "30")
         assert evaluated.code == 0, evaluated.err
+        again = on_server("renew", "swing-2", "--policy", "production", "--env", "support.levitation:HeavySwing")
+        assert again.code == 1
+        assert "next: surrogym renew swing --policy swing@production" in again.err
         now = api.policies.get("swing", "production")
         assert [(one.own, one.promise_kept) for one in now.evaluations] == [(True, True)]
 
@@ -251,6 +254,8 @@ def test_a_surrogate_with_lags_is_renewed(
         (("--policy", "other@production"), ["expected a policy of 'swing'", "got 'other@production'"]),
         (("--policy", "staging"), ["staging"]),
         (("--policy", "production"), ["--env"]),
+        (("--policy", "production", "--env", "support.levitation:Nothing"), ["Nothing"]),
+        (("--policy", "production", "--env", "support.rated:RatedRail"), ["does not fit surrogate 'swing'"]),
     ],
 )
 def test_an_unusable_renewal_is_refused_before_it_changes_anything(

@@ -234,7 +234,7 @@ def test_posted_steps_are_compared_from_the_latest_confirmation_of_the_promise_o
         calls, machine = StepCalls(api.connection), api.surrogate(tank).spec.environment
         calls.add(tank, machine, "repaired", 0, worn)
         found = on_server(*watch)
-        assert "drift, found in step" in found.out, found.err
+        assert "drift, found in stream 'repaired', step" in found.out, found.err
         assert api.policies.evaluate(tank, policy()[0].version, kept).promise_kept
         calls.add(tank, machine, "repaired", len(worn), sound)
     said = on_server(*watch)

@@ -119,7 +119,7 @@ def test_a_machine_that_changed_before_the_first_step_is_a_drift(
 ):
     post(Plant(PENDULUM, {**PENDULUM.real, "pump": 0.5}), lambda row: row, 60)
     said = on_server("watch", swing, "--policy", "1")
-    assert (said.code, "drift, found in step" in said.out) == (1, True), said.out
+    assert (said.code, "drift, found in stream " in said.out) == (1, True), said.out
     assert "may be of another machine or in other units" in said.out
 
 

@@ -80,6 +80,7 @@ def command(
     from surrogym.cli.errors import CommandError
     from surrogym_client.runtime.lifetime import terminations_as_interrupts
     from surrogym_sampler.original.loading import for_queries
+    from surrogym_sampler.queries.query_limits import check_environment
     from surrogym_shared.terminal import on_interrupt, progress, say
 
     name, _, alias = policy.rpartition("@")
@@ -92,6 +93,7 @@ def command(
                 f"expected an alias of a policy of {surrogate!r}, got {alias!r}: give one by surrogym policy alias "
                 f"{surrogate}@{old.version} production"
             )
+        _require_first(api, surrogate, alias)
         base, target = chain(api, surrogate, alias)
         unconfirmed = old.origin if (old.origin or "").startswith(f"{target}@") and "replaces" in old.settings else None
         if unconfirmed is not None:  # a renewal was killed while its episodes ran
@@ -105,6 +107,7 @@ def command(
             progress("renew", quiet=output.quiet) as update,
             closing(for_queries(opened, 30.0, given, fallback)) as environment,
         ):
+            check_environment(base.name, base.spec, environment.spec())
             spec = renewal.register(budget or _budget(api.surrogate(surrogate)), opened)
             path, runs = out or Path(f"{target}.zip"), f"{episodes} episodes in {opened}"
             runs = f"{runs}: at most {episodes * (spec.time_limit or 1_000)} real steps"
@@ -122,6 +125,26 @@ def command(
     output.give(result, lambda: renewal.words(path, handover))
     if not renewal.stays:
         raise typer.Exit(1)
+
+
+def _require_first(api: Api, surrogate: str, alias: str) -> None:
+    """Raise ``CommandError`` if a surrogate is a renewal of another one whose alias leads to a renewal, because that
+    alias, which controllers ask for, would stay where it is."""
+    from surrogym.cli.errors import CommandError
+    from surrogym_client.errors import UnknownPolicy, UnknownSurrogate
+
+    first, _, number = surrogate.rpartition("-")
+    if not first or not number.isdecimal():
+        return
+    try:
+        origin = api.policies.get(first, alias).origin or ""
+    except (UnknownPolicy, UnknownSurrogate):
+        return
+    if origin.startswith(f"{first}-"):
+        raise CommandError(
+            f"expected {first!r}, of which {surrogate!r} is a renewal, got {surrogate!r}: {first}@{alias} would not "
+            f"move; next: surrogym renew {first} --policy {first}@{alias}"
+        )
 
 
 def chain(api: Api, surrogate: str, alias: str) -> tuple[SurrogateView, str]:

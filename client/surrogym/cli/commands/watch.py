@@ -6,6 +6,8 @@ import sys
 from dataclasses import asdict
 from datetime import UTC, datetime
 from functools import partial
+from itertools import groupby
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -99,7 +101,7 @@ def command(
                 watcher, seen = Watcher(api, view, false_alarm_steps), _Seen()
         if not watcher.compared + watcher.left_out:
             raise CommandError(_words_of_none(view, log, later))
-        stored = None if alarm is None else _withdrawn(watcher, version, alarm, seen.place)
+        stored = None if alarm is None else _withdrawn(watcher, version, alarm, seen.found_in)
         moved = None if alarm is None or which not in watched.aliases else _moved(api, surrogate, which, version)
     named = f"{surrogate}@{version}"
     result = {
@@ -169,13 +171,13 @@ def _posts(
     ``other``. Yields after each reading."""
     from surrogym_trainer.watching.streams import posted, step_of
 
-    seen.place = "step"
     seen.notes = tuple(f"stream {stream!r} is left out: {units.words()}" for stream, units in other.items())
     for steps in posted(api, surrogate, since, follow=follow):
         seen.streams += [one.stream for one in steps if one.stream not in other]
         seen.streams = [*dict.fromkeys(seen.streams)]
-        seen.steps = [step_of(one) for one in steps if one.stream not in other]
-        yield
+        for stream, run in groupby((one for one in steps if one.stream not in other), attrgetter("stream")):
+            seen.place, seen.steps = f"stream {stream!r}, step", [step_of(one) for one in run]
+            yield
 
 
 def _read(log: Path, mapping: Path | None, spec: EnvironmentSpec, seen: _Seen, *, follow: bool) -> Iterator[None]:
@@ -214,7 +216,8 @@ class _Seen:
         self.rejected: dict[int, str] = {}  # for each unusable row so far, the reason, by the row's line number
         self.notes: tuple[str, ...] = ()
         self.streams: list[str] = []  # streams of the posted steps, in the order of their first steps
-        self.place = "line"  # what the number of a step counts
+        self.place = "line"  # what the number of a step of the last reading counts
+        self.found_in = ""  # what the number of the step that gave the alarm counts
         self._line = 0
 
     def add(self, read: ReadLog) -> None:
@@ -243,6 +246,7 @@ def _found(
     alarm = None
     for _ in readings:
         if (alarm := _watched(watcher, seen.steps, update, len(seen.rejected))) is not None:
+            seen.found_in = seen.found_in or seen.place
             units, certain = watcher.other_units()
             if units is None or certain:
                 return (alarm, None) if units is None else (None, units)
@@ -299,7 +303,9 @@ def _words(seen: _Seen, watcher: Watcher, alarm: Alarm | None, units: OtherUnits
         return [*lines, f"{units.words()}; convert the steps: the policy's trust is unchanged"]
     if alarm is None:
         return [*lines, f"no drift in {counted(watcher.compared, 'real step')}"]
-    found = f"drift, found in {seen.place} {alarm.line} after {counted(alarm.compared, 'real step')}: {alarm.words()}"
+    found = (
+        f"drift, found in {seen.found_in} {alarm.line} after {counted(alarm.compared, 'real step')}: {alarm.words()}"
+    )
     if alarm.from_the_start:
         found += (
             "; it is there from the start, so the steps may be of another machine or in other units, or the model was "
