@@ -48,5 +48,5 @@ def configure(level: str, form: LogFormat) -> None:
     root = logging.getLogger()
     root.handlers = [handler]
     root.setLevel(level.upper())
-    for quiet in ("uvicorn.error", "alembic"):
+    for quiet in ("uvicorn.error", "alembic", "httpx", "httpcore"):  # the latter two log the webhook's secret path
         logging.getLogger(quiet).setLevel(max(logging.WARNING, root.level))

@@ -69,7 +69,7 @@ def test_a_report_of_drift_is_posted_once_to_the_address_of_the_operator(receive
     vector = np.zeros(Network.size(spec, 4))
     Network.of(spec, np.zeros(3), np.ones(3), 4, vector).save(tmp_path / "policy.zip")
     with (
-        running_server(tmp_path, SURROGYM_DRIFT_WEBHOOK=receiver.url) as server,
+        running_server(tmp_path, "--log-level", "debug", SURROGYM_DRIFT_WEBHOOK=receiver.url) as server,
         Api(server.url) as api,
         httpx.Client(base_url=server.url) as client,
     ):
@@ -80,6 +80,7 @@ def test_a_report_of_drift_is_posted_once_to_the_address_of_the_operator(receive
             assert client.post("/v1/surrogates/plant/policies/1/drifts", json=routes.DRIFT_EXAMPLE).status_code == 201
         assert receiver.arrived.acquire(timeout=60)
         time.sleep(0.2)
+        assert "key=secret" not in server.log
     drift = {name: value for name, value in routes.DRIFT_EXAMPLE.items() if name != "idempotency_key"}
     message = {"event": "drift", "surrogate": "plant", "policy_version": 1, **drift}
     assert receiver.received == [("/alarms?key=secret", message)]
