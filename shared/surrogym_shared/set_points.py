@@ -44,13 +44,21 @@ class Rewarded(Protocol):
 
 def set_points_of(environment: Rewarded) -> dict[str, tuple[float, ...]]:
     """Return the values at which a declared reward measures no error, by the coordinate's name. Empty if the reward is
-    learned."""
+    learned. Values that differ by a rounding error are one."""
     found: dict[str, list[float]] = {}
     for quantity in _quantities(environment.reward):
         if (error := _error(quantity)) is not None:
             name, slope, constant = error
-            found.setdefault(name, []).append(-constant / slope + 0.0)
-    return {name: tuple(sorted(set(values))) for name, values in found.items()}
+            value, known = -constant / slope + 0.0, found.setdefault(name, [])
+            low, high = _range(environment, name)
+            if all(abs(value - other) > SAME * (high - low) for other in known):
+                known.append(value)
+    return {name: tuple(sorted(values)) for name, values in found.items()}
+
+
+def _range(environment: Rewarded, name: str) -> tuple[float, float]:
+    """Return the sampling range of a coordinate."""
+    return limits(environment.coordinates[environment.coordinate_names.index(name)].sampling)
 
 
 def reward_for(environment: Rewarded, points: Mapping[str, float]) -> DeclaredReward:
@@ -100,11 +108,9 @@ def _check(environment: Rewarded, name: str, value: float) -> None:
         raise ValueError(
             f"set points: expected a coordinate whose error the declared reward measures by itself{among}, got {name!r}"
         )
-    column = environment.coordinate_names.index(name)
-    low, high = limits(environment.coordinates[column].sampling)
-    old = known[name]
+    column, (low, high), old = environment.coordinate_names.index(name), _range(environment, name), known[name]
     require(
-        old[-1] - old[0] <= SAME * (high - low),
+        len(old) == 1,
         f"set point {name!r}: expected a reward with one set point of {name!r}, got one with several: "
         f"{', '.join(f'{one:g}' for one in old)}",
     )

@@ -65,6 +65,13 @@ def test_another_set_point_gives_the_reward_that_is_declared_for_it():
     assert with_set_points(tank(10), {}) == tank(10)
 
 
+def test_set_points_that_differ_by_a_rounding_error_are_one():
+    assert -(-0.1 * 0.7) / 0.1 != -(-0.3 * 0.7) / 0.3 != -(-3.9 * 0.7) / 3.9
+    three = spec(*(RewardTerm(shape="bump", of=(error(0.7, scale),)) for scale in (0.1, 0.3, 3.9)))
+    assert set_points_of(three) == {"level": (pytest.approx(0.7),)}
+    assert set_points_of(with_set_points(three, {"level": 1.7})) == {"level": (pytest.approx(1.7),)}
+
+
 def test_criteria_of_success_belong_to_the_declared_set_point():
     criterion = Success(hold=(Inequality(term=LEVEL, relation=">", value=9.0),))
     assert with_set_points(tank(10, success=criterion), {"level": 12.5}).success is None
