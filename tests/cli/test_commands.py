@@ -14,6 +14,7 @@ from surrogym_sampler import original
 from surrogym_sampler.original.loading import with_choices
 from surrogym_shared.archives import stored
 from surrogym_trainer.policies import PolicyCard
+from surrogym_trainer.policies.evidence import Promise
 
 OWN = """
 from surrogym_sampler.original import RealStep
@@ -295,6 +296,13 @@ def test_the_evaluate_command_reports_returns_for_the_set_points_of_the_card(sur
     assert "returns are for the set point x = 0.25, by the declared reward of the policy's card" in said.out
     # x is 0.25, 0.35, ..., 0.65
     assert json.loads(surrogym(*arguments, "--json").out)["per_episode"] == [pytest.approx(-1.0)]
+    promise = Promise(median=-1.0, low=-1.1, high=-0.9, functions=32, episodes=256)
+    blind = card.model_copy(update={"spec": None, "promise": promise})
+    (tmp_path / "policy.json").write_text(blind.model_dump_json())
+    said = surrogym(*arguments[:-1], "40", "--json")
+    assert json.loads(said.out)["per_episode"][0] == pytest.approx(-2.25)
+    assert json.loads(said.out)["promise_kept"] is None
+    assert "the promise for the set point x = 0.25 is not judged" in surrogym(*arguments).out
 
 
 def test_the_evaluate_command_shows_a_policy_the_integrals_of_its_card(surrogym, monkeypatch, tmp_path):

@@ -166,6 +166,8 @@ def command(
     ]
     result = reports[0][1]
     promise = card.promise if is_promised(settings, result, card.spec) else None
+    if card.set_points and card.spec is None:
+        promise = None
     expected = promise if _judges(settings.episodes) else None
     elsewhere = _elsewhere(env, card, promise)
     with kept(learning, policy, result, quiet=output.quiet) as steps:
@@ -202,8 +204,14 @@ def _aimed(card: PolicyCard) -> list[str]:
     """Return a remark about the set points that the returns are for; empty if they are those of the specification."""
     from surrogym_trainer.policies.card import words_of_set_points
 
-    points = words_of_set_points(card.set_points)
-    return [f"returns are for the set point {points}, by the declared reward of the policy's card"] if points else []
+    if not (points := words_of_set_points(card.set_points)):
+        return []
+    if card.spec is None:
+        return [
+            f"returns are those that the environment pays, and the promise for the set point {points} is not judged: "
+            "the policy's card has no specification by which to compute them"
+        ]
+    return [f"returns are for the set point {points}, by the declared reward of the policy's card"]
 
 
 def _named(env: str | None, card: PolicyCard) -> str:
