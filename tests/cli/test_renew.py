@@ -14,6 +14,7 @@ from support.rated import RATED, RatedRail
 from support.saying import Said
 from support.server import ServerProcess
 from surrogym.cli.commands.policy import stored_card
+from surrogym.cli.commands.renew import _Renewal
 from surrogym_client.surrogates.waiting import wait_for_design
 from surrogym_client.transport import Api, HttpSurrogate
 from surrogym_sampler.queries.settings import SamplerSettings
@@ -185,6 +186,39 @@ def test_an_interrupted_renewal_leaves_the_alias_and_continues_with_the_same_sur
     assert (first["surrogate"], first["prior"], first["real_steps"]["total"]) == ("swing-2", "swing", taken)
     assert (second["surrogate"], second["prior"], second["renewed"]) == ("swing-3", "swing-2", True)
     assert led_to(server_process, trained) == second["alias"]["version"]
+
+
+@pytest.mark.parametrize("where", ["training", "episodes"])
+def test_an_alias_that_somebody_else_moves_during_a_renewal_stays_there(
+    renew: Renew,
+    trained: str,
+    server_process: ServerProcess,
+    handed_over: Callable[..., None],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    where: str,
+):
+    """The command moved it on to its own policy, or back to the old one."""
+    handed_over(trusted=True)
+    with Api(server_process.url) as api:
+        card = stored_card(api, trained, "1")[2].model_copy(update={"imagined_return": 1.0})
+        (tmp_path / "by hand.zip").write_bytes(api.policies.file(trained, 1, "zip"))
+        write_card(tmp_path / "by hand.zip", card)
+        by_hand = push(api, tmp_path / "by hand.zip", trained).policy.version
+
+        def moving(*_: Any, **__: Any) -> Handover:
+            api.policies.put_alias(trained, "production", by_hand)
+            return Handover(None, None, False, "so the episodes say")
+
+        if where == "training":
+            short = _Renewal.train
+            monkeypatch.setattr(_Renewal, "train", lambda *given: (short(*given), moving())[0])
+        monkeypatch.setattr("surrogym.cli.commands.audit.by_episodes", moving)
+        said = renew("HeavySwing")
+    assert said.code == 1
+    assert f"got version {by_hand}: somebody else has moved it meanwhile, and it stays there" in said.err
+    assert "the new policy is swing-2@1" in said.err
+    assert led_to(server_process, trained) == by_hand
 
 
 @pytest.mark.parametrize("agree", [True, False])

@@ -312,19 +312,45 @@ class _Renewal:
 
     def put_into_use(self, path: Path, env: str, episodes: int, fallback: str | None, *, quiet: bool) -> None:
         """Move the alias to the new policy, run real episodes, and move it back if they contradict the promise, or if
-        the episodes fail or are interrupted."""
+        the episodes fail or are interrupted.
+
+        Raises:
+            CommandError: somebody else has moved the alias meanwhile. It stays where it is.
+        """
         from surrogym_trainer.policies.pushing import push
 
+        self._require_alias_at(self.old.version)
         self.version = push(self.api, path, self.surrogate).policy.version
         try:
             self.api.policies.put_alias(self.surrogate, self.alias, self.version)
             self.judged = self._episodes(path, env, episodes, fallback, quiet=quiet)
             self.stays = self.judged.trusted
         finally:
-            if not self.stays:
+            if not self.stays and self._version_of_alias() == self.version:
                 self.api.policies.put_alias(self.surrogate, self.alias, self.old.version)
+        self._require_alias_at(self.version if self.stays else self.old.version)
         if self.stays:
             self.api.policies.put_alias(self.target, self.alias, self.made)
+
+    def _version_of_alias(self) -> int | None:
+        """Return the version to which the alias leads now; None if it does not exist any more."""
+        from surrogym_client.errors import UnknownPolicy
+
+        try:
+            return self.api.policies.get(self.surrogate, self.alias).version
+        except UnknownPolicy:
+            return None
+
+    def _require_alias_at(self, version: int) -> None:
+        """Raise ``CommandError`` if the alias does not lead to ``version``, because somebody else has moved it."""
+        from surrogym.cli.errors import CommandError
+
+        if (now := self._version_of_alias()) != version:
+            got = "no such alias" if now is None else f"version {now}"
+            raise CommandError(
+                f"expected {self.surrogate}@{self.alias} to lead to version {version}, got {got}: somebody else has "
+                f"moved it meanwhile, and it stays there; the new policy is {self.target}@{self.made}"
+            )
 
     def _episodes(self, path: Path, env: str, episodes: int, fallback: str | None, *, quiet: bool) -> Handover:
         """Run real episodes with the new policy, and judge its promise by them."""
