@@ -32,7 +32,7 @@ REQUEST_SECONDS, MEMORY_MIB, BODY_MIB = 4, 64, 32
 IDLE = times(short=300, full=10_000)
 SLOWER = 10.0  # a step beside an attack, in those before it; a queue behind it would be hundreds
 ACTION = {"action": [[0.5]]}
-PATH, JSON_BYTES = "/v1/surrogates/pendulum/add_sample", 128 * 1024
+PATH, JSON_BYTES, ALL_BYTES = "/v1/surrogates/pendulum/add_sample", 1024 * 1024, 128 * 1024
 
 pytestmark = pytest.mark.timeout(900)
 
@@ -163,13 +163,13 @@ def test_a_chunked_body_of_a_gigabyte_is_refused_at_the_limit(server: ServerProc
 @pytest.fixture
 def narrow(tmp_path: Path) -> Iterator[ServerProcess]:
     """A server of three connections, and 128 KiB for all bodies at once."""
-    limits = {"SURROGYM_MAX_CONNECTIONS": "3", "SURROGYM_MAX_BODIES_BYTES": str(JSON_BYTES)}
+    limits = {"SURROGYM_MAX_CONNECTIONS": "3", "SURROGYM_MAX_BODIES_BYTES": str(ALL_BYTES)}
     with running_server(tmp_path, **limits) as server:
         yield server
 
 
 def test_connections_and_bodies_beyond_the_limit_are_refused(narrow: ServerProcess):
-    body, unlike = b"x" * 90_000, f"expected bodies of at most {JSON_BYTES} bytes in all requests at once"
+    body, unlike = b"x" * 90_000, f"expected bodies of at most {ALL_BYTES} bytes in all requests at once"
     with contextlib.ExitStack() as stack:
         first, second, _ = (stack.enter_context(connected(narrow.url)) for _ in range(3))
         time.sleep(0.5)
@@ -271,7 +271,7 @@ def test_the_total_size_of_unfinished_stream_messages_is_limited(narrow: ServerP
         teach(api, "pendulum", pendulum(), queries=6)
         id = opened(client).json()["id"]
     with upgraded(narrow.url, id) as attacker, contextlib.suppress(ConnectionError):
-        attacker.sendall(b"\x82\xff" + (2**20).to_bytes(8, "big") + b"\0\0\0\0" + b"x" * (2 * JSON_BYTES))
+        attacker.sendall(b"\x82\xff" + (2**20).to_bytes(8, "big") + b"\0\0\0\0" + b"x" * (2 * ALL_BYTES))
         assert b"unfinished messages of at most 131072 bytes" in read_all(attacker)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import groupby
 from typing import Any, Literal, Self, TypeVar
 
 from pydantic import BaseModel
@@ -235,7 +236,7 @@ _EVENT_SILENCE_SECONDS = 60.0
 _NUMBERS = 2_000
 _OF_ALL_POINTS = ("model_version", "outputs")
 _MODEL_FILE = "application/octet-stream"
-_BATCH_BYTES = 96 * 1024  # largest size in bytes of the samples in one request; the server accepts 128 KiB of JSON
+_BATCH_BYTES = 96 * 1024  # size in bytes of the samples in one request; only the answer to one query may be larger
 
 
 class Api:
@@ -448,18 +449,21 @@ class Api:
         action: Sequence[Sequence[float]] = (),
         *,
         rollouts: Sequence[Sequence[Sequence[float]]] = (),
+        policy: str | None = None,
         audit: bool = False,
         idempotency_key: str | None = None,
     ) -> list[wire.QueryView]:
         """Add queries of your own to the queue.
 
         Give n queries of one step by their states, ``coordinates`` (n, C), and their actions, ``action`` (n, F); or
-        give ``rollouts``, each T actions (T, F) from a reset. Queries of an audit don't count towards the budget.
+        give ``rollouts``, each T actions (T, F) from a reset, which are only expected if a ``policy`` (its file in
+        base64) chooses them. Queries of an audit don't count towards the budget.
         """
         body = (wire.AuditModel if audit else wire.AddQueries)(
             coordinates=[list(row) for row in coordinates] or None,
             action=[list(row) for row in action] or None,
             rollouts=[[list(row) for row in actions] for actions in rollouts] or None,
+            policy=policy,
             idempotency_key=idempotency_key or new_key(),
         )
         return self._post(wire.QueryList, f"{routes.surrogate(name)}/{'audit' if audit else 'queries'}", body).queries
@@ -553,14 +557,22 @@ class Api:
         return self._post(wire.Ledger, f"{routes.surrogate(name)}/ledger", body)
 
     def improve(
-        self, name: str, queries: int, *, checkpoint: str | None = None, idempotency_key: str | None = None
+        self,
+        name: str,
+        queries: int,
+        *,
+        checkpoint: str | None = None,
+        trial: wire.Trial | None = None,
+        idempotency_key: str | None = None,
     ) -> wire.ImprovedSurrogate:
-        """Add queries to the design, chosen near the visited states that were submitted as ``checkpoint``.
+        """Add queries to the design, chosen near the visited states that were submitted as ``checkpoint``; or a trial,
+        of as many steps, in which a policy acts.
 
         Raises:
             BeyondBudget: the budget has too few steps left, and this token may not raise it; a token of role admin may.
         """
-        body = wire.Improve(queries=queries, checkpoint=checkpoint, idempotency_key=idempotency_key or new_key())
+        key = idempotency_key or new_key()
+        body = wire.Improve(queries=queries, checkpoint=checkpoint, trial=trial, idempotency_key=key)
         return self._post(wire.ImprovedSurrogate, f"{routes.surrogate(name)}/improve", body)
 
     # Routes of models, and of the states of sessions
@@ -723,15 +735,16 @@ def _joined(added: Sequence[wire.AddedSamples]) -> wire.AddedSamples:
 
 
 def _batches(samples: Sequence[wire.NewSample]) -> list[list[wire.NewSample]]:
-    """Split samples into batches of at most ``_BATCH_BYTES``. There is always at least one batch, which may be
-    empty."""
+    """Split samples into batches of at most ``_BATCH_BYTES``. The answer to one query stays in one batch, because the
+    server takes it whole. There is always at least one batch, which may be empty."""
     batches: list[list[wire.NewSample]] = [[]]
     room = _BATCH_BYTES
-    for sample in samples:
-        size = len(sample.model_dump_json()) + 1
-        if size > room and batches[-1]:
-            batches.append([])
-            room = _BATCH_BYTES
-        batches[-1].append(sample)
-        room -= size
+    for query, group in groupby(samples, lambda sample: sample.query_id):
+        for part in [list(group)] if query is not None else [[sample] for sample in group]:
+            size = sum(len(sample.model_dump_json()) + 1 for sample in part)
+            if size > room and batches[-1]:
+                batches.append([])
+                room = _BATCH_BYTES
+            batches[-1] += part
+            room -= size
     return batches

@@ -38,7 +38,7 @@ MAX_PAGE = 10_000
     "/add_sample",
     summary="Store samples",
     dependencies=[SAMPLE],
-    openapi_extra=json_up_to(128),
+    openapi_extra=json_up_to(1_024),
     responses=documented(
         Code.UNKNOWN_SURROGATE,
         Code.UNKNOWN_QUERY,
