@@ -6,6 +6,7 @@ F action entries.
 
 from __future__ import annotations
 
+import io
 import json
 import zipfile
 from collections.abc import Mapping, Sequence
@@ -115,18 +116,24 @@ class Network:
 
     def save(self, path: Path) -> None:
         """Write one policy to a zip file with its arrays and a JSON header. The file contains no code."""
+        path.write_bytes(self.to_bytes())
+
+    def to_bytes(self) -> bytes:
+        """Return the content of the file that ``save`` writes."""
         head = _Head(version=2, counts=self.counts, activation=self.activation, layers=len(self.layers))
         arrays = {name: getattr(self, name) for name in OUTSIDE}
         for names, layer in zip(head.names, self.layers, strict=True):
             arrays |= dict(zip(names, layer, strict=True))
-        with zipfile.ZipFile(path, "w") as file:
+        content = io.BytesIO()
+        with zipfile.ZipFile(content, "w") as file:
             file.writestr(HEAD, json.dumps(head.model_dump()))
             with file.open(ARRAYS, "w") as archive:
                 np.savez(archive, **arrays)
+        return content.getvalue()
 
     @classmethod
-    def load(cls, path: Path) -> Self:
-        """Read a file that ``save`` wrote.
+    def load(cls, path: Path | bytes) -> Self:
+        """Read a file that ``save`` wrote, given its path or its content.
 
         Raises:
             ValueError: the file can't be read, was not written by ``save``, or has more than ``MAX_BYTES`` bytes.
@@ -140,8 +147,9 @@ class Network:
             arrays = read_arrays(entries[ARRAYS], MAX_BYTES, partial(_require_chain, head))
             require_finite(arrays, positive="deviation")
         except (LookupError, TypeError, OSError, ValueError, RecursionError, MemoryError) as error:
+            named = path if isinstance(path, Path) else "the content"
             raise ValueError(
-                f"{path} is not a policy of surrogym train: {error}; save or download the policy again"
+                f"{named} is not a policy of surrogym train: {error}; save or download the policy again"
             ) from error
         layers = tuple(Layer(*(arrays[name] for name in names)) for names in head.names)
         outside = {name: arrays[name] for name in OUTSIDE}

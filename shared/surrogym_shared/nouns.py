@@ -9,7 +9,7 @@ Shapes: C coordinates, F action entries, D observation entries, T actions of a q
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Self
 
 import numpy as np
@@ -34,6 +34,9 @@ class Query:
     # Whether each action is planned anew on the model, from the state that was measured. ``actions`` are then only
     # expected, and are applied where nothing can be planned.
     replan: bool = False
+    # File of a policy (``Network.save``) that chooses each action from the measured state: the rollout is a trial.
+    # ``actions`` are then those that the model expects, and the largest number of steps.
+    policy: bytes | None = field(default=None, repr=False)
 
     @staticmethod
     def step(coordinates: Iterable[float], action: Iterable[float]) -> Query:
@@ -41,9 +44,15 @@ class Query:
         return Query(tuple(coordinates), (tuple(action),))
 
     @staticmethod
-    def rollout(actions: Iterable[Iterable[float]], snapshot: str | None = None, *, replan: bool = False) -> Query:
+    def rollout(
+        actions: Iterable[Iterable[float]],
+        snapshot: str | None = None,
+        *,
+        replan: bool = False,
+        policy: bytes | None = None,
+    ) -> Query:
         """Return the query of T actions (T, F), one after the other, from a snapshot, or from a reset if it is None."""
-        return Query((), tuple(map(tuple, actions)), snapshot, replan)
+        return Query((), tuple(map(tuple, actions)), snapshot, replan, policy)
 
     @property
     def kind(self) -> QueryKind:

@@ -18,6 +18,7 @@ from surrogym_trainer.evaluation.evaluator import (
     EvaluationSettings,
     evaluate,
     interquartile_mean,
+    succeeded,
 )
 from surrogym_trainer.evaluation.reporting import words_of
 
@@ -96,6 +97,18 @@ def test_success_in_pendulum_is_being_upright_in_the_last_twenty_steps():
     assert held.success[0] == upright.all()
     limp = evaluate(lambda o: np.zeros((len(o), 1)), opener("Pendulum-v1"), EvaluationSettings(episodes=5))
     assert not limp.success.any()
+
+
+@pytest.mark.parametrize(
+    ("name", "policy"), [("Pendulum-v1", pendulum_policy), ("MountainCarContinuous-v0", lambda o: np.sign(o[:, 1:]))]
+)
+def test_an_episode_that_was_recorded_elsewhere_succeeds_as_an_evaluated_one(name, policy):
+    opened = opener(name)()
+    result = evaluate(policy, opener(name), EvaluationSettings(episodes=6))
+    for trace, success in zip(result.traces, result.success, strict=True):
+        states, ended = trace.coordinates[1:], trace.terminated
+        assert succeeded(opened.spec, states, trace.reward, terminated=ended) == success
+        assert not succeeded(opened.spec, states[:5], trace.reward[:5], terminated=False)
 
 
 def test_the_evaluation_trace_is_that_of_the_first_episode():

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 import uuid
+from base64 import b64encode
 from itertools import pairwise
 
 import numpy as np
@@ -19,10 +20,12 @@ from surrogym_sampler import original
 from surrogym_sampler.original.errors import UnknownEnvironment
 from surrogym_sampler.original.isolated import IsolatedEnvironment
 from surrogym_sampler.queries import Sampler, SamplerSettings
-from surrogym_sampler.queries.replanning import replanning
+from surrogym_sampler.queries.acting import following, replanning
 from surrogym_sampler.queries.sample_conversion import reset_seed
 from surrogym_sampler.queries.words import line_of, words_of_query
-from surrogym_shared.wire import NewSample, RolloutQuery
+from surrogym_shared.network import Layer, Network
+from surrogym_shared.terms import observe
+from surrogym_shared.wire import NewSample, RolloutQuery, Trial
 
 RIGHT, LEFT = [1.0], [-1.0]
 ONE = SamplerSettings(name="worker", batch=1, once=True, wait_seconds=5.0)
@@ -294,3 +297,82 @@ def test_a_query_that_is_planned_anew_is_drawn_and_reported_as_such():
     first = words_of_query(SPEC, trial)[0]
     assert first.endswith("from a reset, each action planned anew from the measured state; expected:")
     assert "anew" not in words_of_query(SPEC, trial.model_copy(update={"replan": False}))[0]
+
+
+@pytest.fixture
+def policy():
+    """A network with random weights for the rail, and its file in base64."""
+    weights = np.random.default_rng(0).normal(size=Network.size(SPEC, 4))
+    network = Network.of(SPEC, np.zeros(1), np.ones(1), 4, weights)
+    return network, b64encode(network.to_bytes()).decode()
+
+
+def test_in_a_trial_a_policy_acts_on_the_states_that_were_measured(api, rail, policy):
+    network, file = policy
+    before, expected = api.surrogate(rail), [[0.0]] * 8
+    granted = api.improve(rail, 8, trial=Trial(policy=file, actions=expected))
+    assert granted.budget_raised_by == 8 - before.budget_left
+    lines = []
+    told = lambda query, outcome, error: lines.append(line_of(query, outcome, error))  # noqa: E731
+    Sampler(api, rail, Rail(), SamplerSettings(until_done=True, time_limit=60.0), told).run()
+    (query,) = [query for query in api.queries(rail) if query.policy]
+    assert f"query {query.id} (adaptive, 8 steps of a policy) answered" in lines
+    samples = [sample for sample in api.samples(rail) if sample.query_id == query.id]
+    assert (query.actions, len(samples)) == (expected, 8)
+    chosen = [network(observe(SPEC, np.array([sample.coordinates])))[0].tolist() for sample in samples]
+    assert [sample.action for sample in samples] == [pytest.approx(action) for action in chosen]
+
+
+def test_a_trial_that_does_not_fit_the_surrogate_is_refused_and_changes_nothing(api, rail, policy):
+    network, file = policy
+    before = api.surrogate(rail)
+    other = Network(np.zeros(2), np.ones(2), (Layer(np.zeros((2, 1)), np.zeros(1)),), network.low, network.high)
+    wrong = {
+        "in base64": (3, Trial(policy="no base64!", actions=[[0.0]] * 3)),
+        "is not a policy of surrogym train": (3, Trial(policy="AAAA", actions=[[0.0]] * 3)),
+        "expected one of 1 observation entries with 1 continuous actions, got one of 2": (
+            3,
+            Trial(policy=b64encode(other.to_bytes()).decode(), actions=[[0.0]] * 3),
+        ),
+        "expected 4 actions, as many as queries, got 3": (4, Trial(policy=file, actions=[[0.0]] * 3)),
+        "expected at most 20 actions in a rollout, got 21": (21, Trial(policy=file, actions=[[0.0]] * 21)),
+        "action": (1, Trial(policy=file, actions=[[9.0]])),
+    }
+    for said, (steps, trial) in wrong.items():
+        with pytest.raises(InvalidInput, match=said):
+            api.improve(rail, steps, trial=trial)
+    after = api.surrogate(rail)
+    assert (after.budget, after.queries, after.phase) == (before.budget, before.queries, before.phase)
+    anywhere = f"pendulum-{uuid.uuid4().hex[:8]}"
+    api.create_surrogate(anywhere, original.make("Pendulum-v1").spec())
+    with pytest.raises(InvalidInput, match="expected an original environment that can only be reset"):
+        api.improve(anywhere, 1, trial=Trial(policy=file, actions=[[0.0]]))
+    api.delete_surrogate(anywhere)
+
+
+def test_a_sampler_refuses_a_policy_that_does_not_fit_its_environment(policy):
+    with pytest.raises(ValueError, match="expected a policy of 3 observation entries"):
+        following(policy[0].to_bytes(), original.make("Pendulum-v1").spec())
+    with pytest.raises(ValueError, match="is not a policy of surrogym train"):
+        following(b"PK", SPEC)
+
+
+class Long(Rail):
+    """A rail whose episodes may have 600 steps."""
+
+    def spec(self):
+        return SPEC.model_copy(update={"time_limit": 600, "max_rollout": 600})
+
+
+def test_a_rollout_of_many_steps_is_answered_whole(api):
+    """Its samples have more than 96 KiB, the size of the requests in which other samples are sent."""
+    name = f"long-{uuid.uuid4().hex[:8]}"
+    api.create_surrogate(name, Long().spec())
+    api.add_queries(name, rollouts=[[LEFT, RIGHT] * 300])
+    told = []
+    settings = SamplerSettings(name="worker", batch=8, once=True, wait_seconds=5.0)
+    Sampler(api, name, Long(), settings, lambda *one: told.append(one[1:])).run()
+    assert set(told) == {("answered", "")}
+    (query,) = [query for query in api.queries(name) if len(query.actions) == 600]
+    assert len([sample for sample in api.samples(name) if sample.query_id == query.id]) == 600
+    api.delete_surrogate(name)

@@ -230,14 +230,17 @@ class LoopOptions:
     """Options of the closed loop, which takes real steps between trainings, and of the audit."""
 
     improve: Annotated[
-        int,
+        int | None,
         typer.Option(
             min=0,
             help="Real steps to add in each round, at states that the policy visits; 0 trains without rounds. Rounds "
             "end when the model is certain at these states, or when the design is ready. This needs a running "
-            "sampler and enough budget; an admin's token raises the budget.",
+            "sampler and enough budget; an admin's token raises the budget. [default: none; if the environment can "
+            "only be reset and has more than four coordinates, the policy tries episodes with what is left of the "
+            "budget]",
+            show_default=False,
         ),
-    ] = 0
+    ] = None
     rounds: Annotated[int, typer.Option(min=1, help="Maximum number of rounds of --improve.")] = 3
     audit: Annotated[
         bool,
@@ -260,7 +263,7 @@ class LoopOptions:
     def settings(self) -> LoopSettings | None:
         from surrogym_trainer.training.closed_loop import LoopSettings
 
-        return LoopSettings(self.improve, self.rounds) if self.improve else None
+        return None if self.improve == 0 else LoopSettings(self.improve or 0, self.rounds)
 
     def audited(self, seed: int) -> AuditSettings | None:
         from surrogym_trainer.training.handover import AuditSettings

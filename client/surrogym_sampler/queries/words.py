@@ -24,6 +24,7 @@ class Line:
 def line_of(query: Query, outcome: Outcome, error: str) -> str:
     """Return a line of output about the outcome of a query; ``error`` is empty if there was none."""
     anew = " planned anew" if query.kind == "rollout" and query.replan else ""
+    anew = " of a policy" if query.kind == "rollout" and query.policy else anew
     asked = f", {len(query.actions)} steps{anew}" if query.kind == "rollout" else ""
     return f"query {query.id} ({query.purpose}{asked}) {outcome}{': ' if error else ''}{error}"
 
@@ -32,7 +33,9 @@ def words_of_query(spec: EnvironmentSpec, query: Query | QueryView) -> list[str]
     """Describe a query: its start, then one line for each entry of the action, with a bar for each step."""
     actions = query.actions if isinstance(query, QueryView) or query.kind == "rollout" else [query.action]
     steps = f"{len(actions)} step{'s' * (len(actions) > 1)}"
-    anew = ", each action planned anew from the measured state; expected:" if getattr(query, "replan", False) else ""
+    how = "planned anew" if getattr(query, "replan", False) else "chosen by a policy"
+    acts = getattr(query, "replan", False) or getattr(query, "policy", None)
+    anew = f", each action {how} from the measured state; expected:" if acts else ""
     lines = [f"query {query.id} ({query.purpose}): {steps} from {_start(spec, query)}{anew}"]
     for entry, (low, high) in enumerate(spec.action.ranges):
         values = [action[entry] for action in actions]

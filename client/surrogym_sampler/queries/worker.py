@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from base64 import b64decode
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TypeVar, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from surrogym_client.errors import InvalidInput, LeaseExpired, NotThere
 from surrogym_client.surrogates.waiting import ENDED
@@ -23,16 +23,16 @@ from surrogym_sampler.original.protocol import (
     RolloutEnvironment,
 )
 from surrogym_sampler.original.rollouts import answering
+from surrogym_sampler.queries.acting import Acting, following, replanning
 from surrogym_sampler.queries.failures import Failures, Violations
 from surrogym_sampler.queries.leases import LeaseEnded, Leases
 from surrogym_sampler.queries.pipeline import Pipeline
 from surrogym_sampler.queries.query_limits import check_action, check_environment, check_query
-from surrogym_sampler.queries.replanning import replanning
 from surrogym_sampler.queries.returning import Returning, snapshots_of
 from surrogym_sampler.queries.sample_conversion import reset_seed, sample_of
 from surrogym_sampler.queries.settings import Outcome, SamplerReport, SamplerSettings
 from surrogym_shared.spec import EnvironmentSpec
-from surrogym_shared.wire import ClaimedQueries, NewSample, Phase, Query, StepQuery
+from surrogym_shared.wire import ClaimedQueries, NewSample, Phase, Query, RolloutQuery, StepQuery
 
 # Retries of a request while the server or its storage does not answer.
 PATIENCE = Retries(seconds=900.0, first_delay=0.1, longest_delay=5.0)
@@ -328,19 +328,19 @@ class Sampler:
             taken.append(sample_of(query, step, size))
             return
         assert isinstance(environment, RolloutEnvironment)
-        planner = self._planner() if query.replan and query.snapshot is None else None
+        acting = self._acting(query) if query.snapshot is None else None
         self._leases.check(query)
         if query.snapshot is None:
             state = environment.begin(reset_seed(query, self._spec.design.seed))
         else:
             assert self._returning is not None  # check_query has refused snapshots if the environment has none
             self._returning.begin(query.snapshot)
-            state = np.empty(0)  # only queries that begin at a reset are planned anew
+            state = np.empty(0)  # only in queries that begin at a reset, actions depend on the state
         for number, expected in enumerate(query.actions):
             if self._stopped():
                 return
             self._leases.check(query)
-            action = expected if planner is None else planner(state)
+            action = expected if acting is None else acting(state)
             check_action(self._own, action)
             step = environment.act(np.array(action))
             state = np.asarray(step.next_coordinates, dtype=np.float64)
@@ -351,9 +351,21 @@ class Sampler:
                 snapshot = self._returning.save(taken[-1].next_coordinates)
                 taken[-1] = taken[-1].model_copy(update={"snapshot": snapshot})
 
-    def _planner(self) -> Callable[[NDArray[np.float64]], Sequence[float]] | None:
-        """Return a function that plans an action for a state. Return None and set a remark if nothing can be planned
-        here; the expected actions of the query are applied then."""
+    def _acting(self, query: RolloutQuery) -> Acting | None:
+        """Return a function that chooses an action for a state, if the query asks for one, by its policy or by a
+        planner. Return None and set a remark if nothing can be planned here; the expected actions of the query are
+        applied then.
+
+        Raises:
+            QueryRefused: the policy is not one for this environment.
+        """
+        if query.policy is not None:
+            try:
+                return following(b64decode(query.policy), self._own)
+            except ValueError as error:
+                raise QueryRefused(f"the policy of the trial: {error}") from error
+        if not query.replan:
+            return None
         try:
             return replanning(self._api, self._surrogate, self._spec)
         except Exception as error:  # errors of the server's package, whose classes the client does not import

@@ -490,13 +490,31 @@ def _holds(spec: EnvironmentSpec, coordinates: Array) -> bool:
 
 
 def _succeeds(success: Success, tally: _Tally) -> bool:
-    """Return whether the episode meets every criterion of ``success``."""
+    return _meets(success, tally.held, tally.length, tally.total, terminated=tally.moment.terminated)
+
+
+def _meets(success: Success, held: int, length: int, total: float, *, terminated: bool) -> bool:
+    """Return whether an episode meets every criterion of ``success``. ``held`` is the number of its last steps in which
+    all inequalities hold."""
     return (
-        (not success.hold or tally.held >= success.hold_steps)
-        and (success.min_steps is None or tally.length >= success.min_steps)
-        and (success.terminated is None or tally.moment.terminated == success.terminated)
-        and (success.min_return is None or tally.total >= success.min_return)
+        (not success.hold or held >= success.hold_steps)
+        and (success.min_steps is None or length >= success.min_steps)
+        and (success.terminated is None or terminated == success.terminated)
+        and (success.min_return is None or total >= success.min_return)
     )
+
+
+def succeeded(spec: EnvironmentSpec, next_coordinates: Array, rewards: Array, *, terminated: bool) -> bool:
+    """Return whether an episode of T steps succeeded, from the states (T, C) and the rewards (T,) after its steps. It
+    did if the specification declares no success."""
+    if spec.success is None:
+        return True
+    held = 0
+    for state in next_coordinates[::-1]:
+        if not _holds(spec, state):
+            break
+        held += 1
+    return _meets(spec.success, held, len(rewards), float(rewards.sum()), terminated=terminated)
 
 
 # If a policy leaves the limits no more often than declared, they count as broken with at most this probability.

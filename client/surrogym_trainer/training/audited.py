@@ -27,6 +27,7 @@ from surrogym_trainer.training.settings import (
     prolongs,
 )
 from surrogym_trainer.training.trainer import train
+from surrogym_trainer.training.trials import Trials, allows_trials, is_waiting_for_trials
 
 
 @dataclass
@@ -99,11 +100,13 @@ class AuditedTraining:
         return result, handover
 
     def _first(self) -> TrainResult:
-        if self.rounds is None:
+        rounds, inputs = self.rounds, (self.api, self.name, self.port, self.out, self.settings)
+        tries = rounds is not None and allows_trials(self.port.spec(), self.settings)
+        if rounds and tries and (rounds.queries or is_waiting_for_trials(self.api.surrogate(self.name))):
+            return Trials(*inputs, rounds, self.progress, self.waiting, self.candidates).train()
+        if rounds is None or not rounds.queries:
             return train(self.port, self.out, self._chosen, self.progress)
-        loop = ClosedLoop(
-            self.api, self.name, self.port, self.out, self.settings, self.rounds, self.progress, self.waiting
-        )
+        loop = ClosedLoop(*inputs, rounds, self.progress, self.waiting)
         loop.candidates = self.candidates
         result = loop.train()
         self._unspent = loop.unspent
@@ -145,7 +148,7 @@ class AuditedTraining:
         view = self.api.surrogate(self.name)
         if not needed and view.phase == "ready" and (view.confidence_index or 0.0) >= view.target:
             return False
-        round_ = self.rounds.queries if self.rounds else AUDIT_STEPS
+        round_ = (self.rounds and self.rounds.queries) or AUDIT_STEPS
         left = round_ if self._unspent and self.api.access().role == "admin" else view.budget_left
         wanted = min(round_, left)
         if wanted > 0:

@@ -96,7 +96,7 @@ class LoopSettings:
     reaches the design's target.
     """
 
-    queries: int  # number of real steps in one round (train a policy, then query where it goes)
+    queries: int  # number of real steps in one round (train a policy, then query where it goes); 0: not given
     rounds: int = 3
     # longest time in seconds to wait until samplers have taken the real steps of a round
     patience_seconds: float = 3_600.0
@@ -230,7 +230,7 @@ class ClosedLoop:
         if self.trained:
             now = replace(now, start_from=self.out, trust_policy=False)
         known = self._known[-1] if self._known else None
-        progress = _shifted(self.progress, self._steps + self._visited, whole, known)
+        progress = shifted(self.progress, self._steps + self._visited, whole, known)
         self.trained.append(train(self.port, self.out, now, progress))
         self.candidates.keep(self.trained[-1])
 
@@ -291,9 +291,11 @@ def visit(
     return steps * VISIT_LANES, submitted.confidence_index
 
 
-def _shifted(
+def shifted(
     progress: Callable[[TrainProgress], None] | None, done: int, total: int, known: float | None
 ) -> Callable[[TrainProgress], None] | None:
+    """Return a function that reports the progress of a training that follows ``done`` of ``total`` virtual steps, with
+    the confidence index ``known`` over visited states; None if ``progress`` is None."""
     if progress is None:
         return None
     return lambda now: progress(after(replace(now, visited_confidence=known), done, total))

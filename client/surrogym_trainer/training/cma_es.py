@@ -42,6 +42,7 @@ class CmaEs(PolicySearch):
     sigma: float = 1.0  # initial standard deviation of a parameter
 
     suggested_steps = 10_000_000
+    saves_network = True
     most_steps = None  # no limit: CMA-ES takes far more steps than PPO, but each is far cheaper
 
     def search(self, task: SearchTask) -> Found:

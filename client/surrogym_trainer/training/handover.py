@@ -15,7 +15,9 @@ from surrogym_client.surrogates.waiting import COMPLETED, NobodyAnswers, wait_fo
 from surrogym_client.transport.api import Api
 from surrogym_sampler.original.actions import decode_actions
 from surrogym_sampler.original.protocol import LONGEST_EPISODE
+from surrogym_shared.network import Network
 from surrogym_shared.port import SurrogatePort
+from surrogym_shared.spec import LONGEST_ROLLOUT
 from surrogym_shared.states import LEAST_AUDITED
 from surrogym_shared.wire import QueryView, SampleView, SurrogateView
 from surrogym_trainer.evaluation.audit import (
@@ -43,6 +45,7 @@ from surrogym_trainer.evaluation.promise import UNNOTICED, promise_of
 from surrogym_trainer.evaluation.systematic import Inputs
 from surrogym_trainer.policies.evidence import Audit, Promise
 from surrogym_trainer.policies.predict import Predict
+from surrogym_trainer.training.trials import encoded, needs_trials
 
 MOST_AUDITS = 3  # largest number of audits in one training
 WAY_LANES = 16  # an audit takes real steps at states from this number of virtual episodes of the policy
@@ -276,16 +279,19 @@ def _asked_more(subject: Subject, settings: AuditSettings, q: Array, u: Array) -
 def _asked(subject: Subject, settings: AuditSettings, q: Array, u: Array, *, claims: bool) -> tuple[set[int], set[int]]:
     """Add the queries of an audit, in some of the states q (m, C) that the policy visits, with its actions u (m, F).
 
-    If the design ``claims`` to know the whole sampling range, one of every ``ELSEWHERE`` queries is in a gap between
-    its samples instead, because an error of the model in the gap may have kept the policy away. If the environment
-    can't be set to a state, there is one query: the actions of one virtual episode. The episode is whole if the
-    surrogate's audits may take that many steps. Returns the queries' ids, and the ids of those in gaps.
+    If the design ``claims`` to know the whole sampling range, one of every ``ELSEWHERE`` queries is in a gap
+    between its samples instead, because an error of the model in the gap may have kept the policy away. If the
+    environment can't be set to a state, there is one query: the actions of one virtual episode, or the policy
+    itself where only policies can steer. The episode is whole if the surrogate's audits may take that many steps.
+    Returns the queries' ids, and the ids of those in gaps.
     """
     spec, rng = subject.port.spec(), np.random.default_rng(settings.seed)
     if spec.query == "rollout":
-        steps = length_of_rollout(subject.api.surrogate(subject.name), settings.steps)
+        acting = encoded(subject.predict) if needs_trials(spec) and isinstance(subject.predict, Network) else None
+        view = subject.api.surrogate(subject.name)
+        steps = length_of_rollout(view, settings.steps, LONGEST_EPISODE if acting else LONGEST_ROLLOUT)
         _, actions = way_of(subject, 1, steps)
-        queries = subject.api.add_queries(subject.name, rollouts=[actions.tolist()], audit=True)
+        queries = subject.api.add_queries(subject.name, rollouts=[actions.tolist()], policy=acting, audit=True)
         return {query.id for query in queries}, set()
     elsewhere = settings.steps // ELSEWHERE if claims else 0
     chosen = places(spec, q, u, settings.steps - elsewhere, rng)
@@ -300,11 +306,12 @@ def _asked(subject: Subject, settings: AuditSettings, q: Array, u: Array, *, cla
     return set(numbers), set(numbers[len(chosen) :])
 
 
-def length_of_rollout(view: SurrogateView, steps: int) -> int:
+def length_of_rollout(view: SurrogateView, steps: int, most: int = LONGEST_ROLLOUT) -> int:
     """Return the number of real steps of an audit that begins with a reset: a whole episode or, if that is shorter, one
-    audit's share of the steps that all audits may take. It is at least ``steps``, unless an episode is shorter."""
+    audit's share of the steps that all audits may take. It is at least ``steps``, unless an episode is shorter, and at
+    most ``most``, unless the specification allows longer rollouts."""
     spec = view.spec
-    longest = min(spec.time_limit or LONGEST_EPISODE, spec.max_rollout or LONGEST_EPISODE)
+    longest = min(spec.time_limit or LONGEST_EPISODE, spec.max_rollout or most)
     share = max(view.budget, LEAST_AUDITED) // MOST_AUDITS
     return min(longest, max(min(share, _left_for_audits(view)), steps + spec.unknown_steps))
 

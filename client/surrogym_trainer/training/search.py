@@ -96,6 +96,7 @@ class PolicySearch(ABC):
     prolongable: ClassVar[bool] = False  # whether the search supports task.prolong
     whole_episodes: ClassVar[bool] = True  # whether episodes always start as declared and are never shortened
     tracked: ClassVar[bool] = False  # whether the search logs curves to settings.tracker
+    saves_network: ClassVar[bool] = False  # whether policies are networks of arrays, which a sampler can run
     resumable: ClassVar[bool] = True  # whether the search can start from a saved policy, which the closed loop needs
 
     @abstractmethod

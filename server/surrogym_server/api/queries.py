@@ -86,7 +86,7 @@ def fail(name: str, query_id: int, body: Annotated[FailQuery, example(examples.F
     status_code=201,
     summary="Add queries of your own",
     dependencies=[SAMPLE],
-    openapi_extra=json_up_to(128),
+    openapi_extra=json_up_to(512),
     responses=documented(Code.UNKNOWN_SURROGATE, Code.IDEMPOTENCY_CONFLICT, Code.INVALID_REQUEST),
 )
 def add_queries(name: str, body: Annotated[AddQueries, example(examples.ADD_QUERIES)], use: Use) -> QueryList:
@@ -99,7 +99,7 @@ def add_queries(name: str, body: Annotated[AddQueries, example(examples.ADD_QUER
     status_code=201,
     summary="Request the real steps of an audit",
     dependencies=[TRAIN],
-    openapi_extra=json_up_to(128),
+    openapi_extra=json_up_to(512),
     responses=documented(Code.UNKNOWN_SURROGATE, Code.IDEMPOTENCY_CONFLICT, Code.BEYOND_BUDGET, Code.INVALID_REQUEST),
 )
 def audit(name: str, body: Annotated[AuditModel, example(examples.ADD_QUERIES)], use: Use) -> QueryList:

@@ -8,7 +8,7 @@ from fastapi import APIRouter
 from fastapi.responses import Response
 
 from surrogym_server.api import examples
-from surrogym_server.api.door import READ, TRAIN, DoorRoute, example
+from surrogym_server.api.door import READ, TRAIN, DoorRoute, example, json_up_to
 from surrogym_server.api.problems import documented
 from surrogym_server.api.state import Use
 from surrogym_server.convert import sessions
@@ -32,6 +32,7 @@ SESSION_ERRORS = (Code.UNKNOWN_SESSION, Code.SESSION_EXPIRED, Code.INVALID_REQUE
     status_code=201,
     summary="Open a virtual environment",
     dependencies=[TRAIN],
+    openapi_extra=json_up_to(128),
     responses=documented(
         Code.UNKNOWN_SURROGATE,
         Code.NO_MODEL,

@@ -117,15 +117,19 @@ async def delete(name: str, use: Use) -> Response:
     "/{name}/improve",
     summary="Request more queries from the design",
     dependencies=[TRAIN],
+    openapi_extra=json_up_to(512),
     responses=documented(Code.UNKNOWN_SURROGATE, Code.IDEMPOTENCY_CONFLICT, Code.INVALID_REQUEST, Code.BEYOND_BUDGET),
 )
 def improve(
     name: str, body: Annotated[Improve, example(examples.IMPROVE)], request: Request, use: Use
 ) -> ImprovedSurrogate:
     """Request more queries from the design. The acquisition chooses them, weighted by the submitted occupancy (states
-    that policies visited). The budget must have enough real steps left; steps of open queries and of earlier requests
-    count as used. For a token of role ``admin`` the budget is raised if needed, and ``budget_raised_by`` is the
-    increase."""
+    that policies visited). With ``trial``, the query is an episode in which a policy acts. The budget must have enough
+    real steps left; steps of open queries and of earlier requests count as used. For a token of role ``admin`` the
+    budget is raised if needed, and ``budget_raised_by`` is the increase."""
     may_raise = role_of(request.scope) == "admin"
-    granted = use.designer.improve(name, body.queries, body.checkpoint, body.idempotency_key, raise_budget=may_raise)
+    trial = None if body.trial is None else resources.trial(body.trial)
+    granted = use.designer.improve(
+        name, body.queries, body.checkpoint, body.idempotency_key, raise_budget=may_raise, trial=trial
+    )
     return resources.improved(use.surrogates.status(name), granted.raised)

@@ -11,7 +11,6 @@ from surrogym_shared import spec as wire
 from surrogym_shared.rates import rates
 
 MONTE_CARLO = 1024  # number of points that estimate the confidence index, if the specification gives no number
-LONGEST_ROLLOUT = 200  # largest number of steps of a requested rollout, if the specification gives no number
 
 
 def definition_from_spec(spec: wire.EnvironmentSpec) -> core.EnvironmentDefinition:
@@ -109,7 +108,7 @@ def _choice(given: str | wire.Choice | None, usual: str) -> Choice:
 
 
 def _max_rollout(spec: wire.EnvironmentSpec) -> int:
-    longest = spec.max_rollout or LONGEST_ROLLOUT
+    longest = spec.max_rollout or wire.LONGEST_ROLLOUT
     return longest if spec.time_limit is None else min(longest, spec.time_limit)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from base64 import b64decode, b64encode
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
@@ -109,7 +110,26 @@ def requested(body: replies.AddQueries) -> list[Query]:
             f"expected one action for each row of coordinates, got {len(u)} actions and {len(q)} rows of coordinates"
         )
     steps = [Query.step(*step) for step in zip(q.tolist(), u.tolist(), strict=True)]
-    return steps + [Query.rollout(numbers("rollouts", actions).tolist()) for actions in body.rollouts or ()]
+    policy = None if body.policy is None else _decoded(body.policy)
+    return steps + [
+        Query.rollout(numbers("rollouts", actions).tolist(), policy=policy) for actions in body.rollouts or ()
+    ]
+
+
+def trial(body: replies.Trial) -> Query:
+    """Return the query of a trial.
+
+    Raises:
+        InvalidInput: rows of actions have different lengths, or the policy is not base64.
+    """
+    return Query.rollout(numbers("actions", body.actions).tolist(), policy=_decoded(body.policy))
+
+
+def _decoded(policy: str) -> bytes:
+    try:
+        return b64decode(policy, validate=True)
+    except ValueError as error:
+        raise InvalidInput(f"policy: expected a policy's file in base64, got other characters: {error}") from error
 
 
 def claimed(claim: Claim, lease_seconds: float) -> replies.ClaimedQueries:
@@ -128,7 +148,11 @@ def _leased(query: LeasedQuery, lease_seconds: float) -> replies.Query:
     }
     if query.kind == "rollout":
         return replies.RolloutQuery(
-            **common, actions=_rows(query.actions), snapshot=query.snapshot, replan=query.replan
+            **common,
+            actions=_rows(query.actions),
+            snapshot=query.snapshot,
+            replan=query.replan,
+            policy=None if query.policy is None else b64encode(query.policy).decode(),
         )
     return replies.StepQuery(**common, coordinates=list(query.coordinates), action=list(query.action))
 
@@ -138,7 +162,7 @@ def query_list(records: Iterable[QueryRecord]) -> replies.QueryList:
 
 
 def query_view(record: QueryRecord) -> replies.QueryView:
-    fields = {"kind": record.kind, "coordinates": record.coordinates or None}
+    fields = {"kind": record.kind, "coordinates": record.coordinates or None, "policy": record.policy is not None}
     return replies.QueryView(**vars(record) | fields)
 
 

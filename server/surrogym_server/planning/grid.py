@@ -11,12 +11,11 @@ from numpy.typing import NDArray
 
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.models.abilities import ArraySteps, GridPolicy
-from surrogym_shared.spec import BoxAction, DiscreteAction
+from surrogym_shared.spec import MOST_PLANNED, BoxAction, DiscreteAction
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 
-MOST_COORDINATES = 4
 NODES = 100_000  # largest number of nodes of a grid
 MOST_ALONG = 201  # largest number of nodes along one coordinate
 LEVELS = {1: 5, 2: 3, 3: 3}  # number of values of each entry that value iteration tries, by the number of entries
@@ -95,8 +94,8 @@ def discount_of(time_limit: int | None) -> float:
 def unfit(definition: EnvironmentDefinition) -> str | None:
     """Return what a grid needs and the environment lacks, in words; None if nothing is missing."""
     action, coordinates = definition.action, len(definition.coordinates)
-    if coordinates > MOST_COORDINATES:
-        return f"at most {MOST_COORDINATES} coordinates, got {coordinates}"
+    if coordinates > MOST_PLANNED:
+        return f"at most {MOST_PLANNED} coordinates, got {coordinates}"
     if isinstance(action, DiscreteAction) or (isinstance(action, BoxAction) and action.size in LEVELS):
         return None
     return "one discrete action, or at most three continuous ones"

@@ -26,7 +26,7 @@ from surrogym_server.errors import (
     UnknownSurrogate,
 )
 from surrogym_server.plugins import in_one_line
-from surrogym_server.services.definitions import Definitions
+from surrogym_server.services.definitions import Definitions, check_trial
 from surrogym_server.services.metrics import ProcessMetrics
 from surrogym_server.services.notices import Notices
 from surrogym_server.services.surrogates import Plan
@@ -39,6 +39,7 @@ from surrogym_server.storage.records import (
     NewDesign,
     NewModel,
 )
+from surrogym_shared.nouns import Query
 
 logger = logging.getLogger(__name__)
 
@@ -183,9 +184,16 @@ class Designer:
             del self._tasks[name]
 
     def improve(
-        self, name: str, queries: int, checkpoint: str | None, key: str | None, *, raise_budget: bool
+        self,
+        name: str,
+        queries: int,
+        checkpoint: str | None,
+        key: str | None,
+        *,
+        raise_budget: bool,
+        trial: Query | None = None,
     ) -> Granted:
-        """Request that the next fit of the surrogate ``name`` chooses more queries.
+        """Request that the next fit of the surrogate ``name`` chooses more queries, or a trial of a policy.
 
         Args:
             name: name of the surrogate.
@@ -194,9 +202,11 @@ class Designer:
                 one, if any.
             key: idempotency key of the request.
             raise_budget: whether to raise the budget as far as the queries need.
+            trial: query of ``queries`` steps in which a policy acts; None if the fit chooses.
 
         Raises:
-            InvalidInput: no occupancy was submitted under the name ``checkpoint``.
+            InvalidInput: no occupancy was submitted under the name ``checkpoint``, or the trial does not fit the
+                surrogate.
             BeyondBudget: the budget has too few real steps left, and ``raise_budget`` is False.
         """
         if checkpoint is not None and self._storage.occupancy.get(name, checkpoint) is None:
@@ -206,8 +216,10 @@ class Designer:
             )
         if checkpoint is None and (latest := self._storage.occupancy.latest(name)) is not None:
             checkpoint = latest.checkpoint
+        if trial is not None:
+            trial = check_trial(self._definitions.get(name), trial, queries)
         granted = self._storage.designs.improve(
-            name, queries, checkpoint=checkpoint, key=key, raise_budget=raise_budget
+            name, queries, checkpoint=checkpoint, trial=trial, key=key, raise_budget=raise_budget
         )
         self._notices.post(name)
         return granted

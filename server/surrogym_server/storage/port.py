@@ -140,6 +140,7 @@ class Designs(ABC):
         queries: int,
         *,
         checkpoint: str | None = None,
+        trial: Query | None = None,
         key: str | None = None,
         raise_budget: bool = False,
     ) -> Granted:
@@ -149,6 +150,7 @@ class Designs(ABC):
             name: name of the surrogate.
             queries: number of real steps of these queries.
             checkpoint: name of the occupancy that weights the choice; None for no weights.
+            trial: query of so many steps that is asked at once, so that no fit has to choose; None if a fit chooses.
             key: idempotency key of the request.
             raise_budget: whether to raise the budget by the missing steps.
 

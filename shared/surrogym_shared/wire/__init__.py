@@ -45,7 +45,7 @@ _NAMES = {
     "queries": (
         "QUERY_LEASE_SECONDS AddedSamples AddQueries AddSamples AuditModel ClaimedQueries ClaimQueries "
         "DroppedSnapshots DropSnapshots FailQuery Improve LeasedQuery NewSample Query QueryList QueryView RenewLease "
-        "ReportSteps RolloutQuery SamplePage SampleView SnapshotList SnapshotView StepQuery WithdrawnQueries "
+        "ReportSteps RolloutQuery SamplePage SampleView SnapshotList SnapshotView StepQuery Trial WithdrawnQueries "
         "WithdrawQueries"
     ),
     "service": "Access Event Health Ready",

@@ -26,6 +26,8 @@ from surrogym_shared.wire.surrogates import Ledger
 
 QUERY_LEASE_SECONDS = 60.0  # default duration of a sampler's lease of a query
 
+MAX_POLICY = 3 * 2**17  # largest number of characters of the policy of a trial
+
 ActionSequence = Annotated[list[Vector], Field(min_length=1, max_length=MAX_ROLLOUT_QUERY)]
 
 
@@ -85,6 +87,11 @@ class RolloutQuery(LeasedQuery):
         default=False,
         description="whether to plan each action anew on the surrogate's latest model, from the measured state; "
         "``actions`` are then only expected, and to be applied where nothing can be planned",
+    )
+    policy: str | None = Field(
+        default=None,
+        description="file of the policy, in base64, that chooses each action from the measured state; ``actions`` are "
+        "then only expected; null: apply ``actions``",
     )
 
 
@@ -149,6 +156,9 @@ class QueryView(Reply):
     replan: bool = Field(
         default=False, description="whether the sampler plans each action anew, so that ``actions`` are only expected"
     )
+    policy: bool = Field(
+        default=False, description="whether a policy chooses each action, so that ``actions`` are only expected"
+    )
     attempts: int = Field(description="how often the query has been leased so far")
     sampler: str | None = Field(description="name of the sampler that claimed the query last; null if none has")
     error: str | None = Field(description="error of the last lease that ended without an answer; null if there is none")
@@ -177,6 +187,11 @@ class AddQueries(Request):
     action: Matrix | None = Field(default=None, description="(m, F) action to apply in each of the m states")
     rollouts: Annotated[list[ActionSequence], Field(min_length=1, max_length=MAX_CLAIM)] | None = Field(
         default=None, description="action sequences, each (T, F), to apply after a reset"
+    )
+    policy: Annotated[str, Field(max_length=MAX_POLICY)] | None = Field(
+        default=None,
+        description="file of the policy, in base64, that chooses each action of the rollouts, whose actions are then "
+        "only expected; null: apply the actions",
     )
     idempotency_key: Key | None = Field(default=None, description="a repeat with the same key adds nothing")
 
@@ -358,8 +373,19 @@ class ReportSteps(Request):
     idempotency_key: Key = Field(description="a repeat with the same key adds nothing")
 
 
+class Trial(Request):
+    """An episode of the original environment, from a reset, in which the sampler lets a policy choose each action."""
+
+    policy: Annotated[str, Field(max_length=MAX_POLICY)] = Field(
+        description="file of the policy, in base64, as ``Network.save`` writes it"
+    )
+    actions: ActionSequence = Field(
+        description="(T, F) actions that the model expects of the policy; T is the largest number of steps"
+    )
+
+
 class Improve(Request):
-    """Request for further queries, which the design's acquisition chooses.
+    """Request for further queries, which the design's acquisition chooses, or for a trial of a policy.
 
     The budget must have enough real steps left. With a token of role ``admin``, the budget is raised as needed.
     """
@@ -374,5 +400,10 @@ class Improve(Request):
         default=None,
         description="name of the submitted occupancy (states that policies visited) near which to choose the queries; "
         "null: the latest one, if there is any",
+    )
+    trial: Trial | None = Field(
+        default=None,
+        description="trial of a policy, of as many steps as ``queries``, instead of queries that the acquisition "
+        "chooses; null: no trial",
     )
     idempotency_key: Key | None = Field(default=None, description="a repeat with the same key adds nothing")

@@ -253,6 +253,24 @@ def test_a_repeated_improve_request_raises_the_budget_and_reaches_the_next_fit_o
     assert storage.surrogates.get(due).extra_queries == 2, "asked for after the fit began"
 
 
+def test_a_trial_is_asked_at_once_within_the_budget_and_only_once(storage: Storage, due: str) -> None:
+    trial = Query.rollout([[0.5], [0.25]], policy=b"arrays")
+    before = storage.surrogates.get(due)
+    for _ in range(2):
+        granted = storage.designs.improve(due, 2, trial=trial, key="k", raise_budget=True)
+        assert (granted.record.extra_queries, granted.record.phase) == (before.extra_queries, "sampling")
+        assert granted.record.budget == before.budget + granted.raised
+    with pytest.raises(IdempotencyConflict):
+        storage.designs.improve(due, 2, trial=replace(trial, policy=b"others"), key="k")
+    pending = storage.queries.list(due, ("pending",))
+    assert [(query.policy, query.actions, query.purpose) for query in pending] == [
+        (b"arrays", trial.actions, "adaptive")
+    ]
+    (leased,) = storage.queries.claim(due, "a", 9, LONG)
+    assert leased.policy == b"arrays"
+    assert storage.designs.due() == [], "the fit waits for the trial"
+
+
 def test_an_improve_request_does_not_raise_a_budget_that_is_large_enough(storage: Storage, due: str) -> None:
     granted = storage.designs.improve(due, 5, raise_budget=True)
     assert (granted.record.budget, granted.raised) == (30, 0)

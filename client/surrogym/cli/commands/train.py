@@ -96,7 +96,7 @@ def command(
     shown = partial(
         words_of_result,
         asked=search.steps,
-        closed_loop=loop.improve > 0,
+        closed_loop=bool(loop.improve),
         server=named,
         env_option=env_option(spec.environment),
     )

@@ -94,6 +94,7 @@ class FastPpo(PolicySearch):
     suggested_steps = 450_000
     prolongable = True
     whole_episodes = False
+    saves_network = True
 
     def __post_init__(self) -> None:
         for name, (low, high) in RANGES.items():

@@ -3,6 +3,7 @@
 from surrogym_server.sampling.rules.ends import seek_end
 from surrogym_server.sampling.rules.excursions import take_excursion
 from surrogym_server.sampling.rules.initial import complete_initial_rollouts
+from surrogym_server.sampling.rules.left import leave_to_trials
 from surrogym_server.sampling.rules.past import see_the_past
 from surrogym_server.sampling.rules.planned import plan_rollouts
 from surrogym_server.sampling.rules.repeats import repeat_steps
@@ -18,6 +19,7 @@ ROLLOUT_RULES: tuple[Rule, ...] = (
     take_excursion,
     see_the_past,
     complete_initial_rollouts,
+    leave_to_trials,
     seek_end,
     try_planner,
     plan_rollouts,

@@ -93,18 +93,24 @@ class SqlDesigns(port.Designs):
         queries: int,
         *,
         checkpoint: str | None = None,
+        trial: Query | None = None,
         key: str | None = None,
         raise_budget: bool = False,
     ) -> Granted:
-        body = fingerprint(queries, checkpoint)
+        body = fingerprint(queries, checkpoint, None if trial is None else checksum(trial.policy or b""))
         with self._database.write() as connection:
             surrogate = hold(connection, name)
             raised = recall(connection, surrogate, "ask", key, body)
             if raised is None:
                 before = surrogate_rows.read(connection, name)
                 raised = _to_raise(connection, before, queries, allowed=raise_budget)
-                extra, budget = before.extra_queries + queries, before.budget + raised
-                touch(connection, surrogate, extra_queries=extra, budget=budget, checkpoint=checkpoint)
+                changes: dict[str, Any] = {"budget": before.budget + raised, "checkpoint": checkpoint}
+                if trial is None:
+                    changes["extra_queries"] = before.extra_queries + queries
+                else:
+                    changes["phase"] = "sampling"
+                    insert_queries(connection, surrogate, [trial], "adaptive", before.round)
+                touch(connection, surrogate, **changes)
                 remember(connection, surrogate, "ask", key, body, raised)
             return Granted(surrogate_rows.read(connection, name), raised)
 

@@ -57,7 +57,7 @@ from surrogym_server.storage.sql.tables import leases, queries, requests, sample
 from surrogym_shared.nouns import Query, Vector
 from surrogym_shared.states import LEAST_AUDITED, Purpose, QueryStatus
 
-CONTENT = [getattr(queries.c, name) for name in ("coordinates", "action", "steps", "snapshot", "replan")]
+CONTENT = [getattr(queries.c, name) for name in ("coordinates", "action", "steps", "snapshot", "replan", "policy")]
 STATE = [getattr(queries.c, name) for name in ("id", "purpose", "status", "round", "attempts", "sampler", "error")]
 
 _EARLIER = queries.alias()
@@ -686,12 +686,14 @@ def _columns(query: Query) -> dict[str, Any]:
         "steps": query.steps,
         "snapshot": query.snapshot,
         "replan": query.replan,
+        "policy": query.policy,
     }
 
 
 def query_in(row: Row[Any]) -> dict[str, Any]:
-    """Convert a row with columns ``coordinates``, ``action``, ``steps``, ``snapshot`` and ``replan`` to fields of a
-    ``Query``."""
+    """Convert a row with columns ``coordinates``, ``action``, ``steps``, ``snapshot``, ``replan`` and ``policy`` to
+    fields of a ``Query``."""
     size = max(1, len(row.action) // row.steps)
     actions = tuple(row.action[first : first + size] for first in range(0, len(row.action), size))
-    return {"coordinates": row.coordinates, "actions": actions, "snapshot": row.snapshot, "replan": row.replan}
+    how = {"snapshot": row.snapshot, "replan": row.replan, "policy": row.policy}
+    return {"coordinates": row.coordinates, "actions": actions, **how}

@@ -203,6 +203,7 @@ queries = sa.Table(
     sa.Column(
         "replan", sa.Boolean, nullable=False, server_default=sa.false()
     ),  # whether the sampler plans actions anew
+    sa.Column("policy", sa.LargeBinary),  # file of the policy that chooses the actions of a trial; NULL: no trial
     # Whether the query was chosen only because ``improve`` requested more.
     sa.Column("extra", sa.Boolean, nullable=False, server_default=sa.false()),
     sa.Column("attempts", sa.Integer, nullable=False),

@@ -1,0 +1,57 @@
+"""Actions that are chosen at each step, in the process that has the machine, from the state that was measured."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogym_client.environments.file_factories import planner_of
+from surrogym_client.transport.api import Api
+from surrogym_shared.network import Network, bounds_of
+from surrogym_shared.port import HORIZON
+from surrogym_shared.spec import EnvironmentSpec
+from surrogym_shared.surrogate_file import RealSamples, SurrogateFile
+from surrogym_shared.terms import observe
+
+Acting = Callable[[NDArray[np.float64]], Sequence[float]]
+
+
+def replanning(api: Api, surrogate: str, spec: EnvironmentSpec) -> Acting:
+    """Return a function from a state (C,) to the action (F,) that a planner on a surrogate's latest model takes there.
+
+    The model is downloaded first, so the steps need no network. The planner is then made, in some seconds.
+
+    Raises:
+        SurrogymClientError: the server can't be reached, or has no model.
+        ImportError, TypeError, ValueError: this installation, the model or the environment does not allow planning.
+    """
+    model = api.export_model(surrogate, api.model(surrogate).version)
+    samples = RealSamples.none(len(spec.coordinates), spec.action.size)
+    planner = planner_of(SurrogateFile(surrogate, spec, model, samples).to_bytes(), HORIZON, spec.design.seed, {})
+    return lambda state: planner.from_states(np.asarray(state, dtype=np.float64)[None])[0].tolist()
+
+
+def following(policy: bytes, spec: EnvironmentSpec) -> Acting:
+    """Return a function from a state (C,) to the action (F,) of a policy, given the content of its file.
+
+    The file contains arrays; nothing is unpickled.
+
+    Raises:
+        ValueError: the file is not a network of arrays, or not one for this environment.
+    """
+    network = Network.load(policy)
+    if len(network.mean) != len(spec.observation) or network.counts != spec.action.policy_counts:
+        raise ValueError(
+            f"expected a policy of {len(spec.observation)} observation entries and the environment's action, got one "
+            f"of {len(network.mean)} entries"
+        )
+    low, high = bounds_of(spec)
+
+    def act(state: NDArray[np.float64]) -> Sequence[float]:
+        action = np.reshape(network(observe(spec, np.asarray(state, dtype=np.float64)[None])), -1).astype(np.float64)
+        chosen: list[float] = (action if network.counts else np.clip(action, low, high)).tolist()
+        return chosen
+
+    return act

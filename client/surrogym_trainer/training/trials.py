@@ -1,0 +1,204 @@
+"""Learn by trying, where the original environment can only be reset: a policy is trained, a sampler runs it for an
+episode of the original environment (a trial), the model learns from these steps, and another policy is trained.
+
+A sequence of actions that was planned beforehand leaves the states that matter as soon as the model is a little wrong.
+A policy reacts to what was measured, and takes the machine where good policies go.
+"""
+
+from __future__ import annotations
+
+import math
+from base64 import b64encode
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogym_client.environments.lanes import Lanes, session_request
+from surrogym_client.surrogates.waiting import COMPLETED, wait_for_design
+from surrogym_client.transport.api import Api
+from surrogym_sampler.original.protocol import LONGEST_EPISODE
+from surrogym_shared.network import Network
+from surrogym_shared.port import SurrogatePort
+from surrogym_shared.spec import MOST_PLANNED, EnvironmentSpec
+from surrogym_shared.wire import SurrogateView, Trial
+from surrogym_trainer.evaluation.evaluator import succeeded
+from surrogym_trainer.evaluation.imagined import imagined_returns
+from surrogym_trainer.policies.files import load_network
+from surrogym_trainer.training.closed_loop import CLEARLY, EPISODES, Candidates, LoopSettings, shifted
+from surrogym_trainer.training.search import planned_steps, search_for, with_algorithm
+from surrogym_trainer.training.settings import (
+    TrainingInterrupted,
+    TrainProgress,
+    TrainResult,
+    TrainSettings,
+    chosen_for,
+)
+from surrogym_trainer.training.trainer import train
+
+VISITED = 0.5  # default share of virtual episodes that start at states of real steps, where all lags are possible ones
+SHORTEST = 0.25  # smallest share of an episode that is worth a trial
+MOST_ROUNDS = 20  # largest number of trials, if no number is requested
+NOTICEABLE = 0.02  # share of a policy's gain over an untrained one; a smaller change does not matter
+
+
+def needs_trials(spec: EnvironmentSpec) -> bool:
+    """Whether only trained policies can steer an environment: it can only be reset, has no limits that a trial could
+    break, and more coordinates than a planner can steer through."""
+    return spec.access == "reset" and spec.limits is None and len(spec.coordinates) > MOST_PLANNED
+
+
+def allows_trials(spec: EnvironmentSpec, settings: TrainSettings) -> bool:
+    """Whether policies of a search try an environment: only they can steer it, and they are networks of arrays."""
+    return needs_trials(spec) and search_for(with_algorithm(settings, spec)).saves_network
+
+
+def encoded(policy: Network) -> str:
+    """Return the content of a policy's file in base64."""
+    return b64encode(policy.to_bytes()).decode()
+
+
+def is_waiting_for_trials(view: SurrogateView) -> bool:
+    """Whether the design has ended and is not ready, its budget has steps left, and a sampler is running."""
+    return view.phase in COMPLETED and view.phase != "ready" and view.budget_left > 0 and bool(view.samplers)
+
+
+@dataclass
+class Trials:
+    """Train policies, each with a new network, and let the best one try an episode after each training.
+
+    The trials end when one has succeeded, the model that has learned from it expects no less of its policy than before,
+    and no other policy is clearly better in that model; or after the number of rounds; or when the budget is spent. A
+    trial succeeds by the criterion of the specification, if there is one.
+
+    Attributes:
+        api: the connection to the server.
+        name: name of the surrogate.
+        port: the interface of the surrogate.
+        out: file to write the policy to, after every training.
+        settings: settings of each training.
+        rounds: number of trials and of their steps; without a number of steps, a trial is a whole episode, and the
+            trials take what is left of the budget.
+        progress: called after every rollout, with steps summed over the trainings.
+        waiting: called each time the surrogate is polled, while a sampler runs the policy.
+        candidates: policies of the trainings.
+    """
+
+    api: Api
+    name: str
+    port: SurrogatePort
+    out: Path
+    settings: TrainSettings
+    rounds: LoopSettings
+    progress: Callable[[TrainProgress], None] | None = None
+    waiting: Callable[[SurrogateView], None] | None = None
+    candidates: Candidates = field(default_factory=Candidates)
+    trained: list[TrainResult] = field(default_factory=list, init=False)
+
+    def train(self) -> TrainResult:
+        """Return the policy that earns most in the last model, with the steps and seconds of all trainings.
+
+        Raises:
+            DesignUnfinished: no sampler answered the query of a trial in time.
+            TrainingInterrupted: Ctrl-C was pressed when there was a policy already.
+            ValueError: the settings don't fit the search.
+            SurrogymClientError: the server can't be reached, or refuses a request.
+        """
+        tried: tuple[Network, NDArray[np.float64]] | None = None
+        try:
+            for number in range(self._most + 1):
+                best = self._learn(number)
+                steps = self._steps_of_a_trial() if number < self._most else 0
+                if not steps or (tried is not None and self._confirms(*tried, best)):
+                    break
+                policy = load_network(best.path)
+                before = self._earned(policy)
+                tried = (policy, before) if self._try(policy, steps, number) else None
+        except TrainingInterrupted as interruption:
+            self.trained.append(interruption.result)
+            raise TrainingInterrupted(self._whole(interruption.result)) from None
+        except KeyboardInterrupt:
+            if self.trained:
+                raise TrainingInterrupted(self._whole(self.trained[-1])) from None
+            raise
+        return self._whole(best)
+
+    @property
+    def _most(self) -> int:
+        return self.rounds.rounds if self.rounds.queries else MOST_ROUNDS
+
+    def _learn(self, number: int) -> TrainResult:
+        """Train a policy with a new network, and return the best one so far in the present model."""
+        settings = self._chosen
+        planned, done = planned_steps(settings), sum(result.virtual_steps for result in self.trained)
+        visited = VISITED if settings.start_box is None and settings.start_visited is None else settings.start_visited
+        now = replace(settings, seed=settings.seed + number, total_steps=planned, start_visited=visited, prolong=False)
+        progress = shifted(self.progress, done, planned * (self._most + 1), None)
+        self.trained.append(train(self.port, self.out, now, progress))
+        self.candidates.keep(self.trained[-1])
+        return self.candidates.best(self.port, self.trained[-1], self._chosen)
+
+    def _confirms(self, policy: Network, before: NDArray[np.float64], best: TrainResult) -> bool:
+        """Whether the model, which has learned from the trial of a policy, expects no less of it than ``before`` (e,),
+        its returns in e virtual episodes, and nothing clearly better of the best policy."""
+        now, other = self._earned(policy), self._earned(load_network(best.path))
+        untrained = best.untrained or 0.0
+        small = NOTICEABLE * abs(float(now.mean()) - untrained)
+        return _more(before, now) <= small and _more(other, now) <= small
+
+    def _earned(self, policy: Network) -> NDArray[np.float64]:
+        return imagined_returns(self.port, policy, EPISODES, self.settings.seed, **self._chosen.judging)
+
+    def _try(self, policy: Network, steps: int, number: int) -> bool:
+        """Let a policy try an episode of at most so many steps, and return whether it succeeded."""
+        view = self.api.surrogate(self.name)
+        actions = expected_actions(self.port, policy, steps, self.settings.seed + number)
+        trial = Trial(policy=encoded(policy), actions=actions)
+        self.api.improve(self.name, steps, trial=trial)
+        wait_for_design(self.api, self.name, self.rounds.patience_seconds, self.waiting, after_round=view.round)
+        asked = max(query.id for query in self.api.queries(self.name) if query.policy)
+        taken = [sample for sample in self.api.samples(self.name) if sample.query_id == asked]
+        states, rewards = np.array([s.next_coordinates for s in taken]), np.array([s.reward for s in taken])
+        return bool(taken) and succeeded(self.port.spec(), states, rewards, terminated=taken[-1].terminated)
+
+    def _steps_of_a_trial(self) -> int:
+        view, spec = self.api.surrogate(self.name), self.port.spec()
+        longest = min(spec.time_limit or LONGEST_EPISODE, spec.max_rollout or LONGEST_EPISODE, LONGEST_EPISODE)
+        if self.rounds.queries:
+            return min(longest, self.rounds.queries)
+        return min(longest, view.budget_left) if view.budget_left >= SHORTEST * longest else 0
+
+    @property
+    def _chosen(self) -> TrainSettings:
+        return chosen_for(self.api.surrogate(self.name), with_algorithm(self.settings, self.port.spec()))
+
+    def _whole(self, result: TrainResult) -> TrainResult:
+        return replace(
+            result,
+            virtual_steps=sum(one.virtual_steps for one in self.trained),
+            seconds=sum(one.seconds for one in self.trained),
+            lost_episodes=sum(one.lost_episodes for one in self.trained),
+        )
+
+
+def _more(some: NDArray[np.float64], others: NDArray[np.float64]) -> float:
+    """Return by how much the mean of returns (e,) clearly exceeds that of others (e,), from the same starts."""
+    more = some - others
+    return float(more.mean()) - CLEARLY * float(more.std(ddof=1)) / math.sqrt(len(more))
+
+
+def expected_actions(port: SurrogatePort, policy: Network, steps: int, seed: int) -> list[list[float]]:
+    """Return the actions (T, F) of a policy in T virtual steps, from the declared starts."""
+    lanes = Lanes(port, session_request(1, "same_step", {"seed": seed, "start_box": 0.0}))
+    actions = []
+    try:
+        observation = lanes.reset().observation
+        for _ in range(steps):
+            action = policy(observation)
+            actions.append(np.reshape(action, -1).astype(float).tolist())
+            observation = lanes.step(action).result.observation
+    finally:
+        lanes.close()
+    return actions

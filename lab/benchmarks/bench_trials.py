@@ -1,0 +1,174 @@
+"""From a cold machine that can only be reset to a policy: real steps, return, success and promise, by the commands that
+a person gives.
+
+Each run starts a server and a sampler, registers the machine within a budget of real steps, and trains with
+``surrogym train``, whose policies try episodes with what the design leaves of the budget. A policy that is not trusted
+then is audited with whole episodes. It is evaluated in
+real episodes, from which nothing is learned. The machines of ``examples/machines`` are programs whose seed draws the
+parameters; their lags are those that ``surrogym doctor --history 60`` proposes, with larger ranges. Prints one line for
+each run, and appends it to ``trials.csv``; a run that is there is not repeated.
+
+    python lab/benchmarks/bench_trials.py --seeds 200 201 202 203 204 --machines belt furuta
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from common import OUT
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
+
+from support.server import running_server
+from surrogym_client.transport import Api
+from surrogym_sampler import original
+from surrogym_shared.spec import EnvironmentSpec, with_history
+
+ROOT = Path(__file__).parents[2]
+MINUTES = 30.0  # longest time of one command
+
+
+@dataclass(frozen=True)
+class Machine:
+    """A machine, and the budget of its design and trials.
+
+    Attributes:
+        name: environment, as ``--env`` names it; ``{seed}`` is the seed that draws its parameters.
+        budget: largest number of real steps without audits.
+        changes: number of earlier changes of a coordinate that are declared.
+        actions: number of earlier actions that are declared.
+        largest: largest change of each coordinate in one step.
+    """
+
+    name: str
+    budget: int
+    changes: int = 0
+    actions: int = 0
+    largest: tuple[float, ...] = ()
+
+
+def _program(name: str) -> str:
+    return f"exec:{sys.executable} {ROOT}/examples/machines/{name}.py --seed {{seed}}"
+
+
+MACHINES = {
+    "belt": Machine(_program("belt"), 450, 2, 1, (0.12, 0.6)),
+    "furuta": Machine(_program("furuta"), 1_000, 1, 2, (0.6, 0.8)),
+    "double_pendulum": Machine(_program("double_pendulum"), 2_000, 1, 2, (0.6, 0.9)),
+    "invertedpendulum2": Machine("InvertedDoublePendulum-v5", 120),
+    "reacher": Machine("Reacher-v5", 200),
+}
+
+
+def main() -> None:
+    made = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    made.add_argument("--machines", nargs="+", default=tuple(MACHINES), choices=tuple(MACHINES))
+    made.add_argument("--seeds", nargs="+", type=int, required=True)
+    made.add_argument("--budget", type=int, help="largest number of real steps, instead of the machine's")
+    made.add_argument("--episodes", type=int, default=100)
+    made.add_argument("--out", type=Path, default=OUT)
+    options = made.parse_args()
+    file = options.out / "trials.csv"
+    done = set()
+    if file.exists():
+        with file.open(newline="", encoding="utf-8") as rows:
+            done = {(row["machine"], int(row["seed"])) for row in csv.DictReader(rows)}
+    for seed in options.seeds:
+        for machine in options.machines:
+            if (machine, seed) not in done:
+                with TemporaryDirectory() as folder:
+                    row = _run(machine, seed, options.budget, options.episodes, Path(folder))
+                print(json.dumps(row), flush=True)
+                _append(file, row)
+
+
+def _run(machine: str, seed: int, budget: int | None, episodes: int, folder: Path) -> dict[str, Any]:
+    made, begun = MACHINES[machine], time.monotonic()
+    name, spec = made.name.format(seed=seed), folder / "spec.json"
+    spec.write_text(_specification(made, name, seed, budget or made.budget).model_dump_json())
+    policy = folder / "policy.zip"
+    with running_server(folder) as server:
+        environment = {**os.environ, "SURROGYM_URL": server.url}
+
+        def surrogym(*arguments: str) -> dict[str, Any]:
+            line = [sys.executable, "-m", "surrogym", *arguments, "--json", "--quiet"]
+            ran = subprocess.run(
+                line, env=environment, timeout=60 * MINUTES, check=True, stdout=subprocess.PIPE, text=True
+            )
+            result: dict[str, Any] = json.loads(ran.stdout)
+            return result
+
+        where = ("--env", name, "--spec", str(spec))
+        surrogym("register", name, "--spec", str(spec), "--name", machine)
+        with _sampling([sys.executable, "-m", "surrogym", "sample", machine, *where], environment):
+            trained = surrogym("train", machine, "--wait", "900", "--seed", str(seed), "--out", str(policy))
+        # As the reason says then: one rollout from a reset left states untested, which whole episodes test.
+        audited = trained if trained["trusted"] else surrogym("audit", str(policy), *where)
+        minutes = (time.monotonic() - begun) / 60
+        with Api(server.url) as api:
+            view = api.surrogate(machine)
+            trials = [len(query.actions) for query in api.queries(machine) if query.policy]
+        found = surrogym("evaluate", str(policy), *where, "--episodes", str(episodes))
+    promise = audited.get("promise") or {}
+    return {
+        "machine": machine,
+        "seed": seed,
+        "steps": view.ledger.total,
+        "trials": len(trials),
+        "audit": view.ledger.audit + view.ledger.evaluation,
+        "virtual_steps": trained["virtual_steps"],
+        "minutes": round(minutes, 1),
+        "mean": round(found["mean"], 2),
+        "least": round(found["min"], 2),
+        "success": found.get("success_rate"),
+        "low": promise.get("low"),
+        "high": promise.get("high"),
+        "trusted": audited.get("trusted"),
+    }
+
+
+def _specification(machine: Machine, name: str, seed: int, budget: int) -> EnvironmentSpec:
+    plain = original.make(name, access="reset")
+    spec = plain.spec()
+    plain.close()
+    if machine.largest:
+        largest = dict(zip([c.name for c in spec.coordinates], machine.largest, strict=True))
+        spec = with_history(spec, changes=machine.changes, actions=machine.actions, largest=largest)
+    return spec.model_copy(update={"design": spec.design.model_copy(update={"budget": budget, "seed": seed})})
+
+
+@contextmanager
+def _sampling(line: list[str], environment: dict[str, str]) -> Iterator[None]:
+    sampler = subprocess.Popen(line, env=environment, stdout=subprocess.DEVNULL)
+    try:
+        yield
+    finally:
+        sampler.send_signal(signal.SIGTERM)
+        sampler.wait(60)
+
+
+def _append(path: Path, row: dict[str, Any]) -> None:
+    new = not path.exists()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("a", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(row))
+        if new:
+            writer.writeheader()
+        writer.writerow(row)
+
+
+if __name__ == "__main__":
+    main()

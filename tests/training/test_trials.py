@@ -1,0 +1,149 @@
+"""Learning by trying over a real server: policies run at the machine, and the model learns from their steps."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from uuid import uuid4
+
+import numpy as np
+import pytest
+
+from support.server import ServerProcess, running_server
+from surrogym_client.surrogates.waiting import wait_for_design
+from surrogym_client.transport import Api, HttpSurrogate
+from surrogym_sampler.original.classic import pendulum
+from surrogym_sampler.original.rollouts import answering
+from surrogym_sampler.queries import Sampler, SamplerSettings
+from surrogym_shared.spec import (
+    BoxAction,
+    Coordinate,
+    Design,
+    EnvironmentSpec,
+    ObservationEntry,
+    Term,
+    Uniform,
+    with_history,
+)
+from surrogym_trainer.policies.files import load_network
+from surrogym_trainer.training import TrainSettings
+from surrogym_trainer.training.audited import AuditedTraining
+from surrogym_trainer.training.closed_loop import LoopSettings
+from surrogym_trainer.training.trials import Trials, allows_trials, is_waiting_for_trials
+
+BUDGET, FIRST, EPISODE = 100, 60, 15
+SETTINGS = TrainSettings(algorithm="FASTPPO", total_steps=4_096, num_envs=16, seed=0)
+
+
+class Late:
+    """A level in [-2, 2] that an action moves after a dead time of one step. It is to stay at 0."""
+
+    parallel = True
+
+    def spec(self) -> EnvironmentSpec:
+        plain = EnvironmentSpec(
+            environment="late",
+            coordinates=(Coordinate(name="level", sampling=Uniform(low=-2, high=2)),),
+            observation=(ObservationEntry(name="level", term=Term.linear(level=1)),),
+            action=BoxAction(low=(-1,), high=(1,)),
+            start={"level": Uniform(low=-1.5, high=1.5)},
+            time_limit=EPISODE,
+            query="rollout",
+            tolerances={"level": 1e-9},
+            design=Design(budget=BUDGET, initial=FIRST, seed=0),
+        )
+        return with_history(plain, actions=4)
+
+    def reset(self, *, seed=None):
+        self.level, self.late = float(np.random.default_rng(seed).uniform(-1.5, 1.5)), 0.0
+        return self.level, {}
+
+    def step(self, action):
+        reward = -(self.level**2)
+        self.level, self.late = 0.95 * self.level + 0.2 * np.sin(self.late), float(action[0])
+        return self.level, reward, False, False, {}
+
+    def coordinates(self, observation):
+        return [observation]
+
+    def close(self):
+        pass
+
+
+@pytest.fixture(scope="module")
+def trials_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServerProcess]:
+    with running_server(tmp_path_factory.mktemp("trials")) as server:
+        yield server
+
+
+@pytest.fixture
+def waiting(trials_server: ServerProcess) -> Iterator[str]:
+    """A surrogate whose design has left the rest of its budget to trials, with a sampler in a thread."""
+    name = f"late-{uuid4().hex[:8]}"
+    with Api(trials_server.url) as api, Api(trials_server.url) as own:
+        api.create_surrogate(name, Late().spec())
+        sampler = Sampler(own, name, answering(Late()), SamplerSettings(name="thread", wait_seconds=0.5))
+        thread = threading.Thread(target=sampler.run)
+        thread.start()
+        try:
+            wait_for_design(api, name, 120)
+            yield name
+        finally:
+            sampler.stop()
+            thread.join()
+            api.delete_surrogate(name)
+
+
+def test_policies_try_episodes_with_what_the_design_has_left_of_its_budget(
+    trials_server: ServerProcess, waiting: str, tmp_path: Path
+) -> None:
+    with Api(trials_server.url) as api, HttpSurrogate(trials_server.url, waiting) as port:
+        before = api.surrogate(waiting)
+        assert before.phase == "unsure"
+        assert FIRST <= before.ledger.total < BUDGET
+        assert is_waiting_for_trials(before)
+        training = AuditedTraining(api, waiting, port, tmp_path / "p.zip", SETTINGS, LoopSettings(queries=0))
+        result, _ = training.train()
+        after = api.surrogate(waiting)
+        trials = [query for query in api.queries(waiting) if query.policy]
+        samples = [sample for sample in api.samples(waiting) if sample.query_id == trials[0].id]
+    assert 1 <= len(trials) <= 1 + (BUDGET - before.ledger.total) // EPISODE
+    assert [len(query.actions) for query in trials[:-1]] == [EPISODE] * (len(trials) - 1)
+    assert after.ledger.total - before.ledger.total == sum(len(query.actions) for query in trials)
+    assert after.ledger.total <= BUDGET == after.budget
+    assert len({tuple(sample.action) for sample in samples}) > 1
+    assert result.virtual_steps > SETTINGS.total_steps
+    load_network(result.path)
+
+
+def test_a_number_of_rounds_and_of_steps_raises_the_budget(
+    trials_server: ServerProcess, waiting: str, tmp_path: Path
+) -> None:
+    with Api(trials_server.url) as api, HttpSurrogate(trials_server.url, waiting) as port:
+        rounds = LoopSettings(queries=100, rounds=3)
+        trials = Trials(api, waiting, port, tmp_path / "p.zip", SETTINGS, rounds)
+        trials._confirms = lambda *_: False  # no trial is the last one
+        result = trials.train()
+        view, asked = api.surrogate(waiting), [query for query in api.queries(waiting) if query.policy]
+    assert [len(query.actions) for query in asked] == [EPISODE] * 3, "a trial is at most an episode"
+    assert view.ledger.total == view.budget > BUDGET
+    assert len(trials.trained) == 4
+    assert result.virtual_steps == sum(one.virtual_steps for one in trials.trained)
+
+
+@pytest.mark.parametrize(
+    ("settings", "allowed"),
+    [
+        (SETTINGS, True),
+        (TrainSettings(algorithm="CMAES"), True),
+        (TrainSettings(algorithm="SAC"), False),
+    ],
+)
+def test_trials_need_a_search_whose_policies_are_networks_of_arrays(settings: TrainSettings, allowed: bool) -> None:
+    assert allows_trials(Late().spec(), settings) is allowed
+
+
+def test_no_trial_is_taken_where_any_state_can_be_set_or_a_planner_can_act() -> None:
+    assert not allows_trials(pendulum(), SETTINGS)
+    assert not allows_trials(pendulum().model_copy(update={"query": "rollout"}), SETTINGS)
