@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from uuid import uuid4
 
@@ -16,6 +17,7 @@ from surrogym_client.transport import Api, HttpSurrogate
 from surrogym_sampler.original.classic import pendulum
 from surrogym_sampler.original.rollouts import answering
 from surrogym_sampler.queries import Sampler, SamplerSettings
+from surrogym_shared.network import Network
 from surrogym_shared.spec import (
     BoxAction,
     Coordinate,
@@ -27,9 +29,11 @@ from surrogym_shared.spec import (
     with_history,
 )
 from surrogym_trainer.policies.files import load_network
+from surrogym_trainer.policies.integrals import IntegralPort, Integrals
 from surrogym_trainer.training import TrainSettings
 from surrogym_trainer.training.audited import AuditedTraining
 from surrogym_trainer.training.closed_loop import LoopSettings
+from surrogym_trainer.training.handover import AuditSettings, Subject, hand_over
 from surrogym_trainer.training.trials import Trials, allows_trials, is_waiting_for_trials
 
 BUDGET, FIRST, EPISODE = 100, 60, 15
@@ -132,12 +136,25 @@ def test_a_number_of_rounds_and_of_steps_raises_the_budget(
     assert result.virtual_steps == sum(one.virtual_steps for one in trials.trained)
 
 
+def test_an_audit_sends_no_policy_that_sees_integrals_to_a_sampler(trials_server: ServerProcess, waiting: str) -> None:
+    with Api(trials_server.url) as api, HttpSurrogate(trials_server.url, waiting) as own:
+        port = IntegralPort(own, Integrals(np.array([0]), np.array([1.0]), np.array([0.0])), ("level",))
+        size = len(port.spec().observation)
+        vector = np.zeros(Network.size(port.spec(), 4))
+        policy = Network.of(port.spec(), np.zeros(size), np.ones(size), 4, vector)
+        handover = hand_over(Subject(api, waiting, port, policy), AuditSettings())
+        assert handover.audit is not None
+        assert handover.audit.steps >= 8
+        assert not [query for query in api.queries(waiting) if query.policy]
+
+
 @pytest.mark.parametrize(
     ("settings", "allowed"),
     [
         (SETTINGS, True),
         (TrainSettings(algorithm="CMAES"), True),
         (TrainSettings(algorithm="SAC"), False),
+        (replace(SETTINGS, integral=("level",)), False),
     ],
 )
 def test_trials_need_a_search_whose_policies_are_networks_of_arrays(settings: TrainSettings, allowed: bool) -> None:

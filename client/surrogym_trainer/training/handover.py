@@ -44,6 +44,7 @@ from surrogym_trainer.evaluation.out_of_distribution import Outside, outside_of,
 from surrogym_trainer.evaluation.promise import UNNOTICED, promise_of
 from surrogym_trainer.evaluation.systematic import Inputs
 from surrogym_trainer.policies.evidence import Audit, Promise
+from surrogym_trainer.policies.integrals import IntegralPort
 from surrogym_trainer.policies.predict import Predict
 from surrogym_trainer.training.trials import encoded, needs_trials
 
@@ -287,7 +288,8 @@ def _asked(subject: Subject, settings: AuditSettings, q: Array, u: Array, *, cla
     """
     spec, rng = subject.port.spec(), np.random.default_rng(settings.seed)
     if spec.query == "rollout":
-        acting = encoded(subject.predict) if needs_trials(spec) and isinstance(subject.predict, Network) else None
+        policy, tries = subject.predict, needs_trials(spec) and not isinstance(subject.port, IntegralPort)
+        acting = encoded(policy) if tries and isinstance(policy, Network) else None
         view = subject.api.surrogate(subject.name)
         steps = length_of_rollout(view, settings.steps, LONGEST_EPISODE if acting else LONGEST_ROLLOUT)
         _, actions = way_of(subject, 1, steps)

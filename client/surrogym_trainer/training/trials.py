@@ -22,6 +22,7 @@ from surrogym_client.transport.api import Api
 from surrogym_sampler.original.protocol import LONGEST_EPISODE
 from surrogym_shared.network import Network
 from surrogym_shared.port import SurrogatePort
+from surrogym_shared.set_points import with_set_points
 from surrogym_shared.spec import MOST_PLANNED, EnvironmentSpec
 from surrogym_shared.wire import SurrogateView, Trial
 from surrogym_trainer.evaluation.evaluator import succeeded
@@ -51,8 +52,9 @@ def needs_trials(spec: EnvironmentSpec) -> bool:
 
 
 def allows_trials(spec: EnvironmentSpec, settings: TrainSettings) -> bool:
-    """Whether policies of a search try an environment: only they can steer it, and they are networks of arrays."""
-    return needs_trials(spec) and search_for(with_algorithm(settings, spec)).saves_network
+    """Whether policies of a search try an environment: only they can steer it, and they are networks of arrays that see
+    no integrals of errors, which a sampler does not compute."""
+    return needs_trials(spec) and not settings.integral and search_for(with_algorithm(settings, spec)).saves_network
 
 
 def encoded(policy: Network) -> str:
@@ -161,7 +163,8 @@ class Trials:
         asked = max(query.id for query in self.api.queries(self.name) if query.policy)
         taken = [sample for sample in self.api.samples(self.name) if sample.query_id == asked]
         states, rewards = np.array([s.next_coordinates for s in taken]), np.array([s.reward for s in taken])
-        return bool(taken) and succeeded(self.port.spec(), states, rewards, terminated=taken[-1].terminated)
+        spec = with_set_points(self.port.spec(), self.settings.set_points)
+        return bool(taken) and succeeded(spec, states, rewards, terminated=taken[-1].terminated)
 
     def _steps_of_a_trial(self) -> int:
         view, spec = self.api.surrogate(self.name), self.port.spec()
