@@ -107,14 +107,17 @@ def test_policies_try_episodes_with_what_the_design_has_left_of_its_budget(
         assert before.phase == "unsure"
         assert FIRST <= before.ledger.total < BUDGET
         assert is_waiting_for_trials(before)
-        training = AuditedTraining(api, waiting, port, tmp_path / "p.zip", SETTINGS, LoopSettings(queries=0))
-        result, _ = training.train()
-        after = api.surrogate(waiting)
-        trials = [query for query in api.queries(waiting) if query.policy]
+        rounds, audit = LoopSettings(queries=0), AuditSettings()
+        training = AuditedTraining(api, waiting, port, tmp_path / "p.zip", SETTINGS, rounds, audit)
+        result, handover = training.train()
+        after, asked = api.surrogate(waiting), [query for query in api.queries(waiting) if query.policy]
+        trials = [query for query in asked if query.purpose == "adaptive"]
         samples = [sample for sample in api.samples(waiting) if sample.query_id == trials[0].id]
     assert 1 <= len(trials) <= 1 + (BUDGET - before.ledger.total) // EPISODE
     assert [len(query.actions) for query in trials[:-1]] == [EPISODE] * (len(trials) - 1)
-    assert after.ledger.total - before.ledger.total == sum(len(query.actions) for query in trials)
+    assert {query.purpose for query in asked} == {"adaptive", "audit"}, "an audit lets the policy act, too"
+    assert handover.audit is not None
+    assert after.ledger.audit >= EPISODE
     assert after.ledger.total <= BUDGET == after.budget
     assert len({tuple(sample.action) for sample in samples}) > 1
     assert result.virtual_steps > SETTINGS.total_steps

@@ -317,5 +317,5 @@ class EventRecord:
 
 
 def fingerprint(*parts: object) -> str:
-    """Return a hash of JSON values, to compare the contents of requests with the same idempotency key."""
-    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
+    """Return a hash of JSON values and bytes, to compare the contents of requests with the same idempotency key."""
+    return hashlib.sha256(json.dumps(parts, sort_keys=True, default=bytes.hex).encode()).hexdigest()

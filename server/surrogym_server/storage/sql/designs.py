@@ -97,7 +97,7 @@ class SqlDesigns(port.Designs):
         key: str | None = None,
         raise_budget: bool = False,
     ) -> Granted:
-        body = fingerprint(queries, checkpoint, None if trial is None else checksum(trial.policy or b""))
+        body = fingerprint(queries, checkpoint, trial and trial.policy)
         with self._database.write() as connection:
             surrogate = hold(connection, name)
             raised = recall(connection, surrogate, "ask", key, body)
