@@ -88,6 +88,12 @@ def _bayesian_network() -> Peer:
     return BayesianNetwork()
 
 
+def _local_processes() -> Peer:
+    from surrogym_lab.peers.methods.local_processes import LocalProcesses
+
+    return LocalProcesses()
+
+
 def _knows_reward(spec: EnvironmentSpec) -> None:
     from surrogym_lab.peers.methods.told import told
 
@@ -106,6 +112,11 @@ METHODS = {
     "world_model": Method("recurrent world model: mixture density network, CMA-ES in its dream", _world_model),
     "bayesian_network": Method(
         "a Bayesian network in PILCO's loop: dropout, particles, gradients", _bayesian_network, check=_knows_reward
+    ),
+    "local_processes": Method(
+        "local Gaussian processes: the nearest samples only, in Black-DROPS' loop",
+        _local_processes,
+        check=_knows_reward,
     ),
     "sac": Method("soft actor-critic of Stable-Baselines3, model-free", _sac, budget=20_000),
     "ppo": Method("proximal policy optimisation of Stable-Baselines3, model-free", _ppo, budget=100_000),

@@ -10,12 +10,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
+from typing import Protocol
 
 import numpy as np
 import torch
 from cmaes import CMA
+from torch import Tensor
 
-from surrogym_lab.peers.methods.gaussian_process import Processes, fit
+from surrogym_lab.peers.methods.gaussian_process import fit
 from surrogym_lab.peers.methods.states import Held, States, Transitions, episode, random_control
 from surrogym_lab.peers.methods.told import Told, survives, told
 from surrogym_lab.peers.port import Real
@@ -55,8 +57,7 @@ class BlackDrops:
             data.append(episode(real, states, control, known.horizon, known.repeat))
             seen = Transitions.joined(data)
             inputs = np.concatenate([states.featured(seen.q), seen.u], 1)
-            ratio = self._settings.signal_to_noise
-            model = fit(inputs, states.change(seen.q, seen.reached), ratio, rng, real.clock.check)
+            model = self.model(inputs, states.change(seen.q, seen.reached), rng, real.clock.check)
             limits = np.abs(states.featured(np.concatenate([seen.q, seen.reached]))).max(0) + 1e-6
             imagined = Imagined(states, known, model, seen, limits, self._settings)
             best = search(
@@ -65,12 +66,24 @@ class BlackDrops:
             control = partial(_act, imagined, best)
             yield Held(states, control, known.repeat)
 
+    def model(self, x: Array, y: Array, rng: np.random.Generator, check: Callable[[], None]) -> Model:
+        """Model of outputs (n, C) at inputs (n, A + F) of n samples."""
+        return fit(x, y, self._settings.signal_to_noise, rng, check)
+
+
+class Model(Protocol):
+    """What a rollout needs of a model."""
+
+    def predict(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Means and standard deviations (m, C) at inputs (m, A + F)."""
+        ...
+
 
 class Imagined:
     """Rollouts of policies through the processes."""
 
     def __init__(
-        self, states: States, known: Told, model: Processes, seen: Transitions, limits: Array, settings: Settings
+        self, states: States, known: Told, model: Model, seen: Transitions, limits: Array, settings: Settings
     ) -> None:
         self.states = states
         self.limits = limits  # (A,), by which features are divided for the policy
