@@ -140,6 +140,23 @@ def test_a_policy_that_is_not_trusted_never_gets_the_alias(
         assert [one.version for one in api.policies.list(trained)] == [1]
 
 
+def test_a_renewal_that_was_not_trusted_continues_with_a_larger_budget_in_the_same_environment(
+    renew: Renew, trained: str, server_process: ServerProcess, handed_over: Callable[..., None]
+):
+    """Both were refused, with the advice to register the surrogate under another name."""
+    handed_over(trusted=False)
+    first = renew("HeavySwing", "--budget", "4", "--json").json["real_steps"]["total"]
+    more = renew("HeavySwing", "--budget", "12", "--json")
+    assert more.code == 1
+    assert first <= 4 < more.json["real_steps"]["total"] <= 12, more.err
+    assert renew("HeavySwing", "--json").json["real_steps"] == more.json["real_steps"]
+    other = renew("TiredSwing")
+    assert other.code == 1
+    assert "expected 'support.levitation:HeavySwing', with which an earlier run began 'swing-2'" in other.err
+    with Api(server_process.url) as api:
+        assert api.surrogate("swing-2").budget == 12
+
+
 def test_a_training_does_not_begin_with_a_policy_that_fails_in_the_new_model(
     renew: Renew, trained: str, server_process: ServerProcess, handed_over: Callable[..., None], tmp_path: Path
 ):

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from surrogym_client.transport import Api
     from surrogym_sampler.original.protocol import Environment
     from surrogym_shared.port import SurrogatePort
-    from surrogym_shared.spec import EnvironmentSpec
+    from surrogym_shared.spec import Design
     from surrogym_shared.terminal import Update
     from surrogym_shared.wire import PolicyDetail, SurrogateView
     from surrogym_trainer.training.handover import Handover
@@ -52,7 +52,7 @@ def command(
         typer.Option(
             min=FEWEST,
             help="Maximum number of real steps to learn the changed machine, without audits. [default: a quarter of "
-            "those of the old design]",
+            "those of the old design, or as in an interrupted run]",
         ),
     ] = None,
     episodes: Annotated[
@@ -108,14 +108,14 @@ def command(
             closing(for_queries(opened, 30.0, given, fallback)) as environment,
         ):
             check_environment(base.name, base.spec, environment.spec())
-            spec = renewal.register(budget or _budget(api.surrogate(surrogate)), opened)
+            made = renewal.register(budget, opened)
             path, runs = out or Path(f"{target}.zip"), f"{episodes} episodes in {opened}"
-            runs = f"{runs}: at most {episodes * (spec.time_limit or 1_000)} real steps"
+            runs = f"{runs}: at most {episodes * (made.spec.time_limit or 1_000)} real steps"
             if unconfirmed is not None:
                 say(f"{unconfirmed} continues with {runs}", quiet=output.quiet)
                 handover = renewal.load(path, unconfirmed)
             else:
-                learns = f"{target} learns with at most {spec.design.budget} real steps beside {base.name}"
+                learns = f"{target} learns with at most {made.budget} real steps beside {base.name}"
                 say(f"{learns}; an audit follows, and {runs}", quiet=output.quiet)
                 with _sampling(api, renewal, environment) as check:
                     handover = renewal.train(path, update, check)
@@ -176,6 +176,17 @@ def _budget(view: SurrogateView) -> int:
     return max(FEWEST, view.ledger.total // SHARE)
 
 
+def _require_environment(earlier: SurrogateView, env: str) -> None:
+    """Raise ``CommandError`` if an earlier run has created the new surrogate for another environment."""
+    from surrogym.cli.errors import CommandError
+
+    if earlier.spec.environment != env:
+        raise CommandError(
+            f"expected {earlier.spec.environment!r}, with which an earlier run began {earlier.name!r}, got {env!r}: "
+            f"give --env {earlier.spec.environment}; or begin anew, after surrogym delete {earlier.name}"
+        )
+
+
 @contextmanager
 def _sampling(api: Api, renewal: _Renewal, environment: Environment) -> Iterator[Callable[[], object]]:
     """Context in which a sampler answers the queries of the new surrogate. Yields a function that raises the error with
@@ -222,31 +233,47 @@ class _Renewal:
     stays: bool = False
     judged: Handover | None = None
 
-    def register(self, budget: int, env: str) -> EnvironmentSpec:
-        """Create the new surrogate with the old one as its prior, and return its specification, whose environment is
-        ``env``. A repetition changes nothing.
+    def register(self, budget: int | None, env: str) -> SurrogateView:
+        """Create the new surrogate with the old one as its prior, and return it. One that an earlier run has created
+        keeps its real steps.
+
+        Args:
+            budget: maximum number of real steps. None: as in the earlier run, or else the default.
+            env: name of its environment.
 
         Raises:
+            CommandError: an earlier run has created the new surrogate for another environment.
             SpecConflict: another surrogate has this name.
             InvalidInput: the surrogate can't have a prior.
         """
+        from surrogym_client.errors import UnknownSurrogate
         from surrogym_client.surrogates.transfer import export_surrogate
         from surrogym_client.transport.priors import PriorCalls
 
+        try:
+            earlier = self.api.surrogate(self.target)
+        except UnknownSurrogate:
+            design = self._design(budget or _budget(self.api.surrogate(self.surrogate)))
+        else:
+            _require_environment(earlier, env)
+            design = earlier.spec.design
+        spec = self.base.spec.model_copy(update={"design": design, "environment": env})
+        created, priors = self.api.create_surrogate(self.target, spec).created, PriorCalls(self.api.connection)
+        if created or priors.get(self.target).about is None:
+            try:
+                priors.put(self.target, export_surrogate(self.api, self.base.name).to_bytes())
+            except BaseException:
+                if created:
+                    self.api.delete_surrogate(self.target)
+                raise
+        view = self.api.surrogate(self.target)
+        return view if budget in (None, view.budget) else self.api.patch_surrogate(self.target, budget=budget)
+
+    def _design(self, budget: int) -> Design:
+        """Return the design of the old surrogate with another budget."""
         design = self.base.spec.design
         initial = None if design.initial is None else min(design.initial, budget)
-        smaller = design.model_copy(update={"budget": budget, "initial": initial})
-        spec = self.base.spec.model_copy(update={"design": smaller, "environment": env})
-        created, priors = self.api.create_surrogate(self.target, spec).created, PriorCalls(self.api.connection)
-        if not created and priors.get(self.target).about is not None:
-            return spec
-        try:
-            priors.put(self.target, export_surrogate(self.api, self.base.name).to_bytes())
-        except BaseException:
-            if created:
-                self.api.delete_surrogate(self.target)
-            raise
-        return spec
+        return design.model_copy(update={"budget": budget, "initial": initial})
 
     def train(self, out: Path, update: Update, check: Callable[[], object]) -> Handover:
         """Wait for the design, train a policy from the network of the old one with its set points and integrals, audit
