@@ -69,9 +69,10 @@ class Streams:
             }
             for number, step in enumerate(again, start=first):
                 if known.get(number) != step:
+                    how = "with other values than before" if number in known else "that is not kept any more"
                     raise IdempotencyConflict(
-                        f"first: expected step {following} of the stream {stream!r} next, got step {number} with other "
-                        "values than before: begin another stream after a restart"
+                        f"first: expected step {following} of the stream {stream!r} next, got step {number} {how}: "
+                        "begin another stream after a restart"
                     )
             place = {"surrogate_id": held.id, "stream": stream, "created_at": held.now}
             new = list(enumerate(steps[len(again) :], start=following))

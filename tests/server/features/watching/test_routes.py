@@ -129,5 +129,7 @@ def test_only_the_newest_steps_of_a_surrogate_are_kept(tmp_path: Path, monkeypat
             streams.add("one", "a", number, [{"reward": number}])
         assert [one["number"] for one in streams.page("one", 0, 0.0, 10)] == [2, 3, 4]
         assert streams.add("one", "a", 4, [{"reward": 4}]) == (0, 5)
-        with pytest.raises(Conflict):
+        with pytest.raises(Conflict, match="got step 0 that is not kept any more"):
             streams.add("one", "a", 0, [{"reward": 0}])
+        with pytest.raises(Conflict, match="got step 4 with other values than before"):
+            streams.add("one", "a", 4, [{"reward": 0}])
