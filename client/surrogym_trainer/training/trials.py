@@ -39,7 +39,9 @@ from surrogym_trainer.training.settings import (
 )
 from surrogym_trainer.training.trainer import train
 
-VISITED = 0.5  # default share of virtual episodes that start at states of real steps, where all lags are possible ones
+VISITED = (
+    0.5  # with lags, default share of virtual episodes that start at states of real steps: their lags are possible
+)
 SHORTEST = 0.25  # smallest share of an episode that is worth a trial
 MOST_ROUNDS = 20  # largest number of trials, if no number is requested
 NOTICEABLE = 0.02  # share of a policy's gain over an untrained one; a smaller change does not matter
@@ -133,11 +135,12 @@ class Trials:
 
     def _learn(self, number: int) -> TrainResult:
         """Train a policy with a new network, and return the best one so far in the present model."""
-        settings = self._chosen
-        planned, done = planned_steps(settings), sum(result.virtual_steps for result in self.trained)
-        visited = VISITED if settings.start_box is None and settings.start_visited is None else settings.start_visited
-        now = replace(settings, seed=settings.seed + number, total_steps=planned, start_visited=visited, prolong=False)
-        progress = shifted(self.progress, done, planned * (self._most + 1), None)
+        settings, done = self._chosen, sum(result.virtual_steps for result in self.trained)
+        lagging = any(coordinate.lag is not None for coordinate in self.port.spec().coordinates)
+        usual = lagging and settings.start_box is None and settings.start_visited is None
+        visited = VISITED if usual else settings.start_visited
+        now = replace(settings, seed=settings.seed + number, start_visited=visited)
+        progress = shifted(self.progress, done, planned_steps(settings) * (self._most + 1), None)
         self.trained.append(train(self.port, self.out, now, progress))
         self.candidates.keep(self.trained[-1])
         return self.candidates.best(self.port, self.trained[-1], self._chosen)
