@@ -66,7 +66,7 @@ def _program(name: str) -> str:
 
 MACHINES = {
     "belt": Machine(_program("belt"), 450, 2, 1, (0.12, 0.6)),
-    "furuta": Machine(_program("furuta"), 1_000, 1, 2, (0.6, 0.8)),
+    "furuta": Machine(_program("furuta"), 2_000, 1, 2, (0.6, 0.8)),
     "double_pendulum": Machine(_program("double_pendulum"), 2_000, 1, 2, (0.6, 0.9)),
     "invertedpendulum2": Machine("InvertedDoublePendulum-v5", 120),
     "reacher": Machine("Reacher-v5", 200),
