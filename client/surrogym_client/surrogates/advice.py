@@ -59,6 +59,11 @@ def advice(view: SurrogateView, models: Sequence[ModelView]) -> str:
         return ""
     if past := [output for output in view.fidelity.outputs if output.past] if view.fidelity else []:
         return _of_past(view, past)
+    if view.spec.needs_trials and view.phase == "unsure" and view.budget_left:
+        return (
+            f"trials of policies take the other {view.budget_left} real steps of the budget, while a sampler runs: "
+            f"surrogym train {view.name}"
+        )
     if worst.tolerance < TOLERABLE * error:
         return (
             f"all initial samples had the same {worst.name}, so its tolerance is {worst.tolerance:.2g}; declare it in "

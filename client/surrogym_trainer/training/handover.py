@@ -46,7 +46,7 @@ from surrogym_trainer.evaluation.systematic import Inputs
 from surrogym_trainer.policies.evidence import Audit, Promise
 from surrogym_trainer.policies.integrals import IntegralPort
 from surrogym_trainer.policies.predict import Predict
-from surrogym_trainer.training.trials import encoded, needs_trials
+from surrogym_trainer.training.trials import encoded
 
 MOST_AUDITS = 3  # largest number of audits in one training
 WAY_LANES = 16  # an audit takes real steps at states from this number of virtual episodes of the policy
@@ -288,7 +288,7 @@ def _asked(subject: Subject, settings: AuditSettings, q: Array, u: Array, *, cla
     """
     spec, rng = subject.port.spec(), np.random.default_rng(settings.seed)
     if spec.query == "rollout":
-        policy, tries = subject.predict, needs_trials(spec) and not isinstance(subject.port, IntegralPort)
+        policy, tries = subject.predict, spec.needs_trials and not isinstance(subject.port, IntegralPort)
         acting = encoded(policy) if tries and isinstance(policy, Network) else None
         view = subject.api.surrogate(subject.name)
         steps = length_of_rollout(view, settings.steps, LONGEST_EPISODE if acting else LONGEST_ROLLOUT)

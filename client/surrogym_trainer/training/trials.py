@@ -23,7 +23,7 @@ from surrogym_sampler.original.protocol import LONGEST_EPISODE
 from surrogym_shared.network import Network
 from surrogym_shared.port import SurrogatePort
 from surrogym_shared.set_points import with_set_points
-from surrogym_shared.spec import MOST_PLANNED, EnvironmentSpec
+from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import SurrogateView, Trial
 from surrogym_trainer.evaluation.evaluator import succeeded
 from surrogym_trainer.evaluation.imagined import imagined_returns
@@ -47,16 +47,10 @@ MOST_ROUNDS = 20  # largest number of trials, if no number is requested
 NOTICEABLE = 0.02  # share of a policy's gain over an untrained one; a smaller change does not matter
 
 
-def needs_trials(spec: EnvironmentSpec) -> bool:
-    """Whether only trained policies can steer an environment: it can only be reset, has no limits that a trial could
-    break, and more coordinates than a planner can steer through."""
-    return spec.access == "reset" and spec.limits is None and len(spec.coordinates) > MOST_PLANNED
-
-
 def allows_trials(spec: EnvironmentSpec, settings: TrainSettings) -> bool:
     """Whether policies of a search try an environment: only they can steer it, and they are networks of arrays that see
     no integrals of errors, which a sampler does not compute."""
-    return needs_trials(spec) and not settings.integral and search_for(with_algorithm(settings, spec)).saves_network
+    return spec.needs_trials and not settings.integral and search_for(with_algorithm(settings, spec)).saves_network
 
 
 def encoded(policy: Network) -> str:

@@ -13,7 +13,16 @@ from surrogym_shared.kinds import Access
 from surrogym_shared.patterns import VISIBLE
 from surrogym_shared.presets import PRESETS, Preset, PresetName, Tolerance
 from surrogym_shared.spec.actions import Action, BoxAction
-from surrogym_shared.spec.base import MAX_DIMENSIONS, MAX_ROLLOUT_QUERY, MAX_STARTS, REWARD, Frozen, Name, ends_of
+from surrogym_shared.spec.base import (
+    MAX_DIMENSIONS,
+    MAX_ROLLOUT_QUERY,
+    MAX_STARTS,
+    MOST_PLANNED,
+    REWARD,
+    Frozen,
+    Name,
+    ends_of,
+)
 from surrogym_shared.spec.coordinates import Coordinate, StartDistribution, limits
 from surrogym_shared.spec.rewards import AnyReward, DeclaredReward, Reward, Success
 from surrogym_shared.spec.safety import Limits
@@ -153,6 +162,12 @@ class EnvironmentSpec(Frozen):
     def termination_groups(self) -> tuple[AllOf, ...]:
         """Groups of inequalities: an episode terminates when all of a group hold. Empty if termination is learned."""
         return () if self.termination == "learned" else self.termination
+
+    @property
+    def needs_trials(self) -> bool:
+        """Whether only trained policies can steer the environment: it can only be reset, has no limits that a trial
+        could break, and more coordinates than a planner can steer through."""
+        return self.access == "reset" and self.limits is None and len(self.coordinates) > MOST_PLANNED
 
     @property
     def access(self) -> Access:
