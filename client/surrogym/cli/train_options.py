@@ -122,11 +122,12 @@ class SessionOptions:
             help="Subtract PENALTY predicted standard deviations from each reward. [default: from the specification]",
         ),
     ] = None
-    set_point: Annotated[
+    set_points: Annotated[
         list[str] | None,
         typer.Option(
+            "--set-point",
             help="Set point of a coordinate, as COORDINATE=VALUE, in the place of the value from which the declared "
-            "reward measures the coordinate's error. May be given several times."
+            "reward measures the coordinate's error. May be given several times.",
         ),
     ] = None
 
@@ -141,7 +142,7 @@ class SessionOptions:
         from surrogym_shared.wire import OF_PARTICLES
 
         given = {name: value for name, value in vars(self).items() if value is not None and value is not False}
-        if pairs := given.pop("set_point", None):
+        if pairs := given.pop("set_points", None):
             given["set_points"] = dict(map(_set_point, pairs))
         for name in OF_PARTICLES:
             if name in given and self.variant != "probabilistic":
