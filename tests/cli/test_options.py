@@ -45,11 +45,11 @@ def test_a_recommended_command_repeats_the_typed_options_without_secrets(line: s
 
 
 def test_set_points_are_session_options_of_a_training():
-    assert SessionOptions(set_point=["level=12", "a=b=-1.5"]).fields() == {"set_points": {"level": 12.0, "a=b": -1.5}}
+    assert SessionOptions(set_points=["level=12", "a=b=-1.5"]).fields() == {"set_points": {"level": 12.0, "a=b": -1.5}}
     assert SessionOptions().fields() == {}
 
 
 @pytest.mark.parametrize("given", ["level", "level=", "level=high", "=", ""])
 def test_a_set_point_that_is_no_pair_of_coordinate_and_value_is_refused(given: str):
     with pytest.raises(CommandError, match="--set-point: expected COORDINATE=VALUE, such as level=12, got"):
-        SessionOptions(set_point=[given]).fields()
+        SessionOptions(set_points=[given]).fields()
