@@ -34,6 +34,7 @@ from surrogym_trainer.training import TrainSettings
 from surrogym_trainer.training.audited import AuditedTraining
 from surrogym_trainer.training.closed_loop import LoopSettings
 from surrogym_trainer.training.handover import AuditSettings, Subject, hand_over
+from surrogym_trainer.training.settings import TrainingInterrupted
 from surrogym_trainer.training.trials import Trials, allows_trials, is_waiting_for_trials
 
 BUDGET, FIRST, EPISODE = 100, 60, 15
@@ -167,3 +168,18 @@ def test_trials_need_a_search_whose_policies_are_networks_of_arrays(settings: Tr
 def test_no_trial_is_taken_where_any_state_can_be_set_or_a_planner_can_act() -> None:
     assert not allows_trials(pendulum(), SETTINGS)
     assert not allows_trials(pendulum().model_copy(update={"query": "rollout"}), SETTINGS)
+
+
+def test_ctrl_c_during_a_trial_leaves_the_best_policy_so_far(
+    trials_server: ServerProcess, waiting: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: object) -> bool:
+        raise KeyboardInterrupt
+
+    with Api(trials_server.url) as api, HttpSurrogate(trials_server.url, waiting) as port:
+        trials = Trials(api, waiting, port, tmp_path / "p.zip", SETTINGS, LoopSettings(queries=0))
+        monkeypatch.setattr(trials, "_try", interrupted)
+        with pytest.raises(TrainingInterrupted) as stopped:
+            trials.train()
+    assert stopped.value.result.virtual_steps == trials.trained[0].virtual_steps
+    load_network(tmp_path / "p.zip")

@@ -105,6 +105,7 @@ class Trials:
             SurrogymClientError: the server can't be reached, or refuses a request.
         """
         tried: tuple[Network, NDArray[np.float64]] | None = None
+        best: TrainResult | None = None
         try:
             for number in range(self._most + 1):
                 best = self._learn(number)
@@ -118,9 +119,10 @@ class Trials:
             self.trained.append(interruption.result)
             raise TrainingInterrupted(self._whole(interruption.result)) from None
         except KeyboardInterrupt:
-            if self.trained:
-                raise TrainingInterrupted(self._whole(self.trained[-1])) from None
+            if best is not None:
+                raise TrainingInterrupted(self._whole(best)) from None
             raise
+        assert best is not None  # there is at least one training
         return self._whole(best)
 
     @property
