@@ -110,3 +110,10 @@ def test_a_training_refuses_to_start_from_a_policy_of_another_environment(on_ser
         "error: the policy does not fit the surrogate, it is for Pendulum-v1: expected coordinates (theta, speed) and "
         "a box action of 1, got coordinates (x) and a box action of 1\n"
     )
+
+
+def test_a_training_that_would_replace_a_specification_is_refused_before_it_waits(surrogym, tmp_path) -> None:
+    (tmp_path / "tank.json").write_text('{"coordinates": []}')
+    said = surrogym("train", "tank", "--wait", "60", "--out", "tank.zip", "--server", "http://127.0.0.1:9")
+    assert said.code == 1
+    assert "the card of tank.zip would replace tank.json, which is not a card: choose another name" in said.err

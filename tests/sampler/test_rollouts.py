@@ -350,6 +350,19 @@ def test_a_trial_that_does_not_fit_the_surrogate_is_refused_and_changes_nothing(
     api.delete_surrogate(anywhere)
 
 
+def test_a_trial_whose_policy_overflows_is_refused_for_good_before_any_step(api, rail):
+    huge = np.full((1, 2), 1e308), np.array([1e308, 1e308])
+    layers = (Layer(*huge), Layer(np.array([[1e308], [-1e308]]), np.zeros(1)))
+    network = Network(np.zeros(1), np.ones(1), layers, -np.ones(1), np.ones(1), activation="relu")
+    api.improve(rail, 3, trial=Trial(policy=b64encode(network.to_bytes()).decode(), actions=[[0.0]] * 3))
+    with np.errstate(all="ignore"):
+        Sampler(api, rail, Rail(), SamplerSettings(until_done=True, time_limit=60.0)).run()
+    (query,) = [query for query in api.queries(rail) if query.policy]
+    assert query.status == "refused"
+    assert "the policy of the trial chose an action that is no finite number: [nan]" in query.error
+    assert not [sample for sample in api.samples(rail) if sample.query_id == query.id]
+
+
 def test_a_sampler_refuses_a_policy_that_does_not_fit_its_environment(policy):
     with pytest.raises(ValueError, match="expected a policy of 3 observation entries"):
         following(policy[0].to_bytes(), original.make("Pendulum-v1").spec())

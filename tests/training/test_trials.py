@@ -6,6 +6,7 @@ import threading
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from uuid import uuid4
 
 import numpy as np
@@ -123,6 +124,14 @@ def test_policies_try_episodes_with_what_the_design_has_left_of_its_budget(
     assert len({tuple(sample.action) for sample in samples}) > 1
     assert result.virtual_steps > SETTINGS.total_steps
     load_network(result.path)
+
+
+@pytest.mark.parametrize(("left", "trials"), [(45, 3), (40, 3), (33, 2), (3, 0), (10_000, 20)])
+def test_the_expected_number_of_trials_follows_from_the_budget(tmp_path: Path, left: int, trials: int) -> None:
+    api = SimpleNamespace(surrogate=lambda _: SimpleNamespace(budget_left=left))
+    port = SimpleNamespace(spec=Late().spec)
+    some = Trials(api, "late", port, tmp_path / "p.zip", SETTINGS, LoopSettings(queries=0))  # type: ignore[arg-type]
+    assert some._trials_left(0) == trials
 
 
 def test_a_number_of_rounds_and_of_steps_raises_the_budget(

@@ -341,6 +341,8 @@ class Sampler:
                 return
             self._leases.check(query)
             action = expected if acting is None else acting(state)
+            if query.policy is not None and not np.all(np.isfinite(action)):  # no other sampler can do better
+                raise StepRefused(f"the policy of the trial chose an action that is no finite number: {action}")
             check_action(self._own, action)
             step = environment.act(np.array(action))
             state = np.asarray(step.next_coordinates, dtype=np.float64)

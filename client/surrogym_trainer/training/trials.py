@@ -136,7 +136,8 @@ class Trials:
         usual = lagging and settings.start_box is None and settings.start_visited is None
         visited = VISITED if usual else settings.start_visited
         now = replace(settings, seed=settings.seed + number, start_visited=visited)
-        progress = shifted(self.progress, done, planned_steps(settings) * (self._most + 1), None)
+        total = done + planned_steps(settings) * (1 + self._trials_left(number))
+        progress = shifted(self.progress, done, total, None)
         self.trained.append(train(self.port, self.out, now, progress))
         self.candidates.keep(self.trained[-1])
         return self.candidates.best(self.port, self.trained[-1], self._chosen)
@@ -165,12 +166,23 @@ class Trials:
         spec = with_set_points(self.port.spec(), self.settings.set_points)
         return bool(taken) and succeeded(spec, states, rewards, terminated=taken[-1].terminated)
 
+    def _trials_left(self, number: int) -> int:
+        """Return the largest number of trials of whole episodes after ``number`` trials."""
+        if self.rounds.queries:
+            return self._most - number
+        whole, rest = divmod(self.api.surrogate(self.name).budget_left, self._longest)
+        return min(whole + (rest >= SHORTEST * self._longest), self._most - number)
+
     def _steps_of_a_trial(self) -> int:
-        view, spec = self.api.surrogate(self.name), self.port.spec()
-        longest = min(spec.time_limit or LONGEST_EPISODE, spec.max_rollout or LONGEST_EPISODE, LONGEST_EPISODE)
+        view, longest = self.api.surrogate(self.name), self._longest
         if self.rounds.queries:
             return min(longest, self.rounds.queries)
         return min(longest, view.budget_left) if view.budget_left >= SHORTEST * longest else 0
+
+    @property
+    def _longest(self) -> int:
+        spec = self.port.spec()
+        return min(spec.time_limit or LONGEST_EPISODE, spec.max_rollout or LONGEST_EPISODE, LONGEST_EPISODE)
 
     @property
     def _chosen(self) -> TrainSettings:

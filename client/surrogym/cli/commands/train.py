@@ -69,11 +69,13 @@ def command(
     from surrogym_sampler.original.fitting import check_shape
     from surrogym_sampler.original.loading import env_option, sample_command
     from surrogym_shared.terminal import say
+    from surrogym_trainer.policies.card import require_place
     from surrogym_trainer.training.search import with_algorithm
     from surrogym_trainer.training.words import words_of_no_sampler, words_of_result
 
     if exit_with_parent:
         watch_parent()
+    require_place(out)  # before the design is awaited, which may take hours
     settings, learned = _settings(search, session, start, log), start.learned()
     token = service.token_for(context)
     spec, url = _trainable(surrogate, service.server, token, wait, settings, quiet=output.quiet)
