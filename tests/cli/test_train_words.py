@@ -120,3 +120,11 @@ def test_the_train_command_warns_if_another_session_of_the_surrogate_is_open(
     monkeypatch.setattr(train, "connect", lambda *_, **__: nullcontext(SimpleNamespace(url="here")))
     assert train._trainable("rig", None, None, 0.0, TrainSettings(), quiet=False) == (pendulum(), "here")
     assert ("warning" in capsys.readouterr().err) is (sessions > 0)
+
+
+def test_a_training_without_a_sampler_says_how_its_policies_could_try():
+    said = train._words_without_trials(SimpleNamespace(name="rail", environment="plant:Rail", budget_left=70))
+    assert said == (
+        "no sampler is running, so no trials take the other 70 real steps of the budget: for trials, start surrogym "
+        "sample rail --env plant:Rail in another terminal first"
+    )

@@ -219,11 +219,23 @@ def _trainable(
             say(_words_of_sessions(view), quiet=quiet)
         if view.phase in ("over_budget", "unsure"):
             say(words_of_uncertainty(view), quiet=quiet)
+        if view.phase == "unsure" and view.spec.needs_trials and view.budget_left and not view.samplers:
+            say(_words_without_trials(view), quiet=quiet)
         if view.phase not in COMPLETED and not view.paused:
             typer.echo(
                 f"the design of {surrogate!r} continues; training starts with model {view.model_version}", err=True
             )
         return view.spec, api.url
+
+
+def _words_without_trials(view: SurrogateView) -> str:
+    """Return a hint that no policy can try the original environment, because no sampler is running."""
+    from surrogym_sampler.original.loading import sample_command
+
+    return (
+        f"no sampler is running, so no trials take the other {view.budget_left} real steps of the budget: for trials, "
+        f"start {sample_command(view.name, view.environment)} in another terminal first"
+    )
 
 
 def _words_without_model(view: SurrogateView) -> str:
