@@ -155,12 +155,13 @@ class Trials:
 
     def _try(self, policy: Network, steps: int, number: int) -> bool:
         """Let a policy try an episode of at most so many steps, and return whether it succeeded."""
-        view = self.api.surrogate(self.name)
+        view, earlier = self.api.surrogate(self.name), {query.id for query in self.api.queries(self.name)}
         actions = expected_actions(self.port, policy, steps, self.settings.seed + number)
         trial = Trial(policy=encoded(policy), actions=actions)
         self.api.improve(self.name, steps, trial=trial)
         wait_for_design(self.api, self.name, self.rounds.patience_seconds, self.waiting, after_round=view.round)
-        asked = max(query.id for query in self.api.queries(self.name) if query.policy)
+        # of two trainings at once, each takes the first one after its own request
+        asked = min(query.id for query in self.api.queries(self.name) if query.policy and query.id not in earlier)
         taken = [sample for sample in self.api.samples(self.name) if sample.query_id == asked]
         states, rewards = np.array([s.next_coordinates for s in taken]), np.array([s.reward for s in taken])
         spec = with_set_points(self.port.spec(), self.settings.set_points)
