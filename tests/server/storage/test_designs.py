@@ -258,7 +258,7 @@ def test_a_trial_is_asked_at_once_within_the_budget_and_only_once(storage: Stora
     before = storage.surrogates.get(due)
     for _ in range(2):
         granted = storage.designs.improve(due, 2, trial=trial, key="k", raise_budget=True)
-        assert (granted.record.extra_queries, granted.record.phase) == (before.extra_queries, "sampling")
+        assert (granted.record.extra_queries, granted.record.phase) == (before.extra_queries, "collecting")
         assert granted.record.budget == before.budget + granted.raised
     with pytest.raises(IdempotencyConflict):
         storage.designs.improve(due, 2, trial=replace(trial, policy=b"others"), key="k")

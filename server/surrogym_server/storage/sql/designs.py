@@ -34,7 +34,7 @@ from surrogym_server.storage.sql.rows import append_event, checksum, find, hold,
 from surrogym_server.storage.sql.surrogates import NO_RIGHT
 from surrogym_server.storage.sql.tables import occupancies, priors, queries, samples, surrogates
 from surrogym_shared.nouns import Query
-from surrogym_shared.states import Phase
+from surrogym_shared.states import COMPLETED, Phase
 
 INTERRUPTED_SECONDS = 60.0  # if initial queries are incomplete for longer, the server that queued them has died
 # SQL expressions for conditions on a row of the table of surrogates, such as IS_DUE, and for parts of such conditions.
@@ -108,7 +108,8 @@ class SqlDesigns(port.Designs):
                 if trial is None:
                     changes["extra_queries"] = before.extra_queries + queries
                 else:
-                    changes["phase"] = "sampling"
+                    if before.phase in COMPLETED:
+                        changes["phase"] = "sampling"
                     insert_queries(connection, surrogate, [trial], "adaptive", before.round)
                 touch(connection, surrogate, **changes)
                 remember(connection, surrogate, "ask", key, body, raised)
