@@ -11,7 +11,6 @@ targets are those of the demo, without its second evaluation. Prints one line fo
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 import time
 from dataclasses import replace
@@ -19,7 +18,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from common import OUT
+from common import OUT, append_row
 
 import surrogym
 from surrogym.demo.tasks import TASKS, Outcome
@@ -55,7 +54,7 @@ def main() -> None:
         for seed in options.seeds:
             for row in _run(task, seed, options.budget or BUDGETS[task], options.episodes, rounds=options.rounds):
                 print(json.dumps(row), flush=True)
-                _append(options.out / "resets.csv", row)
+                append_row(options.out / "resets.csv", row)
 
 
 def _run(task: str, seed: int, budget: int, episodes: int, *, rounds: bool) -> list[dict[str, object]]:
@@ -99,16 +98,6 @@ def _earned(task: str, surrogate: LocalSurrogate, seed: int, episodes: int) -> d
     target = replace(TASKS[task].target, also_success=None)
     reached = target.reached(Outcome(mean, least, success))
     return {"mean": round(mean, 2), "least": round(least, 2), "success": success, "reached": reached}
-
-
-def _append(path: Path, row: dict[str, object]) -> None:
-    new = not path.exists()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("a", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(row))
-        if new:
-            writer.writeheader()
-        writer.writerow(row)
 
 
 if __name__ == "__main__":

@@ -28,7 +28,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from common import OUT
+from common import OUT, append_row
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 
@@ -92,7 +92,7 @@ def main() -> None:
                 with TemporaryDirectory() as folder:
                     row = _run(machine, seed, options.budget, options.episodes, Path(folder))
                 print(json.dumps(row), flush=True)
-                _append(file, row)
+                append_row(file, row)
 
 
 def _run(machine: str, seed: int, budget: int | None, episodes: int, folder: Path) -> dict[str, Any]:
@@ -158,16 +158,6 @@ def _sampling(line: list[str], environment: dict[str, str]) -> Iterator[None]:
     finally:
         sampler.send_signal(signal.SIGTERM)
         sampler.wait(60)
-
-
-def _append(path: Path, row: dict[str, Any]) -> None:
-    new = not path.exists()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("a", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(row))
-        if new:
-            writer.writeheader()
-        writer.writerow(row)
 
 
 if __name__ == "__main__":
