@@ -237,7 +237,7 @@ class LoopOptions:
             help="Real steps to add in each round, at states that the policy visits; 0 trains without rounds. Rounds "
             "end when the model is certain at these states, or when the design is ready. This needs a running "
             "sampler and enough budget; an admin's token raises the budget. [default: none; if the environment can "
-            "only be reset and has more than four coordinates, the policy tries episodes with what is left of the "
+            "only be reset and has more than four coordinates, the policy tries episodes with the rest of the "
             "budget]",
             show_default=False,
         ),

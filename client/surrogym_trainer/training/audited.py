@@ -25,6 +25,7 @@ from surrogym_trainer.training.settings import (
     after,
     chosen_for,
     prolongs,
+    summed,
 )
 from surrogym_trainer.training.trainer import train
 from surrogym_trainer.training.trials import Trials, allows_trials, is_waiting_for_trials
@@ -180,10 +181,4 @@ class AuditedTraining:
 
 def _joined(before: TrainResult, after: TrainResult) -> TrainResult:
     """Return the result of the later training, with the virtual steps and seconds of both trainings."""
-    return replace(
-        after,
-        virtual_steps=before.virtual_steps + after.virtual_steps,
-        seconds=before.seconds + after.seconds,
-        lost_episodes=before.lost_episodes + after.lost_episodes,
-        visited_confidence=before.visited_confidence,
-    )
+    return replace(summed(after, (before, after)), visited_confidence=before.visited_confidence)

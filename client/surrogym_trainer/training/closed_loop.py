@@ -28,6 +28,7 @@ from surrogym_trainer.training.settings import (
     TrainSettings,
     after,
     chosen_for,
+    summed,
 )
 from surrogym_trainer.training.trainer import train
 
@@ -207,13 +208,9 @@ class ClosedLoop:
 
     def result(self) -> TrainResult:
         """Return the last training's result, with the steps and seconds of all trainings."""
-        return replace(
-            self.trained[-1],
-            virtual_steps=self._steps + self._visited,
-            seconds=sum(result.seconds for result in self.trained),
-            lost_episodes=sum(result.lost_episodes for result in self.trained),
-            visited_confidence=tuple(self._known),
-        )
+        whole = summed(self.trained[-1], self.trained)
+        steps = whole.virtual_steps + self._visited
+        return replace(whole, virtual_steps=steps, visited_confidence=tuple(self._known))
 
     @property
     def unspent(self) -> int:

@@ -3,6 +3,7 @@ specification, or from other settings."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -180,6 +181,16 @@ class TrainResult:
     untrained: float | None = None  # imagined return of an untrained network; None if not measured
     # For each round of training, the confidence index over the states that its policy visited.
     visited_confidence: tuple[float | None, ...] = ()
+
+
+def summed(result: TrainResult, trainings: Sequence[TrainResult]) -> TrainResult:
+    """Return a result with the virtual steps, the seconds and the lost episodes of all ``trainings``."""
+    return replace(
+        result,
+        virtual_steps=sum(one.virtual_steps for one in trainings),
+        seconds=sum(one.seconds for one in trainings),
+        lost_episodes=sum(one.lost_episodes for one in trainings),
+    )
 
 
 class TrainingInterrupted(KeyboardInterrupt):

@@ -36,12 +36,12 @@ from surrogym_trainer.training.settings import (
     TrainResult,
     TrainSettings,
     chosen_for,
+    summed,
 )
 from surrogym_trainer.training.trainer import train
 
-VISITED = (
-    0.5  # with lags, default share of virtual episodes that start at states of real steps: their lags are possible
-)
+# With lags, default share of virtual episodes that start at states of real steps, whose lags are possible ones.
+VISITED = 0.5
 SHORTEST = 0.25  # smallest share of an episode that is worth a trial
 MOST_ROUNDS = 20  # largest number of trials, if no number is requested
 NOTICEABLE = 0.02  # share of a policy's gain over an untrained one; a smaller change does not matter
@@ -78,7 +78,7 @@ class Trials:
         out: file to write the policy to, after every training.
         settings: settings of each training.
         rounds: number of trials and of their steps; without a number of steps, a trial is a whole episode, and the
-            trials take what is left of the budget.
+            trials take the rest of the budget.
         progress: called after every rollout, with steps summed over the trainings.
         waiting: called each time the surrogate is polled, while a sampler runs the policy.
         candidates: policies of the trainings.
@@ -110,20 +110,22 @@ class Trials:
             for number in range(self._most + 1):
                 best = self._learn(number)
                 steps = self._steps_of_a_trial() if number < self._most else 0
-                if not steps or (tried is not None and self._confirms(*tried, best)):
+                if not steps:
                     break
                 policy = load_network(best.path)
-                before = self._earned(policy)
-                tried = (policy, before) if self._try(policy, steps, number) else None
+                earned = self._earned(policy)
+                if tried is not None and self._confirms(*tried, earned, best.untrained or 0.0):
+                    break
+                tried = (policy, earned) if self._try(policy, steps, number) else None
         except TrainingInterrupted as interruption:
             self.trained.append(interruption.result)
-            raise TrainingInterrupted(self._whole(interruption.result)) from None
+            raise TrainingInterrupted(summed(interruption.result, self.trained)) from None
         except KeyboardInterrupt:
             if best is not None:
-                raise TrainingInterrupted(self._whole(best)) from None
+                raise TrainingInterrupted(summed(best, self.trained)) from None
             raise
         assert best is not None  # there is at least one training
-        return self._whole(best)
+        return summed(best, self.trained)
 
     @property
     def _most(self) -> int:
@@ -142,19 +144,21 @@ class Trials:
         self.candidates.keep(self.trained[-1])
         return self.candidates.best(self.port, self.trained[-1], self._chosen)
 
-    def _confirms(self, policy: Network, before: NDArray[np.float64], best: TrainResult) -> bool:
+    def _confirms(
+        self, policy: Network, before: NDArray[np.float64], best: NDArray[np.float64], untrained: float
+    ) -> bool:
         """Whether the model, which has learned from the trial of a policy, expects no less of it than ``before`` (e,),
-        its returns in e virtual episodes, and nothing clearly better of the best policy."""
-        now, other = self._earned(policy), self._earned(load_network(best.path))
-        untrained = best.untrained or 0.0
+        its returns in e virtual episodes, and nothing clearly better of the best policy, whose returns are ``best``
+        (e,). ``untrained`` is the return of an untrained policy."""
+        now = self._earned(policy)
         small = NOTICEABLE * abs(float(now.mean()) - untrained)
-        return _more(before, now) <= small and _more(other, now) <= small
+        return _more(before, now) <= small and _more(best, now) <= small
 
     def _earned(self, policy: Network) -> NDArray[np.float64]:
         return imagined_returns(self.port, policy, EPISODES, self.settings.seed, **self._chosen.judging)
 
     def _try(self, policy: Network, steps: int, number: int) -> bool:
-        """Let a policy try an episode of at most so many steps, and return whether it succeeded."""
+        """Let a policy try an episode of at most ``steps`` steps, and return whether it succeeded."""
         view, earlier = self.api.surrogate(self.name), {query.id for query in self.api.queries(self.name)}
         actions = expected_actions(self.port, policy, steps, self.settings.seed + number)
         trial = Trial(policy=encoded(policy), actions=actions)
@@ -188,14 +192,6 @@ class Trials:
     @property
     def _chosen(self) -> TrainSettings:
         return chosen_for(self.api.surrogate(self.name), with_algorithm(self.settings, self.port.spec()))
-
-    def _whole(self, result: TrainResult) -> TrainResult:
-        return replace(
-            result,
-            virtual_steps=sum(one.virtual_steps for one in self.trained),
-            seconds=sum(one.seconds for one in self.trained),
-            lost_episodes=sum(one.lost_episodes for one in self.trained),
-        )
 
 
 def _more(some: NDArray[np.float64], others: NDArray[np.float64]) -> float:

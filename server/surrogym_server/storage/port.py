@@ -150,7 +150,7 @@ class Designs(ABC):
             name: name of the surrogate.
             queries: number of real steps of these queries.
             checkpoint: name of the occupancy that weights the choice; None for no weights.
-            trial: query of so many steps that is asked at once, so that no fit has to choose; None if a fit chooses.
+            trial: query of ``queries`` steps in which a policy acts, stored at once; None if the next fit chooses.
             key: idempotency key of the request.
             raise_budget: whether to raise the budget by the missing steps.
 
