@@ -65,6 +65,23 @@ def test_the_status_list_and_the_status_of_one_count_real_steps_alike(on_server,
     assert status._steps(audited) == "6 of 8, 8 of audits, 3 logged"
 
 
+def test_the_status_shows_resets_seconds_and_wear_of_the_machine(on_server, server_process, name, tmp_path):
+    spec = json.loads(on_server("register", "Pendulum-v1", "--access", "reset", "--print-spec").out)
+    file = tmp_path / "spec.json"
+    file.write_text(json.dumps(spec | {"sampling_period": 0.05}))
+    on_server("register", "Pendulum-v1", "--spec", str(file), "--name", name, "--budget", "8")
+    assert "of the machine" not in on_server("status", name).out
+    on_server("sample", name, "--spec", str(file), "--max-queries", "1", "--time-limit", "60")
+    with Api(server_process.url) as api:
+        samples, view = list(api.samples(name)), api.surrogate(name)
+    wear = sum(abs(sample.action[0]) >= 2.0 for sample in samples)
+    assert (view.ledger.resets, view.ledger.wear) == (1, wear)
+    assert view.machine_seconds == len(samples) * 0.05
+    words = f"of the machine: 1 reset, {len(samples) * 0.05:.4g} s without resets, {wear} step"
+    assert words in on_server("status", name).out
+    assert on_server("status", name, "--json").json["ledger"]["wear"] == wear
+
+
 def test_the_status_of_a_design_with_failed_queries_recommends_resume(on_server, server_process, name):
     on_server("register", "Pendulum-v1", "--name", name, "--budget", "8", "--initial", "4")
     with Api(server_process.url) as api:

@@ -87,7 +87,7 @@ PREQUENTIAL = {
     "in 90 %": "within_90",
     "interval score": "interval_score",
 }
-LEDGER = ("initial", "adaptive", "manual", "total", "audit", "logged", "evaluation", "unresolved")
+LEDGER = ("initial", "adaptive", "manual", "total", "audit", "logged", "evaluation", "unresolved", "resets", "wear")
 
 PHASES: dict[Phase, str] = {
     **IN_WORDS,

@@ -67,9 +67,12 @@ def improved(status: SurrogateStatus, raised: int) -> replies.ImprovedSurrogate:
 
 def _view_fields(status: SurrogateStatus) -> dict[str, Any]:
     record, model = status.record, status.model
+    spec = read_stored(wire.EnvironmentSpec, "a stored specification", record.spec)
+    ledger, period = status.summary.ledger, spec.sampling_period
     return {
         **_summary_fields(status),
-        "spec": read_stored(wire.EnvironmentSpec, "a stored specification", record.spec),
+        "spec": spec,
+        "machine_seconds": None if period is None else (ledger.total + ledger.audit) * period,
         "budget_left": status.budget_left,
         "tolerances": record.tolerances,
         "outputs": list(status.outputs),

@@ -140,7 +140,7 @@ function build(main, name, spec, context) {
       map.show(point);
       probing.show(point);
       if (queries) queue.show(queries);
-      ledger.show(now.ledger);
+      ledger.show({ ledger: now.ledger, machine_seconds: now.machine_seconds });
       if (open) sessions.show(open);
       steer.show(now);
       log.show();

@@ -35,7 +35,7 @@ export function queueTable() {
 
 export function ledgerTable() {
   const place = h("div");
-  const render = shown(place, (ledger) => table("Ledger", [["real steps", ""], ["", "num"], ["", "wide"]], [
+  const render = shown(place, ({ ledger, machine_seconds: taken }) => table("Ledger", [["real steps", ""], ["", "num"], ["", "wide"]], [
     ["initial", count(ledger.initial), "a Latin hypercube, before anything is known"],
     ["adaptive", count(ledger.adaptive), "chosen where the model was uncertain"],
     ["manual", count(ledger.manual), "requested or submitted by a person"],
@@ -44,8 +44,11 @@ export function ledgerTable() {
     ["logged", count(ledger.logged), "recorded before, from a log; they cost no budget"],
     ["unresolved", count(ledger.unresolved), `steps that may have been taken under leases that expired or failed (${count(ledger.failed)} failed)`],
     ["evaluation", count(ledger.evaluation), "real episodes of policies; the model does not learn from them"],
+    ["resets", count(ledger.resets), "rollouts that began at a reset"],
+    ...(taken === undefined ? [] : [["seconds", number(taken), "real steps of the design and of audits, times the sampling period; without resets"]]),
+    ["wear", count(ledger.wear), "steps in which an entry of the action was at a bound"],
   ], ""));
-  return { element: section("ledger", "Ledger", "Every real step, by purpose.", place), show: render };
+  return { element: section("ledger", "Ledger", "Every real step, by purpose, and what else the machine gave.", place), show: render };
 }
 
 const HYPER = ["family", "inputs", "kernel", "features", "features_left_out", "shares_samples_with", "rates", "lengthscale", "signal_variance", "linear_variance", "quadratic_variance", "noise_variance", "jitter", "scale", "points", "left_out"];

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import InvalidInput
+from surrogym_shared.nouns import Vector
 
 Array = NDArray[np.float64]
 # An action may exceed its limit by this share of the action's range, because policies compute in float32.
@@ -48,6 +50,16 @@ def model_actions(definition: EnvironmentDefinition, raw: NDArray[Any]) -> Array
         _require_counts(rows, counts)
         return rows
     return _in_box(definition, rows)
+
+
+def at_bound(definition: EnvironmentDefinition, actions: Sequence[Vector]) -> list[bool]:
+    """Return for each of n actions of the model (n, F) whether an entry of it is at a bound of the specification. A
+    discrete action has no bounds."""
+    if definition.action.nvec or not actions:
+        return [False] * len(actions)
+    low, high = definition.action_limits
+    rows, slack = np.array(actions), FLOAT32_SLACK * (high - low)
+    return [bool(row.any()) for row in (rows <= low + slack) | (rows >= high - slack)]
 
 
 def decode_bins(definition: EnvironmentDefinition, rows: Array) -> Array:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from surrogym_server.environment.actions import model_actions
+from surrogym_server.environment.actions import at_bound, model_actions
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import InvalidInput
 from surrogym_server.sampling.coverage import covered
@@ -81,7 +81,8 @@ class SampleService:
                 "idempotency_key: expected one, because some samples have no query_id, got none: add a text of your "
                 "own that names this request"
             )
-        added = self._storage.samples.add(name, sampler, checked, key=key, log=log)
+        bound = at_bound(definition, [sample.action for sample in checked])
+        added = self._storage.samples.add(name, sampler, checked, key=key, log=log, at_bound=bound)
         if log is not None and log.complete and added.restart is None:
             self._withdraw_covered(name, definition)
         self._samplers.heard(name, sampler)

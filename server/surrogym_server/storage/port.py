@@ -334,6 +334,7 @@ class Samples(ABC):
         *,
         key: str | None = None,
         log: LogPart | None = None,
+        at_bound: Sequence[bool] = (),
     ) -> AddedSamples:
         """Store a batch of samples, all or none, and mark the queries that they answer. Committed when this returns.
 
@@ -348,6 +349,9 @@ class Samples(ABC):
         values and by all earlier samples of its log. So a repeated or extended log adds only its new samples, and equal
         steps within a log are all stored. If a log begins like a stored log and a later part differs, it has to be sent
         again from its start: see ``AddedSamples.restart``. A fit becomes due only after the last part of a log.
+
+        ``at_bound`` (n,) says of each of the n samples whether an entry of its action was at a bound, which the ledger
+        counts as wear; empty: of none. It is ignored for a log.
 
         Raises:
             UnknownQuery: the surrogate has no such query.

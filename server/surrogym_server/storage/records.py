@@ -241,7 +241,9 @@ class LedgerRecord:
     """Counts of real steps by purpose.
 
     ``unresolved`` counts the steps that may have been taken under leases that ended without an answer: ``failed`` of
-    them under leases that a sampler ended with an error, the others under leases that expired.
+    them under leases that a sampler ended with an error, the others under leases that expired. ``resets`` counts the
+    rollouts that began at a reset, and ``wear`` the steps in which an entry of a continuous action was at a bound; both
+    without logs and evaluations.
     """
 
     initial: int = 0
@@ -252,6 +254,8 @@ class LedgerRecord:
     evaluation: int = 0
     unresolved: int = 0
     failed: int = 0
+    resets: int = 0
+    wear: int = 0
 
     @property
     def total(self) -> int:

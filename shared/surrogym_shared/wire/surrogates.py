@@ -177,6 +177,8 @@ class Ledger(Reply):
     steps, which were recorded before and don't count towards the budget. ``unresolved`` counts steps that may have been
     taken under leases that ended without an answer, so the design took between total and total + unresolved steps. Of
     these, ``failed`` steps were returned by a sampler with an error; the leases of the others expired.
+
+    ``resets`` and ``wear`` count what ``total`` + ``audit`` steps took from the machine.
     """
 
     initial: int = Field(default=0, description="steps of the initial queries, before the first model")
@@ -189,6 +191,14 @@ class Ledger(Reply):
     unresolved: int = Field(default=0, description="steps that may have been taken, but whose samples did not come")
     failed: int = Field(
         default=0, description="part of ``unresolved``: steps of queries for which a sampler reported an error"
+    )
+    resets: int = Field(
+        default=0, description="rollouts that began at a reset, without evaluations, and without rollouts of no sample"
+    )
+    wear: int = Field(
+        default=0,
+        description="steps in which an entry of a continuous action was at a bound of the specification, without logs "
+        "and evaluations, and without steps stored before version 0.2.0",
     )
 
 
@@ -239,6 +249,13 @@ class SurrogateView(SurrogateSummary):
     budget_left: int = Field(
         description="real steps of the budget that are neither taken, nor requested by a query, nor reserved for a "
         "request of more queries"
+    )
+    machine_seconds: float | None = Field(
+        default=None,
+        exclude_if=lambda seconds: seconds is None,
+        description="seconds that the real steps of the design and of audits took: ``total`` + ``audit`` of the "
+        "ledger, times the declared sampling period; left out if none is declared. The time of resets is not known, "
+        "and not included",
     )
     tolerances: dict[str, float] = Field(
         description="tolerances that were set after the registration, by output, in the output's unit"

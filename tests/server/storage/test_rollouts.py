@@ -65,7 +65,22 @@ def test_every_step_of_a_rollout_is_a_sample_of_one_trajectory(
     assert samples[0].trajectory is not None
     assert samples[0].requested_coordinates is None
     assert storage.queries.counts(name) == QueryCounts(pending=1, answered=1)
-    assert storage.ledger.read(name) == LedgerRecord(initial=3)
+    assert storage.ledger.read(name) == LedgerRecord(initial=3, resets=1)
+
+
+def test_the_ledger_counts_resets_and_steps_at_a_bound_of_the_action_once(
+    storage: Storage, make: Callable[..., str], answer: Answer
+) -> None:
+    of_each = (ROLLOUTS[0], Query.rollout([[0.5]], snapshot="s"), Query.step((1.0, 1.0), (1.0,)), ROLLOUTS[1])
+    name = make(queries=of_each)
+    long, *others = storage.queries.claim(name, "a", 4, LONG)
+    batch = [answer(long, step=i) for i in range(3)]
+    for _ in range(2):
+        storage.samples.add(name, "a", batch, at_bound=[True, False, True])
+        assert storage.ledger.read(name) == LedgerRecord(initial=3, resets=1, wear=2)
+    storage.samples.add(name, "a", [answer(query) for query in others], at_bound=[False, True, False])
+    assert storage.ledger.read(name) == LedgerRecord(initial=6, resets=2, wear=3)
+    assert storage.surrogates.summaries()[0].ledger == storage.ledger.read(name)
 
 
 def test_the_sample_of_a_step_query_belongs_to_no_trajectory(
@@ -123,9 +138,11 @@ def test_all_steps_of_a_rollout_count_as_unresolved_if_its_sampler_dies(
     [again] = storage.queries.claim(name, "next", 1, LONG)
     assert (again.id, again.attempt) == (lost.id, 2)
     storage.samples.add(name, "next", [answer(again, step=0)])
-    assert storage.ledger.read(name) == LedgerRecord(initial=1, unresolved=3)
+    assert storage.ledger.read(name) == LedgerRecord(initial=1, unresolved=3, resets=1)
     storage.samples.add(name, "dead", [answer(lost, step=0), answer(lost, step=1)])
-    assert storage.ledger.read(name) == LedgerRecord(initial=3), "it was not dead, and its two steps are true ones"
+    assert storage.ledger.read(name) == LedgerRecord(initial=3, resets=2), (
+        "it was not dead, and its two steps are true ones"
+    )
     first, *late = storage.samples.page(name, 0, 10)
     assert [(s.late, s.step) for s in late] == [(True, 0), (True, 1)]
     assert {s.trajectory for s in late} != {first.trajectory}

@@ -155,6 +155,7 @@ def _detail(view: SurrogateView, models: Sequence[ModelView]) -> str:
         f"real steps: {_steps(view)}",
         f"in the budget: {ledger.initial} initial, {ledger.adaptive} adaptive, {ledger.manual} manual, "
         f"{ledger.unresolved} unresolved ({ledger.failed} failed)",
+        *_given(view),
         f"queries: {view.queries.pending} pending, {view.queries.leased} leased, {view.queries.set_aside} set aside",
     ]
     if view.queries.set_aside:
@@ -178,6 +179,18 @@ def _detail(view: SurrogateView, models: Sequence[ModelView]) -> str:
     if following := advice(view, models):
         lines.append(f"next: {following}")
     return "\n".join(lines)
+
+
+def _given(view: SurrogateView) -> list[str]:
+    """Return a line on what the machine gave beside real steps: resets, seconds and wear; empty before a real step."""
+    from surrogym_shared.words import counted
+
+    ledger = view.ledger
+    if not ledger.total + ledger.audit:
+        return []
+    seconds = [] if view.machine_seconds is None else [f"{view.machine_seconds:.4g} s without resets"]
+    bound = f"{counted(ledger.wear, 'step')} at a bound of the action"
+    return [f"of the machine: {', '.join([counted(ledger.resets, 'reset'), *seconds, bound])}"]
 
 
 def _period(view: SurrogateView) -> str:

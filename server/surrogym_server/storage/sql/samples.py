@@ -67,6 +67,7 @@ class SqlSamples(port.Samples):
         *,
         key: str | None = None,
         log: LogPart | None = None,
+        at_bound: Sequence[bool] = (),
     ) -> AddedSamples:
         # Content hash, to be compared with that of an earlier request with the same idempotency key.
         body = fingerprint(sampler, [asdict(sample) for sample in samples] if key else [])
@@ -81,7 +82,7 @@ class SqlSamples(port.Samples):
             if before is not None:
                 return AddedSamples(tuple(before), len(before))
             answers = read_answered(connection, surrogate, samples)
-            added = _store(connection, surrogate, sampler, samples, answers)
+            added = _store(connection, surrogate, sampler, samples, answers, at_bound or [False] * len(samples))
             remember(connection, surrogate, "add_samples", key, body, added.ids)
             return added
 
@@ -131,11 +132,12 @@ def _store(
     sampler: str,
     batch: Sequence[NewSample],
     answers: Sequence[Answered | None],
+    at_bound: Sequence[bool],
 ) -> AddedSamples:
     """Insert the new samples of a batch, and mark the queries that they answer.
 
     A sample that repeats the lease and step of a stored one is a duplicate. ``answers`` has the lease of each sample
-    (None: no query).
+    (None: no query), and ``at_bound`` whether an entry of its action was at a bound.
     """
     identities = [_identity(place, *pair) for place, pair in enumerate(zip(batch, answers, strict=True))]
     leases = [lease for lease in answers if lease]
@@ -144,8 +146,8 @@ def _store(
     prints: dict[Identity, str] = {identity: sample.fingerprint for identity, sample in reported.items()}
     new: dict[Identity, dict[str, Any]] = {}
     new_snapshots: dict[str, Vector] = {}
-    for identity, sample, lease in zip(identities, batch, answers, strict=True):
-        row = row_of(surrogate, sampler, sample, lease)
+    for identity, sample, lease, bound in zip(identities, batch, answers, at_bound, strict=True):
+        row = row_of(surrogate, sampler, sample, lease) | {"at_bound": bound}
         if prints.setdefault(identity, row["fingerprint"]) != row["fingerprint"]:
             raise IdempotencyConflict(
                 f"expected the same sample as first reported for query {sample.query_id}, got another: a stored sample "
@@ -206,6 +208,7 @@ def row_of(
         "attempt": lease.attempt if lease else 0,
         "step": sample.step,
         "late": lease is not None and not lease.live,
+        "at_bound": False,
         "coordinates": sample.coordinates,
         "action": sample.action,
         "next_coordinates": sample.next_coordinates,
@@ -279,9 +282,14 @@ def _continued(connection: Connection, surrogate: Row[Any], digest: str) -> bool
 COUNTED = ("initial", "adaptive", "manual", "audit", "logged", "evaluation", "failed", "expired")
 MOST_KEPT = 100_000  # largest number of surrogates whose numbers of samples are cached
 
+FROM_RESET = sa.exists().where(
+    queries.c.id == samples.c.query_id, queries.c.kind == "rollout", queries.c.snapshot.is_(None)
+)
+RESETS = sa.func.sum(sa.case(((samples.c.step == 0) & FROM_RESET, 1), else_=0))
+WEAR = sa.func.sum(sa.case((samples.c.at_bound, 1), else_=0))
 PURPOSE = sa.type_coerce(samples.c.purpose, sa.Text)  # read as text, because the column's type refuses unknown words
 BY_PURPOSE: sa.Select[Any] = sa.select(
-    samples.c.surrogate_id, PURPOSE, sa.func.count(), sa.func.max(samples.c.id)
+    samples.c.surrogate_id, PURPOSE, sa.func.count(), sa.func.max(samples.c.id), RESETS, WEAR
 ).group_by(samples.c.surrogate_id, samples.c.purpose)
 # Largest number of surrogates in one statement, because SQLite limits the depth of an expression to 1,000.
 COUNTED_AT_ONCE = 500
@@ -290,10 +298,11 @@ SINCE = BY_PURPOSE.where(samples.c.surrogate_id == sa.bindparam("owner"), sample
 
 @dataclass(frozen=True)
 class SampleCounts:
-    """Numbers of a surrogate's samples by purpose, up to the sample with the id ``newest``."""
+    """Numbers of a surrogate's samples by purpose, and of its resets and wear, up to the sample with the id
+    ``newest``. The keys of ``counts`` are fields of a ``LedgerRecord``."""
 
     newest: int = 0
-    by_purpose: Mapping[str, int] = field(default_factory=dict)
+    counts: Mapping[str, int] = field(default_factory=dict)
 
 
 NONE = SampleCounts()
@@ -335,19 +344,20 @@ class CountedSamples:
         return {id: self._add(id, counts, rows[id]) for id, counts in earlier.items()}
 
     def _add(self, surrogate_id: int, earlier: SampleCounts, since: Iterable[Sequence[Any]]) -> SampleCounts:
-        newest, by_purpose = earlier.newest, dict(earlier.by_purpose)
-        for _, purpose, count, last in since:
+        newest, counts = earlier.newest, dict(earlier.counts)
+        for _, purpose, count, last, resets, wear in since:
             if purpose not in COUNTED:
                 raise damaged(
                     f"expected one of {list(COUNTED)} in samples.purpose, got {purpose!r}; restore a copy of "
                     "the database"
                 )
-            by_purpose[purpose] = by_purpose.get(purpose, 0) + int(count)
+            for what, number in ((purpose, count), ("resets", resets), ("wear", wear)):
+                counts[what] = counts.get(what, 0) + int(number)
             newest = max(newest, int(last))
         if len(self._counts) > MOST_KEPT:
             self._counts = {}
-        counts = self._counts[surrogate_id] = SampleCounts(newest, by_purpose)
-        return counts
+        counted = self._counts[surrogate_id] = SampleCounts(newest, counts)
+        return counted
 
 
 def _is_since(surrogate_id: int, counts: SampleCounts) -> sa.ColumnElement[bool]:
@@ -410,7 +420,7 @@ class SqlLedger(port.Ledger):
             return self._read(connection, find(connection, name))
 
     def _read(self, connection: Connection, surrogate_id: int) -> LedgerRecord:
-        sampled = {surrogate_id: self._counted.of(connection, surrogate_id).by_purpose}
+        sampled = {surrogate_id: self._counted.of(connection, surrogate_id).counts}
         return ledgers(connection, (surrogate_id, surrogate_id), sampled)[surrogate_id]
 
 
@@ -421,7 +431,7 @@ def ledgers(connection: Connection, span: Span, sampled: Mapping[int, Mapping[st
     Args:
         connection: connection to the database.
         span: first and last id of the surrogates.
-        sampled: numbers of samples by surrogate id and purpose.
+        sampled: ``SampleCounts.counts`` by surrogate id.
     """
     rows = connection.execute(OTHERS, {"first": span[0], "last": span[1]}).all()
     of_surrogates: defaultdict[int, dict[str, int]] = defaultdict(dict)

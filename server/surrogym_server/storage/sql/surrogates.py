@@ -334,7 +334,7 @@ def read_summaries(
         return []
     span = (rows[0].id, rows[-1].id)
     answers = counts.read(connection, {row.id: row[len(SUMMARY_COLUMNS) + 1] for row in rows})
-    ledger_by_id = ledgers(connection, span, {id: counts.by_purpose for id, (counts, _) in answers.items()})
+    ledger_by_id = ledgers(connection, span, {id: sampled.counts for id, (sampled, _) in answers.items()})
     newest, none_spent = newest_of(connection, span), LedgerRecord()
     summaries = []
     for row in rows:

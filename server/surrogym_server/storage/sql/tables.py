@@ -250,6 +250,8 @@ samples = sa.Table(
     sa.Column("sampler", sa.Text, nullable=False),
     sa.Column("attempt", sa.Integer, nullable=False),
     sa.Column("late", sa.Boolean, nullable=False),
+    # Whether an entry of a continuous action was at a bound; false for logged samples.
+    sa.Column("at_bound", sa.Boolean, nullable=False, server_default=sa.false()),
     sa.Column("coordinates", Floats, nullable=False),
     sa.Column("action", Floats, nullable=False),
     sa.Column("next_coordinates", Floats, nullable=False),
