@@ -77,6 +77,26 @@ def test_a_sampler_answers_a_rollout_design_by_resets_and_action_sequences(api, 
         assert all(before.next_coordinates == after.coordinates for before, after in pairwise(steps))
 
 
+class Elsewhere(Rail):
+    """A rail whose reset leaves the wagon far to the left."""
+
+    def reset(self, *, seed=None):
+        super().reset(seed=seed)
+        self.x -= 0.7
+        return np.array([self.x, self.x]), {}
+
+
+def test_a_reset_that_misses_the_declared_start_is_said_with_its_value_and_its_steps_are_learned(api, asked):
+    told = []
+    Sampler(api, asked, Elsewhere(), ONE, lambda _, *said: told.append(said)).run()
+    ((outcome, remark),) = told
+    assert outcome == "answered"
+    x = list(api.samples(asked))[-4].coordinates[0]
+    assert remark == (
+        f"1 of 1 resets led to no declared start, such as x = {x:.4g}, where the specification declares -0.2 to 0.2"
+    )
+
+
 def test_a_rollout_that_terminates_early_returns_its_unused_budget(api, rail):
     api.add_queries(rail, rollouts=[[RIGHT] * 20])
     Sampler(api, rail, Rail(), SamplerSettings(max_queries=4, wait_seconds=5.0, time_limit=60.0)).run()

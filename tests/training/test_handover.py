@@ -7,6 +7,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
@@ -320,6 +321,35 @@ def test_a_policy_whose_audit_rollout_fails_or_ends_early_is_not_trusted(
         assert not handover.trusted
         end = "failed at 1 of 1 queries, so nothing is known there" if fails else "where the model predicted no end"
         assert handover.reason.endswith(end)
+
+
+class Misplaced(rail.Rail):
+    """The rail, whose resets once it is changed lead elsewhere."""
+
+    changed = False
+
+    def reset(self, *, seed: int | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.x -= 0.7 * self.changed
+        return np.array([self.x, self.x]), {}
+
+
+@pytest.mark.parametrize("whole", [False, True], ids=["queries", "episodes"])
+def test_a_policy_whose_audit_begins_at_no_declared_start_is_not_trusted(
+    server_process: ServerProcess, whole: bool
+) -> None:
+    with placed(server_process.url, rail.SPEC, Misplaced()) as place:
+        place.environment.changed = True
+        if whole:
+            make = partial(open_episode, "rail", None, lambda: place.environment)
+            result = evaluate(place.subject().predict, make, EvaluationSettings(3))
+            handover = judge_episodes(place.subject(), result)
+        else:
+            handover = hand_over(place.subject(), AUDIT)
+        assert handover.audit is not None
+        assert not handover.trusted
+        count = 3 if whole else 1
+        assert f"{count} of {count} resets led to no declared start, such as x = -0." in handover.audit.faults[0]
 
 
 class Growing(Line):

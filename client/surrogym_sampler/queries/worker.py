@@ -32,6 +32,7 @@ from surrogym_sampler.queries.returning import Returning, snapshots_of
 from surrogym_sampler.queries.sample_conversion import reset_seed, sample_of
 from surrogym_sampler.queries.settings import Outcome, SamplerReport, SamplerSettings
 from surrogym_shared.spec import EnvironmentSpec
+from surrogym_shared.starts import not_declared
 from surrogym_shared.wire import ClaimedQueries, NewSample, Phase, Query, RolloutQuery, StepQuery
 
 # Retries of a request while the server or its storage does not answer.
@@ -127,7 +128,7 @@ class Sampler:
         self._refused: set[int] = set()  # ids of refused queries, which the server may offer again
         self._failures = Failures()
         self._steps = 0
-        self._remark = ""  # why no action of the present query was planned anew; "" if there is no reason to say so
+        self._remark = ""  # fault that did not harm the answer of the present query; "" if there was none
         self._begun: Query | None = None  # query whose real steps began last
         self._returning: Returning | None = None  # the environment's snapshots; None if it has none
         self._phase: Phase | None = None
@@ -332,6 +333,7 @@ class Sampler:
         self._leases.check(query)
         if query.snapshot is None:
             state = environment.begin(reset_seed(query, self._spec.design.seed))
+            self._remark = "; ".join(filter(None, (self._remark, not_declared(self._own, [state]))))
         else:
             assert self._returning is not None  # check_query has refused snapshots if the environment has none
             self._returning.begin(query.snapshot)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from surrogym_client.environments.lanes import Lanes, session_request
 from surrogym_client.errors import BeyondBudget
@@ -17,7 +17,8 @@ from surrogym_sampler.original.actions import decode_actions
 from surrogym_sampler.original.protocol import LONGEST_EPISODE
 from surrogym_shared.network import Network
 from surrogym_shared.port import SurrogatePort
-from surrogym_shared.spec import LONGEST_ROLLOUT
+from surrogym_shared.spec import LONGEST_ROLLOUT, EnvironmentSpec
+from surrogym_shared.starts import not_declared
 from surrogym_shared.states import LEAST_AUDITED
 from surrogym_shared.wire import QueryView, SampleView, SurrogateView
 from surrogym_trainer.evaluation.audit import (
@@ -196,7 +197,17 @@ def take(
     beside = replace(beside, unanswered=sum(query.id not in elsewhere for query in failed))
     about: dict[str, Any] = {"unanswered": len(failed), "untestable": untestable(spec, q)}
     about |= {"range_left": range_left(spec, q), "untested": far}
-    return judge(beside, before, subject.promise(), subject.floor, found).model_copy(update=about)
+    firsts = {sample.query_id: sample.coordinates for sample in sorted(answers, key=lambda sample: -sample.id)}
+    audit = judge(beside, before, subject.promise(), subject.floor, found).model_copy(update=about)
+    return _with_starts(audit, spec, list(firsts.values()))
+
+
+def _with_starts(audit: Audit, spec: EnvironmentSpec, starts: Sequence[ArrayLike]) -> Audit:
+    """Add a fault to an audit if resets led to ``starts``, each (C,), that are not declared: the promise is one for the
+    declared starts. Environments that can be set to states, or return to saved ones, are not judged by this."""
+    if spec.query != "rollout" or spec.snapshots or not (fault := not_declared(spec, starts)):
+        return audit
+    return audit.model_copy(update={"passed": False, "faults": (fault, *audit.faults)})
 
 
 def judge_episodes(subject: Subject, result: Evaluation) -> Handover:
@@ -219,7 +230,7 @@ def judge_episodes(subject: Subject, result: Evaluation) -> Handover:
     if result.limits is not None and result.limits.broken:
         audit = audit.model_copy(update={"passed": False, "faults": (result.limits.words(), *audit.faults)})
     about = {"steps": result.steps, "episodes": len(result.returns), "range_left": range_left(spec, q)}
-    audit = audit.model_copy(update=about)
+    audit = _with_starts(audit.model_copy(update=about), spec, [trace.coordinates[0] for trace in result.traces])
     trusted, reason = _verdict(audit, subject.floor)
     return Handover(audit.after, audit, trusted, reason)
 
