@@ -107,8 +107,7 @@ class AuditedTraining:
             return Trials(*inputs, rounds, self.progress, self.waiting, self.candidates).train()
         if rounds is None or not rounds.queries:
             return train(self.port, self.out, self._chosen, self.progress)
-        loop = ClosedLoop(*inputs, rounds, self.progress, self.waiting)
-        loop.candidates = self.candidates
+        loop = ClosedLoop(*inputs, rounds, self.progress, self.waiting, self.candidates)
         result = loop.train()
         self._unspent = loop.unspent
         return self._best(result)

@@ -5,6 +5,7 @@ The policies of one training are compared in the latest model, so that the best 
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -104,29 +105,21 @@ class LoopSettings:
 
 
 @dataclass
-class ClosedLoop:
-    """Train a policy in rounds, with queries in states that it visits, until the model is certain there or the design
-    is ready.
-
-    Each round submits the states that the policy visits from the declared starts, as a checkpoint that no other
-    training shares. So the queries of a round depend on this training alone, and the same seeds choose the same
-    queries. The rounds end once the confidence index over these states reaches the target that the design has for the
-    whole range. In the rounds, virtual states follow the model's mean, so that a policy goes where the model predicts
-    the highest return. The settings of the last training depend on whether the design is ready then, and on the noise
-    that it has confirmed. Only the last training may be prolonged, because a later round makes up for a short earlier
-    one.
+class TrainingInRounds(ABC):
+    """Trainings with real steps between them, from which the model learns.
 
     Attributes:
         api: the connection to the server.
         name: name of the surrogate.
         port: the interface of the surrogate.
-        out: file to write the policy to, after every round.
+        out: file to write the policy to, after every training.
         settings: settings of each training.
-        rounds: number of rounds, and of queries in each.
-        progress: called after every rollout, with steps summed over the rounds.
-        waiting: called each time the surrogate is polled, while a sampler answers a round's queries.
+        rounds: number of rounds, and of real steps in each.
+        progress: called after every rollout, with steps summed over the trainings.
+        waiting: called each time the surrogate is polled, while a sampler takes a round's steps.
+        candidates: policies of the trainings.
         trained: results of the trainings so far.
-        candidates: policies of these trainings.
+        best: result of the policy to hand over.
     """
 
     api: Api
@@ -137,8 +130,65 @@ class ClosedLoop:
     rounds: LoopSettings
     progress: Callable[[TrainProgress], None] | None = None
     waiting: Callable[[SurrogateView], None] | None = None
-    trained: list[TrainResult] = field(default_factory=list, init=False)
     candidates: Candidates = field(default_factory=Candidates)
+    trained: list[TrainResult] = field(default_factory=list, init=False)
+    best: TrainResult | None = field(default=None, init=False)
+
+    @abstractmethod
+    def _run(self) -> None:
+        """Run the rounds and the last training."""
+
+    def train(self) -> TrainResult:
+        """Return the policy to hand over, with the steps and seconds of all trainings.
+
+        Raises:
+            DesignUnfinished: no sampler took the steps of a round in time.
+            TrainingInterrupted: Ctrl-C was pressed when there was a policy already.
+            ValueError: the settings don't fit the search.
+            SurrogymClientError: the server can't be reached, or refuses a request.
+        """
+        try:
+            self._run()
+        except TrainingInterrupted as interruption:
+            self.best = interruption.result
+            self.trained.append(self.best)
+            raise TrainingInterrupted(self.result()) from None
+        except KeyboardInterrupt:
+            if self.trained:
+                raise TrainingInterrupted(self.result()) from None
+            raise
+        return self.result()
+
+    def result(self) -> TrainResult:
+        """Return the best result, with the steps and seconds of all trainings."""
+        assert self.best is not None  # there is at least one training
+        return summed(self.best, self.trained)
+
+    @property
+    def _steps(self) -> int:
+        return sum(result.virtual_steps for result in self.trained)
+
+    def _train(self, settings: TrainSettings, progress: Callable[[TrainProgress], None] | None) -> TrainResult:
+        self.best = train(self.port, self.out, settings, progress)
+        self.trained.append(self.best)
+        self.candidates.keep(self.best)
+        return self.best
+
+
+@dataclass
+class ClosedLoop(TrainingInRounds):
+    """Train a policy in rounds, with queries in states that it visits, until the model is certain there or the design
+    is ready.
+
+    Each round submits the states that the policy visits from the declared starts, as a checkpoint that no other
+    training shares. So the queries of a round depend on this training alone, and the same seeds choose the same
+    queries. The rounds end once the confidence index over these states reaches the target that the design has for the
+    whole range. In the rounds, virtual states follow the model's mean, so that a policy goes where the model predicts
+    the highest return. The settings of the last training depend on whether the design is ready then, and on the noise
+    that it has confirmed. Only the last training may be prolonged, because a later round makes up for a short earlier
+    one.
+    """
+
     # Number of virtual steps that were taken to find the states which policies visit.
     _visited: int = field(default=0, init=False)
     # for each round, the confidence index over the states that its policy visited; None if it is not known
@@ -150,34 +200,16 @@ class ClosedLoop:
         if not search_for(self.settings).resumable:
             raise ValueError(
                 f"algorithm {self.settings.algorithm} can't continue the policy of the round before: train without "
-                "rounds, or "
-                "by another algorithm"
+                "rounds, or by another algorithm"
             )
         self._whole, self._part = shares(self.settings, self.rounds.rounds)
         self._prolong = is_prolonged(self.settings, self.port.spec())
 
-    def train(self) -> TrainResult:
-        """Run the rounds and the last training.
-
-        Raises:
-            DesignUnfinished: the queries of a round were not answered in time.
-            TrainingInterrupted: Ctrl-C was pressed when there was a policy already.
-            ValueError: the settings don't fit the search.
-            SurrogymClientError: the server can't be reached, or refuses a request.
-        """
-        try:
-            for _ in range(self.rounds.rounds):
-                if not self.round():
-                    break
-            self.last()
-        except TrainingInterrupted as interruption:
-            self.trained.append(interruption.result)
-            raise TrainingInterrupted(self.result()) from None
-        except KeyboardInterrupt:
-            if self.trained:
-                raise TrainingInterrupted(self.result()) from None
-            raise
-        return self.result()
+    def _run(self) -> None:
+        for _ in range(self.rounds.rounds):
+            if not self.round():
+                break
+        self.last()
 
     def round(self) -> bool:
         """Run one round: train for a while, submit the visited states, and query in these states. Returns whether
@@ -207,8 +239,7 @@ class ClosedLoop:
         self._learn(left, taken + self._visited + left, replace(last, prolong=self._prolong))
 
     def result(self) -> TrainResult:
-        """Return the last training's result, with the steps and seconds of all trainings."""
-        whole = summed(self.trained[-1], self.trained)
+        whole = super().result()
         steps = whole.virtual_steps + self._visited
         return replace(whole, virtual_steps=steps, visited_confidence=tuple(self._known))
 
@@ -218,18 +249,12 @@ class ClosedLoop:
         that the policy visits."""
         return self.rounds.rounds - len(self._known) + int(self._region_known)
 
-    @property
-    def _steps(self) -> int:
-        return sum(result.virtual_steps for result in self.trained)
-
     def _learn(self, steps: int, whole: int, settings: TrainSettings) -> None:
         now = replace(settings, total_steps=steps)
         if self.trained:
             now = replace(now, start_from=self.out, trust_policy=False)
         known = self._known[-1] if self._known else None
-        progress = shifted(self.progress, self._steps + self._visited, whole, known)
-        self.trained.append(train(self.port, self.out, now, progress))
-        self.candidates.keep(self.trained[-1])
+        self._train(now, shifted(self.progress, self._steps + self._visited, whole, known))
 
 
 def _for_use(view: SurrogateView, settings: TrainSettings, *, region_known: bool) -> TrainSettings:

@@ -9,16 +9,13 @@ from __future__ import annotations
 
 import math
 from base64 import b64encode
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from surrogym_client.environments.lanes import Lanes, session_request
 from surrogym_client.surrogates.waiting import COMPLETED, wait_for_design
-from surrogym_client.transport.api import Api
 from surrogym_sampler.original.protocol import LONGEST_EPISODE
 from surrogym_shared.network import Network
 from surrogym_shared.port import SurrogatePort
@@ -28,17 +25,9 @@ from surrogym_shared.wire import SurrogateView, Trial
 from surrogym_trainer.evaluation.evaluator import succeeded
 from surrogym_trainer.evaluation.imagined import imagined_returns
 from surrogym_trainer.policies.files import load_network
-from surrogym_trainer.training.closed_loop import CLEARLY, EPISODES, Candidates, LoopSettings, shifted
+from surrogym_trainer.training.closed_loop import CLEARLY, EPISODES, TrainingInRounds, shifted
 from surrogym_trainer.training.search import planned_steps, search_for, with_algorithm
-from surrogym_trainer.training.settings import (
-    TrainingInterrupted,
-    TrainProgress,
-    TrainResult,
-    TrainSettings,
-    chosen_for,
-    summed,
-)
-from surrogym_trainer.training.trainer import train
+from surrogym_trainer.training.settings import TrainResult, TrainSettings, chosen_for
 
 # With lags, default share of virtual episodes that start at states of real steps, whose lags are possible ones.
 VISITED = 0.5
@@ -63,69 +52,27 @@ def is_waiting_for_trials(view: SurrogateView) -> bool:
     return view.phase in COMPLETED and view.phase != "ready" and view.budget_left > 0 and bool(view.samplers)
 
 
-@dataclass
-class Trials:
+class Trials(TrainingInRounds):
     """Train policies, each with a new network, and let the best one try an episode after each training.
 
     The trials end when one has succeeded, the model that has learned from it expects no less of its policy than before,
     and no other policy is clearly better in that model; or after the number of rounds; or when the budget is spent. A
-    trial succeeds by the criterion of the specification, if there is one.
-
-    Attributes:
-        api: the connection to the server.
-        name: name of the surrogate.
-        port: the interface of the surrogate.
-        out: file to write the policy to, after every training.
-        settings: settings of each training.
-        rounds: number of trials and of their steps; without a number of steps, a trial is a whole episode, and the
-            trials take the rest of the budget.
-        progress: called after every rollout, with steps summed over the trainings.
-        waiting: called each time the surrogate is polled, while a sampler runs the policy.
-        candidates: policies of the trainings.
+    trial succeeds by the criterion of the specification, if there is one. Without a number of steps in ``rounds``, a
+    trial is a whole episode, and the trials take the rest of the budget.
     """
 
-    api: Api
-    name: str
-    port: SurrogatePort
-    out: Path
-    settings: TrainSettings
-    rounds: LoopSettings
-    progress: Callable[[TrainProgress], None] | None = None
-    waiting: Callable[[SurrogateView], None] | None = None
-    candidates: Candidates = field(default_factory=Candidates)
-    trained: list[TrainResult] = field(default_factory=list, init=False)
-
-    def train(self) -> TrainResult:
-        """Return the policy that earns most in the last model, with the steps and seconds of all trainings.
-
-        Raises:
-            DesignUnfinished: no sampler answered the query of a trial in time.
-            TrainingInterrupted: Ctrl-C was pressed when there was a policy already.
-            ValueError: the settings don't fit the search.
-            SurrogymClientError: the server can't be reached, or refuses a request.
-        """
+    def _run(self) -> None:
         tried: tuple[Network, NDArray[np.float64]] | None = None
-        best: TrainResult | None = None
-        try:
-            for number in range(self._most + 1):
-                best = self._learn(number)
-                steps = self._steps_of_a_trial() if number < self._most else 0
-                if not steps:
-                    break
-                policy = load_network(best.path)
-                earned = self._earned(policy)
-                if tried is not None and self._confirms(*tried, earned, best.untrained or 0.0):
-                    break
-                tried = (policy, earned) if self._try(policy, steps, number) else None
-        except TrainingInterrupted as interruption:
-            self.trained.append(interruption.result)
-            raise TrainingInterrupted(summed(interruption.result, self.trained)) from None
-        except KeyboardInterrupt:
-            if best is not None:
-                raise TrainingInterrupted(summed(best, self.trained)) from None
-            raise
-        assert best is not None  # there is at least one training
-        return summed(best, self.trained)
+        for number in range(self._most + 1):
+            self.best = best = self._learn(number)
+            steps = self._steps_of_a_trial() if number < self._most else 0
+            if not steps:
+                break
+            policy = load_network(best.path)
+            earned = self._earned(policy)
+            if tried is not None and self._confirms(*tried, earned, best.untrained or 0.0):
+                break
+            tried = (policy, earned) if self._try(policy, steps, number) else None
 
     @property
     def _most(self) -> int:
@@ -133,16 +80,14 @@ class Trials:
 
     def _learn(self, number: int) -> TrainResult:
         """Train a policy with a new network, and return the best one so far in the present model."""
-        settings, done = self._chosen, sum(result.virtual_steps for result in self.trained)
+        settings, done = self._chosen, self._steps
         lagging = any(coordinate.lag is not None for coordinate in self.port.spec().coordinates)
         usual = lagging and settings.start_box is None and settings.start_visited is None
         visited = VISITED if usual else settings.start_visited
         now = replace(settings, seed=settings.seed + number, start_visited=visited)
         total = done + planned_steps(settings) * (1 + self._trials_left(number))
-        progress = shifted(self.progress, done, total, None)
-        self.trained.append(train(self.port, self.out, now, progress))
-        self.candidates.keep(self.trained[-1])
-        return self.candidates.best(self.port, self.trained[-1], self._chosen)
+        latest = self._train(now, shifted(self.progress, done, total, None))
+        return self.candidates.best(self.port, latest, self._chosen)
 
     def _confirms(
         self, policy: Network, before: NDArray[np.float64], best: NDArray[np.float64], untrained: float
