@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from surrogym_shared.spec import Coordinate, EnvironmentSpec, limits
+from surrogym_shared.spec import EnvironmentSpec, limits
 
 # A state after a reset is no declared start if a coordinate is outside of its declared starts by more than this share
 # of its sampling range. Less may be noise of a sensor.
@@ -48,8 +48,8 @@ def _declared(spec: EnvironmentSpec, i: int) -> tuple[float, float]:
 def _beyond(spec: EnvironmentSpec, i: int, value: float) -> float:
     """Return the distance of a value from the declared starts of coordinate ``i``, as a share of its sampling range; 0
     if it is one of them, or if nothing is known of it."""
-    coordinate: Coordinate = spec.coordinates[i]
-    if coordinate.lag is not None or math.isnan(value):
+    coordinate = spec.coordinates[i]
+    if coordinate.lag is not None or not math.isfinite(value):
         return 0.0
     low, high = _declared(spec, i)
     away = value - (low + high) / 2

@@ -38,6 +38,7 @@ def test_an_angle_is_compared_over_the_turn():
     assert not_declared(spec, [[-math.pi + 0.01]]) == ""
     assert "x = 0," in not_declared(spec, [[0.0]])
     assert not_declared(spec, [[0.0]]).endswith("declares 3.142")
+    assert not_declared(spec, [[math.inf]]) == "", "what is no finite number is refused elsewhere"
 
 
 def test_starts_of_a_list_are_the_declared_ones():
