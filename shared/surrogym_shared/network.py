@@ -22,7 +22,7 @@ from pydantic import BaseModel, Field, PositiveInt, ValidationError
 
 from surrogym_shared.kinds import Activation
 from surrogym_shared.policy_sizes import MAX_LAYERS
-from surrogym_shared.spec import BoxAction, EnvironmentSpec
+from surrogym_shared.spec import Action, BoxAction, EnvironmentSpec
 
 if TYPE_CHECKING:
     from surrogym_shared.archives import Header
@@ -155,6 +155,14 @@ class Network:
         outside = {name: arrays[name] for name in OUTSIDE}
         return cls(**outside, layers=layers, counts=head.counts, activation=head.activation)
 
+    def require_fit(self, entries: int, action: Action) -> None:
+        """Raise ``ValueError`` if the policy does not read observations of ``entries`` entries, or has other actions
+        than ``action``."""
+        wanted = _form(entries, action.policy_counts or action.size)
+        got = _form(len(self.mean), self.counts or len(self.low))
+        if got != wanted:
+            raise ValueError(f"expected a policy of {wanted}, got one of {got}")
+
     @staticmethod
     def is_at(path: Path) -> bool:
         """Whether a file is a zip file with the header that ``save`` writes."""
@@ -192,6 +200,12 @@ def bounds_of(spec: EnvironmentSpec) -> tuple[Array, Array]:
     if isinstance(spec.action, BoxAction):
         return np.array(spec.action.low), np.array(spec.action.high)
     return np.zeros(0), np.zeros(0)
+
+
+def _form(entries: int, actions: int | tuple[int, ...]) -> str:
+    """Describe a policy by its observation entries, and its number of continuous actions or of discrete choices."""
+    choices = f"{actions} continuous" if isinstance(actions, int) else f"discrete ({' and '.join(map(str, actions))})"
+    return f"{entries} observation entries and {choices} actions"
 
 
 def _sizes(spec: EnvironmentSpec, units: int | Sequence[int]) -> list[int]:

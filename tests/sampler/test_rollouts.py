@@ -330,7 +330,7 @@ def policy():
 def test_in_a_trial_a_policy_acts_on_the_states_that_were_measured(api, rail, policy):
     network, file = policy
     before, expected = api.surrogate(rail), [[0.0]] * 8
-    granted = api.improve(rail, 8, trial=Trial(policy=file, actions=expected))
+    granted = api.improve(rail, trial=Trial(policy=file, actions=expected))
     assert granted.budget_raised_by == 8 - before.budget_left
     lines = []
     told = lambda query, outcome, error: lines.append(line_of(query, outcome, error))  # noqa: E731
@@ -348,25 +348,26 @@ def test_a_trial_that_does_not_fit_the_surrogate_is_refused_and_changes_nothing(
     before = api.surrogate(rail)
     other = Network(np.zeros(2), np.ones(2), (Layer(np.zeros((2, 1)), np.zeros(1)),), network.low, network.high)
     wrong = {
-        "in base64": (3, Trial(policy="no base64!", actions=[[0.0]] * 3)),
-        "is not a policy of surrogym train": (3, Trial(policy="AAAA", actions=[[0.0]] * 3)),
-        "expected one of 1 observation entries with 1 continuous actions, got one of 2": (
-            3,
-            Trial(policy=b64encode(other.to_bytes()).decode(), actions=[[0.0]] * 3),
+        "in base64": Trial(policy="no base64!", actions=[[0.0]] * 3),
+        "is not a policy of surrogym train": Trial(policy="AAAA", actions=[[0.0]] * 3),
+        "expected a policy of 1 observation entries and 1 continuous actions, got one of 2 ": Trial(
+            policy=b64encode(other.to_bytes()).decode(), actions=[[0.0]] * 3
         ),
-        "expected 4 actions, as many as queries, got 3": (4, Trial(policy=file, actions=[[0.0]] * 3)),
-        "expected at most 20 actions in a rollout, got 21": (21, Trial(policy=file, actions=[[0.0]] * 21)),
-        "action": (1, Trial(policy=file, actions=[[9.0]])),
+        "expected at most 20 actions in a rollout, got 21": Trial(policy=file, actions=[[0.0]] * 21),
+        "action": Trial(policy=file, actions=[[9.0]]),
     }
-    for said, (steps, trial) in wrong.items():
+    for said, trial in wrong.items():
         with pytest.raises(InvalidInput, match=said):
-            api.improve(rail, steps, trial=trial)
+            api.improve(rail, trial=trial)
+    for queries, trial in ((3, wrong["action"]), (None, None)):
+        with pytest.raises(ValueError, match="expected either queries or trial"):
+            api.improve(rail, queries, trial=trial)
     after = api.surrogate(rail)
     assert (after.budget, after.queries, after.phase) == (before.budget, before.queries, before.phase)
     anywhere = f"pendulum-{uuid.uuid4().hex[:8]}"
     api.create_surrogate(anywhere, original.make("Pendulum-v1").spec())
     with pytest.raises(InvalidInput, match="expected an original environment that can only be reset"):
-        api.improve(anywhere, 1, trial=Trial(policy=file, actions=[[0.0]]))
+        api.improve(anywhere, trial=Trial(policy=file, actions=[[0.0]]))
     api.delete_surrogate(anywhere)
 
 
@@ -374,7 +375,7 @@ def test_a_trial_whose_policy_overflows_is_refused_for_good_before_any_step(api,
     huge = np.full((1, 2), 1e308), np.array([1e308, 1e308])
     layers = (Layer(*huge), Layer(np.array([[1e308], [-1e308]]), np.zeros(1)))
     network = Network(np.zeros(1), np.ones(1), layers, -np.ones(1), np.ones(1), activation="relu")
-    api.improve(rail, 3, trial=Trial(policy=b64encode(network.to_bytes()).decode(), actions=[[0.0]] * 3))
+    api.improve(rail, trial=Trial(policy=b64encode(network.to_bytes()).decode(), actions=[[0.0]] * 3))
     with np.errstate(all="ignore"):
         Sampler(api, rail, Rail(), SamplerSettings(until_done=True, time_limit=60.0)).run()
     (query,) = [query for query in api.queries(rail) if query.policy]

@@ -559,14 +559,14 @@ class Api:
     def improve(
         self,
         name: str,
-        queries: int,
+        queries: int | None = None,
         *,
         checkpoint: str | None = None,
         trial: wire.Trial | None = None,
         idempotency_key: str | None = None,
     ) -> wire.ImprovedSurrogate:
-        """Add queries to the design, chosen near the visited states that were submitted as ``checkpoint``; or a trial,
-        of as many steps, in which a policy acts.
+        """Add queries to the design, chosen near the visited states that were submitted as ``checkpoint``; or else a
+        trial, in which a policy acts.
 
         Raises:
             BeyondBudget: the budget has too few steps left, and this token may not raise it; a token of role admin may.

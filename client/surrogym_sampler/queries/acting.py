@@ -42,11 +42,7 @@ def following(policy: bytes, spec: EnvironmentSpec) -> Acting:
         ValueError: the file is not a network of arrays, or not one for this environment.
     """
     network = Network.load(policy)
-    if len(network.mean) != len(spec.observation) or network.counts != spec.action.policy_counts:
-        raise ValueError(
-            f"expected a policy of {len(spec.observation)} observation entries and the environment's action, got one "
-            f"of {len(network.mean)} entries"
-        )
+    network.require_fit(len(spec.observation), spec.action)
     low, high = bounds_of(spec)
 
     def act(state: NDArray[np.float64]) -> Sequence[float]:

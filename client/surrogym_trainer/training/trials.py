@@ -107,7 +107,7 @@ class Trials(TrainingInRounds):
         view, earlier = self.api.surrogate(self.name), {query.id for query in self.api.queries(self.name)}
         actions = expected_actions(self.port, policy, steps, self.settings.seed + number)
         trial = Trial(policy=encoded(policy), actions=actions)
-        self.api.improve(self.name, steps, trial=trial)
+        self.api.improve(self.name, trial=trial)
         wait_for_design(self.api, self.name, self.rounds.patience_seconds, self.waiting, after_round=view.round)
         # of two trainings at once, each takes the first one after its own request
         asked = min(query.id for query in self.api.queries(self.name) if query.policy and query.id not in earlier)

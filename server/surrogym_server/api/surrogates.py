@@ -128,8 +128,6 @@ def improve(
     real steps left; steps of open queries and of earlier requests count as used. For a token of role ``admin`` the
     budget is raised if needed, and ``budget_raised_by`` is the increase."""
     may_raise = role_of(request.scope) == "admin"
-    trial = None if body.trial is None else resources.trial(body.trial)
-    granted = use.designer.improve(
-        name, body.queries, body.checkpoint, body.idempotency_key, raise_budget=may_raise, trial=trial
-    )
+    queries = (body.queries or 0) if body.trial is None else resources.trial(body.trial)
+    granted = use.designer.improve(name, queries, body.checkpoint, body.idempotency_key, raise_budget=may_raise)
     return resources.improved(use.surrogates.status(name), granted.raised)

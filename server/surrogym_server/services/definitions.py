@@ -146,7 +146,10 @@ def check_rollouts(definition: EnvironmentDefinition, queries: Sequence[Query]) 
     """
     for query in queries:
         if query.policy is not None:
-            _require_network(definition, query.policy)
+            try:
+                Network.load(query.policy).require_fit(len(definition.observation), definition.action)
+            except ValueError as error:
+                raise InvalidInput(f"policy: {error}") from error
         longest = definition.max_rollout or 0 if query.policy is None else definition.time_limit or MAX_ROLLOUT_QUERY
         if query.steps > longest:
             raise InvalidInput(
@@ -159,9 +162,8 @@ def check_rollouts(definition: EnvironmentDefinition, queries: Sequence[Query]) 
     ]
 
 
-def check_trial(definition: EnvironmentDefinition, trial: Query, steps: int) -> Query:
-    """Check the query of a trial, an episode of ``steps`` steps in which a policy acts, and return it, with actions as
-    float64.
+def check_trial(definition: EnvironmentDefinition, trial: Query) -> Query:
+    """Check the query of a trial, an episode in which a policy acts, and return it, with actions as float64.
 
     Raises:
         InvalidInput: the original environment can be set to any state, the trial is too long, or actions or the policy
@@ -172,29 +174,7 @@ def check_trial(definition: EnvironmentDefinition, trial: Query, steps: int) -> 
             "trial: expected an original environment that can only be reset, got one that can be set to any state: "
             "request queries"
         )
-    if trial.steps != steps:
-        raise InvalidInput(f"trial: expected {steps} actions, as many as queries, got {trial.steps}")
     return check_rollouts(definition, [trial])[0]
-
-
-def _require_network(definition: EnvironmentDefinition, policy: bytes) -> None:
-    """Raise ``InvalidInput`` if a policy is not a network of arrays with the environment's observation and action."""
-    try:
-        network = Network.load(policy)
-    except ValueError as error:
-        raise InvalidInput(f"policy: {error}") from error
-    action = definition.action
-    expected = len(definition.observation), action.policy_counts, 0 if action.policy_counts else action.size
-    got = len(network.mean), network.counts, 0 if network.counts else len(network.low)
-    if got != expected:
-        raise InvalidInput(
-            f"policy: expected one of {expected[0]} observation entries with {_kind(*expected[1:])}, got one of "
-            f"{got[0]} with {_kind(*got[1:])}"
-        )
-
-
-def _kind(counts: tuple[int, ...], size: int) -> str:
-    return f"discrete actions of {list(counts)} choices" if counts else f"{size} continuous actions"
 
 
 def check_settable(definition: EnvironmentDefinition, q: Array) -> Array:

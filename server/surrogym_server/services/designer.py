@@ -186,23 +186,21 @@ class Designer:
     def improve(
         self,
         name: str,
-        queries: int,
+        queries: int | Query,
         checkpoint: str | None,
         key: str | None,
         *,
         raise_budget: bool,
-        trial: Query | None = None,
     ) -> Granted:
         """Request that the next fit of the surrogate ``name`` chooses more queries, or a trial of a policy.
 
         Args:
             name: name of the surrogate.
-            queries: number of real steps of these queries.
+            queries: number of real steps of these queries; or the trial, a query in which a policy acts.
             checkpoint: name of the submitted occupancy (visited states) that weights the queries; None for the latest
                 one, if any.
             key: idempotency key of the request.
             raise_budget: whether to raise the budget as far as the queries need.
-            trial: query of ``queries`` steps in which a policy acts; None if the fit chooses.
 
         Raises:
             InvalidInput: no occupancy was submitted under the name ``checkpoint``, or the trial does not fit the
@@ -216,10 +214,10 @@ class Designer:
             )
         if checkpoint is None and (latest := self._storage.occupancy.latest(name)) is not None:
             checkpoint = latest.checkpoint
-        if trial is not None:
-            trial = check_trial(self._definitions.get(name), trial, queries)
+        if isinstance(queries, Query):
+            queries = check_trial(self._definitions.get(name), queries)
         granted = self._storage.designs.improve(
-            name, queries, checkpoint=checkpoint, trial=trial, key=key, raise_budget=raise_budget
+            name, queries, checkpoint=checkpoint, key=key, raise_budget=raise_budget
         )
         self._notices.post(name)
         return granted

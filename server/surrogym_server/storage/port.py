@@ -137,10 +137,9 @@ class Designs(ABC):
     def improve(
         self,
         name: str,
-        queries: int,
+        queries: int | Query,
         *,
         checkpoint: str | None = None,
-        trial: Query | None = None,
         key: str | None = None,
         raise_budget: bool = False,
     ) -> Granted:
@@ -148,9 +147,8 @@ class Designs(ABC):
 
         Args:
             name: name of the surrogate.
-            queries: number of real steps of these queries.
+            queries: number of real steps of these queries; or a query in which a policy acts, which is stored at once.
             checkpoint: name of the occupancy that weights the choice; None for no weights.
-            trial: query of ``queries`` steps in which a policy acts, stored at once; None if the next fit chooses.
             key: idempotency key of the request.
             raise_budget: whether to raise the budget by the missing steps.
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from surrogym_shared.spec import MAX_ROLLOUT_QUERY
 from surrogym_shared.wire.base import (
@@ -390,12 +390,10 @@ class Improve(Request):
     The budget must have enough real steps left. With a token of role ``admin``, the budget is raised as needed.
     """
 
-    queries: Annotated[
-        int,
-        Field(
-            ge=1, le=10_000, description="number of real steps of the further queries; each step of a rollout counts"
-        ),
-    ]
+    queries: Annotated[int, Field(ge=1, le=10_000)] | None = Field(
+        default=None,
+        description="number of real steps of the further queries; each step of a rollout counts; null for a trial",
+    )
     checkpoint: Key | None = Field(
         default=None,
         description="name of the submitted occupancy (states that policies visited) near which to choose the queries; "
@@ -403,7 +401,12 @@ class Improve(Request):
     )
     trial: Trial | None = Field(
         default=None,
-        description="trial of a policy, of as many steps as ``queries``, instead of queries that the acquisition "
-        "chooses; null: no trial",
+        description="trial of a policy, instead of ``queries`` that the acquisition chooses; null: no trial",
     )
     idempotency_key: Key | None = Field(default=None, description="a repeat with the same key adds nothing")
+
+    @model_validator(mode="after")
+    def _queries_or_a_trial(self) -> Self:
+        if (self.queries is None) == (self.trial is None):
+            raise ValueError("expected either queries or trial")
+        return self

@@ -257,11 +257,11 @@ def test_a_trial_is_asked_at_once_within_the_budget_and_only_once(storage: Stora
     trial = Query.rollout([[0.5], [0.25]], policy=b"arrays")
     before = storage.surrogates.get(due)
     for _ in range(2):
-        granted = storage.designs.improve(due, 2, trial=trial, key="k", raise_budget=True)
+        granted = storage.designs.improve(due, trial, key="k", raise_budget=True)
         assert (granted.record.extra_queries, granted.record.phase) == (before.extra_queries, "collecting")
         assert granted.record.budget == before.budget + granted.raised
     with pytest.raises(IdempotencyConflict):
-        storage.designs.improve(due, 2, trial=replace(trial, policy=b"others"), key="k")
+        storage.designs.improve(due, replace(trial, policy=b"others"), key="k")
     pending = storage.queries.list(due, ("pending",))
     assert [(query.policy, query.actions, query.purpose) for query in pending] == [
         (b"arrays", trial.actions, "adaptive")

@@ -174,17 +174,11 @@ def _require_fit(predict: Predict, spec: EnvironmentSpec, misfit: str) -> None:
     from surrogym.cli.errors import CommandError
     from surrogym_shared.network import Network
 
-    if not isinstance(predict, Network):
-        return
-    own, seen = len(spec.observation), len(predict.mean)
-    if seen != own:
-        raise CommandError(
-            f"{misfit}: expected a policy that reads {own} numbers of the observation, got one that reads {seen}"
-        )
-    choices = spec.action.policy_counts
-    wanted, got = choices or spec.action.size, predict.counts or len(predict.low)
-    if wanted != got:
-        raise CommandError(f"{misfit}: expected a policy with {_actions(wanted)}, got one with {_actions(got)}")
+    if isinstance(predict, Network):
+        try:
+            predict.require_fit(len(spec.observation), spec.action)
+        except ValueError as error:
+            raise CommandError(f"{misfit}: {error}") from error
 
 
 def _of_another(card: PolicyCard) -> PolicyCard:
@@ -205,11 +199,3 @@ def _floor(port: SurrogatePort, seed: int, session: dict[str, object]) -> float:
     spec = port.spec()
     predict = baseline(spec, default_baseline(spec), seed)
     return float(imagined_returns(port, predict, CHECK_EPISODES, seed, **session).mean())
-
-
-def _actions(known: int | tuple[int, ...]) -> str:
-    """Describe the actions of a network in words, from the number of continuous actions, or from the number of choices
-    of each discrete action."""
-    if isinstance(known, int):
-        return f"{known} continuous action{'s' * (known != 1)}"
-    return f"discrete actions of {' and '.join(map(str, known))} choices"

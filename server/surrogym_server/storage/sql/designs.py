@@ -90,23 +90,23 @@ class SqlDesigns(port.Designs):
     def improve(
         self,
         name: str,
-        queries: int,
+        queries: int | Query,
         *,
         checkpoint: str | None = None,
-        trial: Query | None = None,
         key: str | None = None,
         raise_budget: bool = False,
     ) -> Granted:
-        body = fingerprint(queries, checkpoint, trial and trial.policy)
+        trial, steps = (queries, queries.steps) if isinstance(queries, Query) else (None, queries)
+        body = fingerprint(steps, checkpoint, trial and trial.policy)
         with self._database.write() as connection:
             surrogate = hold(connection, name)
             raised = recall(connection, surrogate, "ask", key, body)
             if raised is None:
                 before = surrogate_rows.read(connection, name)
-                raised = _to_raise(connection, before, queries, allowed=raise_budget)
+                raised = _to_raise(connection, before, steps, allowed=raise_budget)
                 changes: dict[str, Any] = {"budget": before.budget + raised, "checkpoint": checkpoint}
                 if trial is None:
-                    changes["extra_queries"] = before.extra_queries + queries
+                    changes["extra_queries"] = before.extra_queries + steps
                 else:
                     if before.phase in COMPLETED:
                         changes["phase"] = "sampling"
