@@ -21,10 +21,10 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "examples" / "machines"))
 import numpy as np
 from dirt import PARTS, Dirt, Machine
 
-from surrogym_sampler.diagnosis.dirt import Dirt as Found
-from surrogym_sampler.diagnosis.dirt import identify, sensors
-from surrogym_sampler.diagnosis.dirt.taking import take
+from surrogym_sampler.diagnosis.taking import take
 from surrogym_sampler.original.swingup import GRAVITY, swing_up
+from surrogym_shared.dirt import Dirt as Found
+from surrogym_shared.dirt import identify, sensors
 from surrogym_shared.nouns import RealStep
 from surrogym_shared.spec import EnvironmentSpec, limits
 

@@ -7,8 +7,10 @@ import re
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
+from support.dirty import learned
 from support.scripted_server import lost_reply, reply, scripted_server
 from support.teaching import teach
 from support.terminal import on_terminal
@@ -16,6 +18,8 @@ from surrogym.cli.commands import status
 from surrogym_client.transport import Api
 from surrogym_sampler.original.classic import pendulum
 from surrogym_shared import wire
+from surrogym_shared.dirt import Rollout, identify, sensors
+from surrogym_shared.dirt.words import traits
 
 EMPTY = reply(wire.SurrogateList(surrogates=[]).model_dump_json())
 
@@ -80,6 +84,33 @@ def test_the_status_shows_resets_seconds_and_wear_of_the_machine(on_server, serv
     words = f"of the machine: 1 reset, {len(samples) * 0.05:.4g} s without resets, {wear} step"
     assert words in on_server("status", name).out
     assert on_server("status", name, "--json").json["ledger"]["wear"] == wear
+
+
+def test_the_status_names_the_dirt_of_the_first_real_steps_in_the_words_of_doctor(on_server, server_process, name):
+    with Api(server_process.url) as api:
+        spec = learned(api, name, "--seed", "1")
+        samples = list(api.samples(name))
+    rollouts = [
+        Rollout(
+            np.array([steps[0].coordinates, *(step.next_coordinates for step in steps)]),
+            np.array([step.action for step in steps]),
+        )
+        for steps in ([s for s in samples if s.trajectory == t] for t in sorted({s.trajectory for s in samples}))
+    ]
+    known = sensors(spec)
+    found = dict(traits(identify(rollouts, known), known, spec, rollouts))
+    assert {"dead time", "encoder"} <= found.keys()
+    out, dirt = on_server("status", name).out, on_server("status", name, "--json").json["dirt"]
+    assert all(f"\n{kind}: {said}\n" in f"{out}\n" for kind, said in found.items())
+    assert found.items() <= {(finding["name"], finding["said"]) for finding in dirt}
+
+
+def test_the_status_of_a_clean_machine_names_no_dirt(on_server, server_process, name):
+    with Api(server_process.url) as api:
+        learned(api, name, "--seed", "1", "--clean")
+        assert api.surrogate(name).ledger.total == 60
+    assert "actions take effect" not in on_server("status", name).out
+    assert "dirt" not in on_server("status", name, "--json").json
 
 
 def test_the_status_of_a_design_with_failed_queries_recommends_resume(on_server, server_process, name):

@@ -9,6 +9,7 @@ import httpx
 import pytest
 from playwright.sync_api import Page, expect
 
+from support.dirty import learned
 from support.server import ServerProcess
 from surrogym_client.transport import Api
 from surrogym_sampler.original.classic import pendulum
@@ -64,6 +65,15 @@ def test_the_dashboard_shows_a_surrogate_without_browser_errors(
     page.locator(".model summary").first.click()
     expect(page.locator(".model").first).to_contain_text("lengthscale")
     assert {re.match(r"https?://[^/]+", address)[0] for address in requested} == {url}
+    assert complaints == []
+
+
+def test_the_dashboard_names_the_dirt_of_a_machine(url: str, open_page: Open, complaints: list[str]):
+    with Api(url) as api:
+        learned(api, "furuta-with-dirt", "--seed", "1")
+        (first, *_) = api.dirt("furuta-with-dirt")
+    page = open_page(f"{url}/#/s/furuta-with-dirt")
+    expect(page.locator(".facts")).to_contain_text(f"{first.name}: {first.said}")
     assert complaints == []
 
 

@@ -7,12 +7,12 @@ import math
 import numpy as np
 import pytest
 
-from surrogym_sampler.diagnosis.dirt import Rollout, Sensors, identify
-from surrogym_sampler.diagnosis.dirt.dead_time import weights
-from surrogym_sampler.diagnosis.dirt.lattice import widths
-from surrogym_sampler.diagnosis.dirt.process import at
-from surrogym_sampler.diagnosis.dirt.stiction import sticking
-from surrogym_sampler.diagnosis.dirt.words import traits
+from surrogym_shared.dirt import Rollout, Sensors, identify
+from surrogym_shared.dirt.dead_time import weights
+from surrogym_shared.dirt.lattice import widths
+from surrogym_shared.dirt.process import at
+from surrogym_shared.dirt.stiction import sticking
+from surrogym_shared.dirt.words import traits
 from surrogym_shared.spec import BoxAction, Coordinate, EnvironmentSpec, ObservationEntry, Term, Uniform
 
 PARTS = 20  # parts of a step

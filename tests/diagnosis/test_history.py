@@ -8,13 +8,13 @@ from functools import partial
 import numpy as np
 import pytest
 
-from surrogym_sampler.diagnosis.dirt import Dirt, identify, sensors
-from surrogym_sampler.diagnosis.dirt.taking import take
-from surrogym_sampler.diagnosis.dirt.words import declared
 from surrogym_sampler.diagnosis.doctor import environment
+from surrogym_sampler.diagnosis.taking import take
 from surrogym_sampler.original import make
 from surrogym_sampler.original.isolated import IsolatedEnvironment
 from surrogym_sampler.original.rollouts import answering
+from surrogym_shared.dirt import Dirt, identify, sensors
+from surrogym_shared.dirt.words import declared
 from surrogym_shared.spec import BoxAction, Coordinate, EnvironmentSpec, ObservationEntry, Term, Uniform, with_history
 
 CIRCLE = Uniform(low=-math.pi, high=math.pi)

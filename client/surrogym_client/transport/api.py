@@ -549,6 +549,10 @@ class Api:
         """Return all samples as the content of one CSV or NPZ file."""
         return self.connection.send("GET", f"{routes.surrogate(name)}/samples", params={"format": file_format})
 
+    def dirt(self, name: str) -> list[wire.DirtFinding]:
+        """Return the dirt that was found in the first real steps of a machine that can only be reset."""
+        return self._get(wire.DirtList, f"{routes.surrogate(name)}/dirt").findings
+
     def report_steps(
         self, name: str, steps: int, *, episodes: int = 0, note: str = "", idempotency_key: str | None = None
     ) -> wire.Ledger:

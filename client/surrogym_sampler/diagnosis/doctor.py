@@ -27,9 +27,7 @@ from surrogym_client.errors import (
 from surrogym_client.runtime.versions import EXTRAS, versions
 from surrogym_client.transport.api import Api
 from surrogym_sampler.diagnosis.access import EXACT, Access, CheckFailed, examine
-from surrogym_sampler.diagnosis.dirt import Dirt, identify, sensors
-from surrogym_sampler.diagnosis.dirt.taking import take
-from surrogym_sampler.diagnosis.dirt.words import declared, history_call, traits
+from surrogym_sampler.diagnosis.taking import take
 from surrogym_sampler.original.actions import middle_action
 from surrogym_sampler.original.episodes import draw
 from surrogym_sampler.original.errors import OriginalError, StepFailed
@@ -38,6 +36,8 @@ from surrogym_sampler.original.isolated import IsolatedEnvironment
 from surrogym_sampler.original.protocol import Array, OriginalEnvironment, RealStep
 from surrogym_sampler.original.simulator import Simulated
 from surrogym_sampler.queries.sample_conversion import sample_of
+from surrogym_shared.dirt import Dirt, identify, sensors
+from surrogym_shared.dirt.words import declared, history_call, traits
 from surrogym_shared.plugins import Registry
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import PROTOCOL, StepQuery

@@ -12,12 +12,14 @@ from surrogym_server.api.door import READ, SAMPLE, TRAIN_OR_SAMPLE, DoorRoute, e
 from surrogym_server.api.problems import documented
 from surrogym_server.api.state import Use
 from surrogym_server.convert import resources
+from surrogym_server.convert.dirt import FIRST, dirt_of
 from surrogym_server.convert.exports import samples_as_csv, samples_as_npz
 from surrogym_server.storage.records import LogPart
 from surrogym_shared.codes import Code
 from surrogym_shared.wire import (
     AddedSamples,
     AddSamples,
+    DirtList,
     DroppedSnapshots,
     DropSnapshots,
     Ledger,
@@ -79,6 +81,18 @@ def samples(
     write, media_type = (samples_as_csv, CSV) if format == "csv" else (samples_as_npz, NPZ)
     content = write(use.samples.coordinate_names(name), use.samples.all(name))
     return Response(content, media_type=media_type, headers=_attachment(f"{name}.{format}"))
+
+
+@router.get(
+    "/dirt",
+    summary="Find dead time, encoders, friction and noise",
+    dependencies=[READ],
+    responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST),
+)
+def dirt(name: str, use: Use) -> DirtList:
+    """Find dead time, encoders, friction that sticks and noise in the first 60 real steps of an original environment
+    that can only be reset. Nothing is found before, or unless the evidence is clear."""
+    return DirtList(findings=dirt_of(use.surrogates.spec(name), use.samples.page(name, 0, FIRST)))
 
 
 @router.get(

@@ -59,6 +59,11 @@ export function where(found, names, onshow, model) {
     h("p", { class: "note" }, `Least certain near ${place}. `, h("button", { type: "button", class: "link", onclick: () => onshow(coordinates, action) }, "Show it")));
 }
 
+/** What the first real steps show of a machine that can only be reset, as `surrogym doctor --history` says it. */
+export function machine(findings) {
+  return findings.length > 0 && card("What the machine has", findings.map(({ name, said }) => h("p", { class: "note" }, `${name}: ${said}`)));
+}
+
 export function cost({ ledger, budget, queries }) {
   const open = queries.pending + queries.leased;
   return card("What it cost",

@@ -43,10 +43,10 @@ _NAMES = {
         "PutAlias TraceRank"
     ),
     "queries": (
-        "QUERY_LEASE_SECONDS AddedSamples AddQueries AddSamples AuditModel ClaimedQueries ClaimQueries "
-        "DroppedSnapshots DropSnapshots FailQuery Improve LeasedQuery NewSample Query QueryList QueryView RenewLease "
-        "ReportSteps RolloutQuery SamplePage SampleView SnapshotList SnapshotView StepQuery Trial WithdrawnQueries "
-        "WithdrawQueries"
+        "QUERY_LEASE_SECONDS AddedSamples AddQueries AddSamples AuditModel ClaimedQueries ClaimQueries DirtFinding "
+        "DirtList DroppedSnapshots DropSnapshots FailQuery Improve LeasedQuery NewSample Query QueryList QueryView "
+        "RenewLease ReportSteps RolloutQuery SamplePage SampleView SnapshotList SnapshotView StepQuery Trial "
+        "WithdrawnQueries WithdrawQueries"
     ),
     "service": "Access Event Health Ready",
     "sessions": (

@@ -359,6 +359,19 @@ class SamplePage(Reply):
     next_after: int | None = Field(description="value of ``after`` for the next page; null on the last page")
 
 
+class DirtFinding(Reply):
+    """Dirt of a machine, such as a dead time, an encoder, friction that sticks or noise."""
+
+    name: str = Field(description="kind of dirt")
+    said: str = Field(description="what was found, as a sentence")
+
+
+class DirtList(Reply):
+    """Dirt of a machine that can only be reset."""
+
+    findings: list[DirtFinding] = Field(description="what was found in the first real steps; empty for nothing")
+
+
 class ReportSteps(Request):
     """Report of the number of real steps that an evaluation took. They don't count towards the budget."""
 

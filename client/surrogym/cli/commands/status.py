@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from surrogym_client.transport.api import Api
-    from surrogym_shared.wire import ModelView, OutputFidelity, PolicyView, SurrogateSummary, SurrogateView
+    from surrogym_shared.wire import DirtFinding, ModelView, OutputFidelity, PolicyView, SurrogateSummary, SurrogateView
 
 Form = Literal["json", "short", "words"]
 
@@ -70,13 +70,19 @@ def _all(api: Api, form: Form) -> str:
 def _one(api: Api, name: str, form: Form) -> str:
     view = api.surrogate(name)
     if form == "json":
-        return json.dumps(view.model_dump(mode="json"))
+        found = {"dirt": [finding.model_dump() for finding in dirt]} if (dirt := _dirt(api, view)) else {}
+        return json.dumps(view.model_dump(mode="json") | found)
     if form == "short":
         return _short(view)
     models = api.models(name) if view.phase in ("over_budget", "unsure") else ()
-    return "\n".join(
-        [_detail(view, models), *_limits(api, view), *_prior(api, name), *_untrusted(name, api.policies.list(name))]
-    )
+    said = [f"{finding.name}: {finding.said}" for finding in _dirt(api, view)]
+    untrusted = _untrusted(name, api.policies.list(name))
+    return "\n".join([_detail(view, models), *said, *_limits(api, view), *_prior(api, name), *untrusted])
+
+
+def _dirt(api: Api, view: SurrogateView) -> list[DirtFinding]:
+    """Return what ``surrogym doctor --history`` would name of the machine, found in the first real steps."""
+    return api.dirt(view.name) if view.spec.access == "reset" else []
 
 
 def _limits(api: Api, view: SurrogateView) -> list[str]:

@@ -10,8 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from surrogym_sampler.diagnosis.dirt.rollouts import Rollout, Sensors, changes
-from surrogym_sampler.original.protocol import Array
+from surrogym_shared.dirt.rollouts import Array, Rollout, Sensors, changes
 
 ROUNDING = 1e-6  # a number counts as a multiple if it is off by at most this share of the largest change
 WIDEST = 30  # a width is at least this multiple of the rounding

@@ -6,10 +6,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from surrogym_sampler.diagnosis.dirt.rollouts import Rollout, rest_action
 from surrogym_sampler.original.actions import random_action
 from surrogym_sampler.original.lags import read_names
 from surrogym_sampler.original.protocol import Array, RealStep, RolloutEnvironment
+from surrogym_shared.dirt.rollouts import Rollout, rest_action
 from surrogym_shared.spec import BoxAction, EnvironmentSpec
 
 EPISODE = 20  # largest number of steps in an episode

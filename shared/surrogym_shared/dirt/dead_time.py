@@ -21,9 +21,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from surrogym_sampler.diagnosis.dirt.process import Process, at, fitted
-from surrogym_sampler.diagnosis.dirt.rollouts import Rollout, Rows, Sensors, rows
-from surrogym_sampler.original.protocol import Array
+from surrogym_shared.dirt.process import Process, at, fitted
+from surrogym_shared.dirt.rollouts import Array, Rollout, Rows, Sensors, rows
 
 LONGEST = 5  # largest dead time in steps
 COARSE, FINE = 0.5, 0.1  # distances of dead times that are compared: all of them, and those near the best one

@@ -12,13 +12,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from surrogym_sampler.diagnosis.dirt.dead_time import Explained, explain
-from surrogym_sampler.diagnosis.dirt.lattice import turns as turns
-from surrogym_sampler.diagnosis.dirt.lattice import widths
-from surrogym_sampler.diagnosis.dirt.rollouts import Rollout as Rollout
-from surrogym_sampler.diagnosis.dirt.rollouts import Sensors as Sensors
-from surrogym_sampler.diagnosis.dirt.rollouts import sensors as sensors
-from surrogym_sampler.diagnosis.dirt.stiction import Stiction, sticking
+from surrogym_shared.dirt.dead_time import Explained, explain
+from surrogym_shared.dirt.lattice import turns as turns
+from surrogym_shared.dirt.lattice import widths
+from surrogym_shared.dirt.rollouts import Rollout as Rollout
+from surrogym_shared.dirt.rollouts import Sensors as Sensors
+from surrogym_shared.dirt.rollouts import sensors as sensors
+from surrogym_shared.dirt.stiction import Stiction, sticking
 
 LIKELY = 5.0  # smallest logarithm of the odds for noise that is named
 LATE = 8.0  # ... and for a dead time, which is the best one of many

@@ -14,8 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from surrogym_sampler.diagnosis.dirt.rollouts import Rollout, Sensors, changes
-from surrogym_sampler.original.protocol import Array
+from surrogym_shared.dirt.rollouts import Array, Rollout, Sensors, changes
 
 FEWEST = 3  # fewest steps in which the coordinate rests
 LEVEL = 1e-3  # friction is named if a coordinate without it would rest that often with at most this probability

@@ -11,12 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from surrogym_sampler.original.lags import read_names
-from surrogym_sampler.original.protocol import Array
 from surrogym_shared.spec import BoxAction, EnvironmentSpec, limits
 
 OTHERS = 0.15  # variance by the noise of other measurements, as a multiple of that by the coordinate's own
 
+Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 
@@ -49,11 +48,10 @@ class Sensors:
 
 def sensors(spec: EnvironmentSpec) -> Sensors:
     """Return the measured coordinates of a specification: those that are no lags."""
-    names = read_names(spec)
-    own = [c for c in spec.coordinates if c.name in names]
+    own = [c for c in spec.coordinates if c.lag is None]
     spans = [high - low for low, high in (limits(c.sampling) for c in own)]
     turning, moving = [c.kind == "angle" for c in own], [c.kind != "constant" for c in own]
-    return Sensors(names, np.array(turning), np.array(moving), np.array(spans), rest_action(spec))
+    return Sensors(tuple(c.name for c in own), np.array(turning), np.array(moving), np.array(spans), rest_action(spec))
 
 
 def rest_action(spec: EnvironmentSpec) -> Array:

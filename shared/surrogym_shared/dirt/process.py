@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from surrogym_sampler.original.protocol import Array
+from surrogym_shared.dirt.rollouts import Array
 
 # Logarithms of length scales, sigma_f, lambda and sigma_n: mean and standard deviation of their normal priors.
 LENGTH, SIGNAL, LINEAR, NOISE = (2.0, 0.6), (-1.0, 1.5), (-0.5, 1.5), (-4.0, 3.0)

@@ -6,8 +6,8 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from surrogym_sampler.diagnosis.dirt import Dirt, turns
-from surrogym_sampler.diagnosis.dirt.rollouts import Rollout, Sensors, changes
+from surrogym_shared.dirt import Dirt, turns
+from surrogym_shared.dirt.rollouts import Rollout, Sensors, changes
 from surrogym_shared.spec import EnvironmentSpec
 
 CERTAIN = 10.0  # logarithm of odds that are called certain
