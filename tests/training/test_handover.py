@@ -319,7 +319,10 @@ def test_a_policy_whose_audit_rollout_fails_or_ends_early_is_not_trusted(
         assert handover.audit is not None
         assert handover.audit.steps == (0 if fails else 3)
         assert not handover.trusted
-        end = "failed at 1 of 1 queries, so nothing is known there" if fails else "where the model predicted no end"
+        failed = (
+            "failed at 1 of 1 queries, so nothing is known there; the last error was: RuntimeError: the interlock is "
+        )
+        end = f"{failed}open" if fails else "where the model predicted no end"
         assert handover.reason.endswith(end)
 
 

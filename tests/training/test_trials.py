@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from support.server import ServerProcess, running_server
-from surrogym_client.surrogates.waiting import wait_for_design
+from surrogym_client.surrogates.waiting import DesignUnfinished, wait_for_design
 from surrogym_client.transport import Api, HttpSurrogate
 from surrogym_sampler.original.classic import pendulum
 from surrogym_sampler.original.rollouts import answering
@@ -29,6 +29,7 @@ from surrogym_shared.spec import (
     Uniform,
     with_history,
 )
+from surrogym_shared.wire import Trial
 from surrogym_trainer.policies.files import load_network
 from surrogym_trainer.policies.integrals import IntegralPort, Integrals
 from surrogym_trainer.training import TrainSettings
@@ -36,7 +37,7 @@ from surrogym_trainer.training.audited import AuditedTraining
 from surrogym_trainer.training.closed_loop import LoopSettings
 from surrogym_trainer.training.handover import AuditSettings, Subject, hand_over
 from surrogym_trainer.training.settings import TrainingInterrupted
-from surrogym_trainer.training.trials import Trials, allows_trials, is_waiting_for_trials
+from surrogym_trainer.training.trials import Trials, allows_trials, encoded, is_waiting_for_trials
 
 BUDGET, FIRST, EPISODE = 100, 60, 15
 SETTINGS = TrainSettings(algorithm="FASTPPO", total_steps=4_096, num_envs=16, seed=0)
@@ -108,7 +109,7 @@ def test_policies_try_episodes_with_what_the_design_has_left_of_its_budget(
         before = api.surrogate(waiting)
         assert before.phase == "unsure"
         assert FIRST <= before.ledger.total < BUDGET
-        assert is_waiting_for_trials(before)
+        assert is_waiting_for_trials(api, waiting)
         rounds, audit = LoopSettings(queries=0), AuditSettings()
         training = AuditedTraining(api, waiting, port, tmp_path / "p.zip", SETTINGS, rounds, audit)
         result, handover = training.train()
@@ -192,3 +193,81 @@ def test_ctrl_c_during_a_trial_leaves_the_best_policy_so_far(
             trials.train()
     assert stopped.value.result.virtual_steps == trials.trained[0].virtual_steps
     load_network(tmp_path / "p.zip")
+
+
+@pytest.fixture
+def trials(trials_server: ServerProcess, waiting: str, tmp_path: Path) -> Iterator[Trials]:
+    with Api(trials_server.url) as api, HttpSurrogate(trials_server.url, waiting) as port:
+        yield Trials(api, waiting, port, tmp_path / "p.zip", SETTINGS, LoopSettings(queries=0))
+
+
+def idle() -> Network:
+    """A policy whose action is always 0."""
+    size = len(Late().spec().observation)
+    return Network.of(Late().spec(), np.zeros(size), np.ones(size), 4, np.zeros(Network.size(Late().spec(), 4)))
+
+
+def test_a_trial_that_a_failed_step_cut_off_has_not_succeeded(
+    trials: Trials, waiting: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert trials._try(idle(), EPISODE, 0) is True
+    step, numbers = Late.step, iter(range(EPISODE))
+    faulty = lambda late, action: 1 / 0 if next(numbers) == 5 else step(late, action)  # noqa: E731
+    monkeypatch.setattr(Late, "step", faulty)
+    assert trials._try(idle(), EPISODE, 1) is False
+    cut = max(query.id for query in trials.api.queries(waiting))
+    assert len([sample for sample in trials.api.samples(waiting) if sample.query_id == cut]) == 5
+
+
+def test_trials_end_with_the_best_policy_if_the_machine_takes_no_first_step(
+    trials: Trials, waiting: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Late, "step", lambda *_: 1 / 0)
+    result = trials.train()
+    (failed,) = [query for query in trials.api.queries(waiting) if query.policy]
+    assert (failed.status, failed.attempts, len(trials.trained)) == ("set_aside", 3, 1)
+    load_network(result.path)
+
+
+def test_trials_without_a_sampler_end_with_an_error_that_names_the_policy(
+    trials: Trials, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    going = threading.Event()
+    step = Late.step
+    monkeypatch.setattr(Late, "step", lambda *arguments: going.wait(60) and step(*arguments))
+    trials.rounds = LoopSettings(queries=0, patience_seconds=1.0)
+    try:
+        with pytest.raises(DesignUnfinished, match=r"has not ended after 1 s.*the policy so far is in .*p\.zip"):
+            trials.train()
+    finally:
+        going.set()
+
+
+def test_a_training_waits_for_trials_while_the_machine_takes_that_of_another_training(
+    trials: Trials, waiting: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    going = threading.Event()
+    step = Late.step
+    monkeypatch.setattr(Late, "step", lambda *arguments: going.wait(60) and step(*arguments))
+    try:
+        trials.api.improve(waiting, trial=Trial(policy=encoded(idle()), actions=[[0.0]] * 3))
+        assert trials.api.surrogate(waiting).phase == "sampling"
+        assert is_waiting_for_trials(trials.api, waiting)
+    finally:
+        going.set()
+
+
+def test_a_training_judges_its_own_trial_beside_that_of_another_training(
+    trials: Trials, waiting: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def beside(*_: object) -> list[list[float]]:
+        trials.api.improve(waiting, trial=Trial(policy=encoded(idle()), actions=[[0.5]]))
+        return [[0.25]] * EPISODE
+
+    judged: list[int] = []
+    monkeypatch.setattr("surrogym_trainer.training.trials.expected_actions", beside)
+    monkeypatch.setattr(
+        "surrogym_trainer.training.trials.succeeded", lambda _, states, *__, **___: not judged.append(len(states))
+    )
+    assert trials._try(idle(), EPISODE, 0)
+    assert judged == [EPISODE]

@@ -103,7 +103,7 @@ class AuditedTraining:
     def _first(self) -> TrainResult:
         rounds, inputs = self.rounds, (self.api, self.name, self.port, self.out, self.settings)
         tries = rounds is not None and allows_trials(self.port.spec(), self.settings)
-        if rounds and tries and (rounds.queries or is_waiting_for_trials(self.api.surrogate(self.name))):
+        if rounds and tries and (rounds.queries or is_waiting_for_trials(self.api, self.name)):
             return Trials(*inputs, rounds, self.progress, self.waiting, self.candidates).train()
         if rounds is None or not rounds.queries:
             return train(self.port, self.out, self._chosen, self.progress)

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from surrogym_client.environments.lanes import Lanes, session_request
-from surrogym_client.surrogates.waiting import wait_for_design
+from surrogym_client.surrogates.waiting import DesignUnfinished, wait_for_design
 from surrogym_client.transport.api import Api
 from surrogym_shared.port import SurrogatePort
 from surrogym_shared.wire import SurrogateView
@@ -157,6 +157,10 @@ class TrainingInRounds(ABC):
             if self.trained:
                 raise TrainingInterrupted(self.result()) from None
             raise
+        except DesignUnfinished as unfinished:
+            if self.best is None:
+                raise
+            raise DesignUnfinished(f"{unfinished}; the policy so far is in {self.best.path}") from unfinished
         return self.result()
 
     def result(self) -> TrainResult:

@@ -180,7 +180,8 @@ def take(
         answers, failed = _answers(subject, settings, wanted, progress)
         samples = [sample for sample in answers if spec.known(sample.coordinates)]
         if not samples:
-            faults = (unanswered(len(failed), len(wanted)),)
+            error = f"; the last error was: {failed[-1].error}" if failed else ""
+            faults = (f"{unanswered(len(failed), len(wanted))}{error}",)
             none = Audit(steps=0, unanswered=len(failed), passed=False, faults=faults, before=before, after=before)
             return none if failed else None
         samples.sort(key=lambda sample: sample.query_id in elsewhere)

@@ -16,12 +16,13 @@ from numpy.typing import NDArray
 
 from surrogym_client.environments.lanes import Lanes, session_request
 from surrogym_client.surrogates.waiting import COMPLETED, wait_for_design
+from surrogym_client.transport.api import Api
 from surrogym_sampler.original.protocol import LONGEST_EPISODE
 from surrogym_shared.network import Network
 from surrogym_shared.port import SurrogatePort
 from surrogym_shared.set_points import with_set_points
 from surrogym_shared.spec import EnvironmentSpec
-from surrogym_shared.wire import SurrogateView, Trial
+from surrogym_shared.wire import QueryView, Trial
 from surrogym_trainer.evaluation.evaluator import succeeded
 from surrogym_trainer.evaluation.imagined import imagined_returns
 from surrogym_trainer.policies.files import load_network
@@ -47,17 +48,26 @@ def encoded(policy: Network) -> str:
     return b64encode(policy.to_bytes()).decode()
 
 
-def is_waiting_for_trials(view: SurrogateView) -> bool:
-    """Whether the design has ended and is not ready, its budget has steps left, and a sampler is running."""
-    return view.phase in COMPLETED and view.phase != "ready" and view.budget_left > 0 and bool(view.samplers)
+def is_waiting_for_trials(api: Api, name: str) -> bool:
+    """Whether the design has ended, or only takes or learns a trial of another training; and it is not ready, its
+    budget has steps left, and a sampler is running."""
+    view = api.surrogate(name)
+    if view.phase in ("ready", "failed") or view.budget_left <= 0 or not view.samplers:
+        return False
+    return view.phase in COMPLETED or any(_is_trial(query) for query in api.queries(name))
+
+
+def _is_trial(query: QueryView) -> bool:
+    return query.policy and query.purpose == "adaptive"  # an audit lets a policy act, too
 
 
 class Trials(TrainingInRounds):
     """Train policies, each with a new network, and let the best one try an episode after each training.
 
     The trials end when one has succeeded, the model that has learned from it expects no less of its policy than before,
-    and no other policy is clearly better in that model; or after the number of rounds; or when the budget is spent. A
-    trial succeeds by the criterion of the specification, if there is one. Without a number of steps in ``rounds``, a
+    and no other policy is clearly better in that model; or after the number of rounds; or when the budget is spent; or
+    when the original environment failed at each attempt to take a trial's first step, or refused the trial. A trial
+    succeeds by the criterion of the specification, if there is one. Without a number of steps in ``rounds``, a
     trial is a whole episode, and the trials take the rest of the budget.
     """
 
@@ -72,7 +82,9 @@ class Trials(TrainingInRounds):
             earned = self._earned(policy)
             if tried is not None and self._confirms(*tried, earned, best.untrained or 0.0):
                 break
-            tried = (policy, earned) if self._try(policy, steps, number) else None
+            if (success := self._try(policy, steps, number)) is None:
+                break
+            tried = (policy, earned) if success else None
 
     @property
     def _most(self) -> int:
@@ -102,19 +114,25 @@ class Trials(TrainingInRounds):
     def _earned(self, policy: Network) -> NDArray[np.float64]:
         return imagined_returns(self.port, policy, EPISODES, self.settings.seed, **self._chosen.judging)
 
-    def _try(self, policy: Network, steps: int, number: int) -> bool:
-        """Let a policy try an episode of at most ``steps`` steps, and return whether it succeeded."""
+    def _try(self, policy: Network, steps: int, number: int) -> bool | None:
+        """Let a policy try an episode of at most ``steps`` steps, and return whether the episode succeeded. One that an
+        error or a stopped sampler cut off has not. Return None if no step could be taken."""
         view, earlier = self.api.surrogate(self.name), {query.id for query in self.api.queries(self.name)}
         actions = expected_actions(self.port, policy, steps, self.settings.seed + number)
         trial = Trial(policy=encoded(policy), actions=actions)
         self.api.improve(self.name, trial=trial)
         wait_for_design(self.api, self.name, self.rounds.patience_seconds, self.waiting, after_round=view.round)
-        # of two trainings at once, each takes the first one after its own request
-        asked = min(query.id for query in self.api.queries(self.name) if query.policy and query.id not in earlier)
-        taken = [sample for sample in self.api.samples(self.name) if sample.query_id == asked]
+        # other trainings may have added trials since
+        added = [query for query in self.api.queries(self.name) if _is_trial(query) and query.id not in earlier]
+        shape = np.shape(actions)
+        asked = next(q.id for q in added if np.shape(q.actions) == shape and np.allclose(q.actions, actions))
+        taken = [sample for sample in self.api.samples(self.name) if sample.query_id == asked and not sample.late]
+        if not taken:
+            return None
+        whole = len(taken) >= steps or taken[-1].terminated or taken[-1].truncated
         states, rewards = np.array([s.next_coordinates for s in taken]), np.array([s.reward for s in taken])
         spec = with_set_points(self.port.spec(), self.settings.set_points)
-        return bool(taken) and succeeded(spec, states, rewards, terminated=taken[-1].terminated)
+        return whole and succeeded(spec, states, rewards, terminated=taken[-1].terminated)
 
     def _trials_left(self, number: int) -> int:
         """Return the largest number of trials of whole episodes after ``number`` trials."""

@@ -260,8 +260,9 @@ def test_a_trial_is_asked_at_once_within_the_budget_and_only_once(storage: Stora
         granted = storage.designs.improve(due, trial, key="k", raise_budget=True)
         assert (granted.record.extra_queries, granted.record.phase) == (before.extra_queries, "collecting")
         assert granted.record.budget == before.budget + granted.raised
-    with pytest.raises(IdempotencyConflict):
-        storage.designs.improve(due, replace(trial, policy=b"others"), key="k")
+    for other in (replace(trial, policy=b"others"), replace(trial, actions=((0.5,), (0.75,)))):
+        with pytest.raises(IdempotencyConflict):
+            storage.designs.improve(due, other, key="k")
     pending = storage.queries.list(due, ("pending",))
     assert [(query.policy, query.actions, query.purpose) for query in pending] == [
         (b"arrays", trial.actions, "adaptive")

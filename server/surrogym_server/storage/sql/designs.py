@@ -97,7 +97,7 @@ class SqlDesigns(port.Designs):
         raise_budget: bool = False,
     ) -> Granted:
         trial, steps = (queries, queries.steps) if isinstance(queries, Query) else (None, queries)
-        body = fingerprint(steps, checkpoint, trial and trial.policy)
+        body = fingerprint(steps, checkpoint, trial and (trial.policy, trial.actions))
         with self._database.write() as connection:
             surrogate = hold(connection, name)
             raised = recall(connection, surrogate, "ask", key, body)
