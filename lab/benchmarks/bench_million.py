@@ -34,8 +34,7 @@ from support.teaching import teach
 from surrogym_client.transport import Api, HttpSurrogate
 from surrogym_sampler.original.classic import pendulum
 from surrogym_server.features.ray.store import Checkpoint, LiveSessions, SessionLease
-from surrogym_server.storage.port import Storage
-from surrogym_server.storage.sql import open_storage
+from surrogym_server.storage.sql import Storage, open_storage
 from surrogym_shared.wire import OpenSession
 
 SURROGATES, SAMPLES, SESSIONS, CHECKPOINT = 200, 1_000_000, 1_000, 16_384

@@ -67,8 +67,7 @@ from surrogym_server.services.sessions import SessionService
 from surrogym_server.services.surrogates import Plan, SurrogateService
 from surrogym_server.services.sweeper import Sweeper
 from surrogym_server.settings import LOCAL_NAMES, Settings
-from surrogym_server.storage.port import Storage
-from surrogym_server.storage.sql import open_storage
+from surrogym_server.storage.sql import Storage, open_storage
 from surrogym_shared.spec import EnvironmentSpec
 
 # Optional features of the server. To remove one, delete its folder in ``features`` and its line here.

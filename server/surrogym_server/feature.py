@@ -19,7 +19,7 @@ from surrogym_server.services.metrics import ProcessMetrics
 from surrogym_server.services.notices import Notices
 from surrogym_server.services.surrogates import Complete
 from surrogym_server.settings import Settings
-from surrogym_server.storage.port import Storage
+from surrogym_server.storage.sql import Storage
 
 S = TypeVar("S")
 

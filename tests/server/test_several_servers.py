@@ -19,9 +19,8 @@ from surrogym_server.services import claim_queues
 from surrogym_server.services.definitions import Definitions
 from surrogym_server.services.notices import Notices
 from surrogym_server.services.queries import QueryService
-from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import NewSurrogate
-from surrogym_server.storage.sql import open_storage
+from surrogym_server.storage.sql import Storage, open_storage
 from surrogym_shared.nouns import Query
 from surrogym_shared.spec import EnvironmentSpec
 

@@ -14,9 +14,8 @@ import sqlalchemy as sa
 
 from support.postgresql import Postgresql, running_postgresql
 from support.queries import steps
-from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import NewSurrogate
-from surrogym_server.storage.sql import open_storage
+from surrogym_server.storage.sql import Storage, open_storage
 from surrogym_server.storage.sql.tables import metadata
 from surrogym_shared.nouns import Query
 

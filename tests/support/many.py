@@ -10,9 +10,8 @@ import sqlalchemy as sa
 
 from support import pendulum
 from support.queries import steps
-from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import NewDesign, NewModel, NewSample, NewSurrogate
-from surrogym_server.storage.sql import open_storage
+from surrogym_server.storage.sql import Storage, open_storage
 from surrogym_server.storage.sql.tables import metadata
 
 QUERIES, MODELS, BLOB_BYTES = 8, 3, 20_000

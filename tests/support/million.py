@@ -5,8 +5,7 @@ from __future__ import annotations
 import sqlalchemy as sa
 
 from support.many import create, finish
-from surrogym_server.storage.port import Storage
-from surrogym_server.storage.sql import open_storage
+from surrogym_server.storage.sql import Storage, open_storage
 from surrogym_server.storage.sql.tables import metadata
 
 FIRST, OPEN = "finished", "waiting"  # the surrogates that are made through storage

@@ -11,8 +11,8 @@ import httpx
 import numpy as np
 
 from surrogym_server.api.examples import PENDULUM
-from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import NewSample
+from surrogym_server.storage.sql import Storage
 
 INITIAL, BUDGET = 5, 7
 

@@ -15,7 +15,7 @@ from surrogym_server.services.queries import QueryService
 from surrogym_server.services.samples import SampleService
 from surrogym_server.services.sessions import SessionService
 from surrogym_server.services.surrogates import SurrogateService
-from surrogym_server.storage.port import Storage
+from surrogym_server.storage.sql import Storage
 
 
 @dataclass(frozen=True)

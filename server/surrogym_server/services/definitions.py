@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from threading import Lock
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,11 +14,13 @@ from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import InvalidInput, NotInstalled, SurrogymError
 from surrogym_server.models.registry import MODELS
 from surrogym_server.sampling.acquisition import ACQUISITIONS
-from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import SurrogateRecord
 from surrogym_shared.network import Network
 from surrogym_shared.nouns import Query
 from surrogym_shared.spec import MAX_ROLLOUT_QUERY
+
+if TYPE_CHECKING:  # checks of points need no database
+    from surrogym_server.storage.sql import Storage
 
 Array = NDArray[np.float64]
 Define = Callable[[dict[str, Any]], EnvironmentDefinition]

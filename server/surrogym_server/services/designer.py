@@ -30,7 +30,6 @@ from surrogym_server.services.definitions import Definitions, check_trial
 from surrogym_server.services.metrics import ProcessMetrics
 from surrogym_server.services.notices import Notices
 from surrogym_server.services.surrogates import Plan
-from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import (
     FREE,
     OPEN_STATUSES,
@@ -39,6 +38,7 @@ from surrogym_server.storage.records import (
     NewDesign,
     NewModel,
 )
+from surrogym_server.storage.sql import Storage
 from surrogym_shared.nouns import Query
 
 logger = logging.getLogger(__name__)

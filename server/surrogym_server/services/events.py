@@ -9,8 +9,8 @@ from typing import TypeVar
 
 from surrogym_server.errors import SurrogymError, Unavailable, UnknownSurrogate
 from surrogym_server.services.notices import Notices
-from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import EventRecord
+from surrogym_server.storage.sql import Storage
 
 T = TypeVar("T")
 

@@ -20,8 +20,8 @@ from surrogym_server.sampling.judging import monte_carlo
 from surrogym_server.sampling.uncertainty import UncertaintyResult, query_uncertainty
 from surrogym_server.services.definitions import Definitions, check_coordinates, check_points
 from surrogym_server.services.notices import Notices
-from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import ModelRecord, NewModel, SurrogateRecord
+from surrogym_server.storage.sql import Storage
 from surrogym_server.virtual.imagined import Imagined, imagine
 from surrogym_server.virtual.single_step import PointPrediction, predict_points
 

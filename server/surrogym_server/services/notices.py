@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from itertools import chain, islice
 
-from surrogym_server.storage.port import Alone, Announcements
+from surrogym_server.storage.sql.events import Announcements
 
 # At most this many listeners are woken in one iteration of the event loop. In between it can answer other requests.
 AT_ONCE = 50
@@ -59,7 +59,7 @@ class Notices:
     """
 
     def __init__(self, announcements: Announcements | None = None) -> None:
-        self._announcements = announcements or Alone()
+        self._announcements = announcements or Announcements()
         self._loop = asyncio.get_running_loop()
         self._audiences: dict[str, Audience] = {}
         self._everything = Audience(0)

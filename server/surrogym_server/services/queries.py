@@ -11,8 +11,8 @@ from surrogym_server.services.activity import Samplers
 from surrogym_server.services.claim_queues import ClaimQueues, Present
 from surrogym_server.services.definitions import Definitions, check_rollouts, check_steps
 from surrogym_server.services.notices import Notices
-from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import LeasedQuery, QueryRecord
+from surrogym_server.storage.sql import Storage
 from surrogym_shared.nouns import Query
 from surrogym_shared.states import ENDED, Phase, Purpose
 

@@ -15,8 +15,8 @@ from surrogym_server.sampling.coverage import covered
 from surrogym_server.services.activity import Samplers
 from surrogym_server.services.definitions import Definitions, check_coordinates
 from surrogym_server.services.notices import Notices
-from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import AddedSamples, LedgerRecord, LogPart, NewSample, SampleRecord
+from surrogym_server.storage.sql import Storage
 
 PAGE = 10_000
 BATCH = 500  # steps of a log are stored in batches of this size, each in one database transaction

@@ -23,8 +23,8 @@ from surrogym_server.engine.tallies import SessionActivity
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import Damaged, SurrogymError, UnknownSession
 from surrogym_server.services.definitions import Definitions
-from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import SavedSession
+from surrogym_server.storage.sql import Storage
 
 MOST_STARTS = 10_000  # if episodes start at states of real steps, a session gets at most this many of these states
 

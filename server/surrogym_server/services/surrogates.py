@@ -15,13 +15,13 @@ from surrogym_server.errors import InvalidInput, NoModel, SpecConflict, UnknownS
 from surrogym_server.services.activity import Samplers
 from surrogym_server.services.definitions import Define, Definitions
 from surrogym_server.services.notices import Notices
-from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import (
     ModelRecord,
     NewSurrogate,
     SurrogateRecord,
     SurrogateSummary,
 )
+from surrogym_server.storage.sql import Storage
 from surrogym_shared.nouns import Query
 
 Plan = Callable[[EnvironmentDefinition, int], Sequence[Query]]

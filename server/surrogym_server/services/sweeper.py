@@ -13,7 +13,7 @@ from surrogym_server.engine.port import SessionEngine
 from surrogym_server.errors import SurrogymError
 from surrogym_server.services.metrics import ProcessMetrics
 from surrogym_server.services.notices import Notices
-from surrogym_server.storage.port import Storage
+from surrogym_server.storage.sql import Storage
 
 logger = logging.getLogger(__name__)
 

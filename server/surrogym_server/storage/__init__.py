@@ -1,1 +1,1 @@
-"""Storage: its abstract interface, and implementations for SQLite and PostgreSQL."""
+"""Storage in SQLite or PostgreSQL, and the records that it takes and returns."""

@@ -14,9 +14,8 @@ from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.sampling.design import initial_queries
 from surrogym_server.services.definitions import Definitions
-from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import NewSurrogate
-from surrogym_server.storage.sql import open_storage
+from surrogym_server.storage.sql import Storage, open_storage
 from surrogym_shared.spec import EnvironmentSpec
 
 NAME = "pendulum"

@@ -25,8 +25,8 @@ from surrogym_server.services.designer import ATTEMPTS, Designer, DesignerSettin
 from surrogym_server.services.metrics import ProcessMetrics
 from surrogym_server.services.models import load_model
 from surrogym_server.services.notices import Notices
-from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import NewSample, NewSurrogate, SurrogateRecord
+from surrogym_server.storage.sql import Storage
 from surrogym_shared.nouns import Query
 from surrogym_shared.spec import EnvironmentSpec
 

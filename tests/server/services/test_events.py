@@ -9,7 +9,7 @@ import pytest
 
 from surrogym_server.services.events import EventService, Page
 from surrogym_server.services.notices import Notices
-from surrogym_server.storage.port import Storage
+from surrogym_server.storage.sql import Storage
 
 NAME = "pendulum"
 

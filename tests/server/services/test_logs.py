@@ -19,8 +19,8 @@ from surrogym_server.services.metrics import ProcessMetrics
 from surrogym_server.services.models import load_model
 from surrogym_server.services.notices import Notices
 from surrogym_server.services.samples import SampleService
-from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import LedgerRecord, LogPart, NewSample, NewSurrogate
+from surrogym_server.storage.sql import Storage
 
 NAME = "pendulum"
 

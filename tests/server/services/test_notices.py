@@ -7,7 +7,7 @@ import asyncio
 import pytest
 
 from surrogym_server.services.notices import Notices
-from surrogym_server.storage.port import Announcements, Hear
+from surrogym_server.storage.sql.events import Announcements, Hear
 
 PATIENCE = 60.0
 

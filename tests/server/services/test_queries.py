@@ -14,7 +14,7 @@ from surrogym_server.errors import UnknownSurrogate
 from surrogym_server.services.definitions import Definitions
 from surrogym_server.services.notices import Notices
 from surrogym_server.services.queries import Claim, QueryService
-from surrogym_server.storage.port import Storage
+from surrogym_server.storage.sql import Storage
 
 NAME = "pendulum"
 PATIENCE = 60.0

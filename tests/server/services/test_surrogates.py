@@ -12,7 +12,7 @@ from surrogym_server.errors import SpecConflict
 from surrogym_server.services.activity import Samplers
 from surrogym_server.services.definitions import Definitions
 from surrogym_server.services.surrogates import READS, SurrogateService, check_same
-from surrogym_server.storage.port import Storage
+from surrogym_server.storage.sql import Storage
 
 NAME = "pendulum"
 

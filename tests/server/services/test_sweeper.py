@@ -12,7 +12,7 @@ from surrogym_server.errors import Unavailable
 from surrogym_server.services.metrics import ProcessMetrics
 from surrogym_server.services.notices import Notices
 from surrogym_server.services.sweeper import Sweeper
-from surrogym_server.storage.port import Storage
+from surrogym_server.storage.sql import Storage
 
 NAME = "pendulum"
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from support.queries import steps
-from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import LeasedQuery, NewDesign, NewModel, NewSample
+from surrogym_server.storage.sql import Storage
 from surrogym_shared.nouns import Query
 
 SECONDS = 60.0  # a lease no test outlives

@@ -10,8 +10,7 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from support.postgresql import Postgresql
-from surrogym_server.storage.port import Storage
-from surrogym_server.storage.sql import events, open_storage
+from surrogym_server.storage.sql import Storage, events, open_storage
 
 PATIENCE = 60.0
 LISTENING = "FROM pg_stat_activity WHERE starts_with(query, 'LISTEN') AND datname = current_database()"

@@ -9,8 +9,8 @@ import pytest
 
 from support.queries import steps
 from surrogym_server.errors import BeyondBudget
-from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import NewSample
+from surrogym_server.storage.sql import Storage
 from surrogym_shared.states import LEAST_AUDITED
 
 Make = Callable[..., str]

@@ -8,8 +8,8 @@ import pytest
 import sqlalchemy as sa
 
 from surrogym_server.errors import LeaseExpired
-from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import NewDesign, NewSample
+from surrogym_server.storage.sql import Storage
 from surrogym_server.storage.sql.tables import Checked, metadata
 
 DAY, LONG, SHORT = 86_400.0, 60.0, 0.05

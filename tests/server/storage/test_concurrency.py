@@ -10,9 +10,8 @@ from typing import TypeVar
 
 import pytest
 
-from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import NewSample, NewSurrogate, QueryCounts
-from surrogym_server.storage.sql import open_storage
+from surrogym_server.storage.sql import Storage, open_storage
 
 T = TypeVar("T")
 

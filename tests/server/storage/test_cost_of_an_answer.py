@@ -13,8 +13,8 @@ import sqlalchemy as sa
 from sqlalchemy.engine.interfaces import CacheStats
 
 from surrogym_server.errors import UnknownSurrogate
-from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import NewSample, Standing
+from surrogym_server.storage.sql import Storage
 
 LONG = 60.0
 

@@ -15,11 +15,10 @@ import pytest
 import sqlalchemy as sa
 
 from surrogym_server.errors import Damaged, NoModel, SurrogymError
-from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import NewDesign, NewSample, NewSurrogate
-from surrogym_server.storage.sql import open_storage
+from surrogym_server.storage.sql import Storage, open_storage
 from surrogym_server.storage.sql.database import connect
-from surrogym_server.storage.sql.storage import SqlStorage, check_pages
+from surrogym_server.storage.sql.storage import check_pages
 from surrogym_server.storage.sql.tables import Checked, metadata, models
 
 NAME = "pendulum"
@@ -244,7 +243,7 @@ def test_reading_a_value_of_wrong_type_raises_an_error_that_names_it(file: Path)
     named = []
     for place in places:
         database = connect(f"sqlite:///{changed_copy(file, place)}")
-        with closing(SqlStorage(database)) as storage:
+        with closing(Storage(database)) as storage:
             damage = [str(error) for error in all_read(storage) if isinstance(error, Damaged)]
         assert not damage or any(f" in {place}, got b'" in said for said in damage), (place, damage)
         named += [place] * bool(damage)

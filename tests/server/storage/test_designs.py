@@ -20,8 +20,9 @@ from surrogym_server.errors import (
     UnknownModel,
     UnknownSurrogate,
 )
-from surrogym_server.storage.port import MAX_ATTEMPTS, Storage
 from surrogym_server.storage.records import FitLease, NewDesign, NewSample
+from surrogym_server.storage.sql import Storage
+from surrogym_server.storage.sql.queries import MAX_ATTEMPTS
 from surrogym_shared.nouns import Query
 
 LONG = 60.0

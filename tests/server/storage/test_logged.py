@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from surrogym_server.errors import InvalidInput
-from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import LedgerRecord, LogPart, NewDesign, NewSample, QueryCounts
+from surrogym_server.storage.sql import Storage
 
 SECONDS = 60.0
 Make = Callable[..., str]

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 import sqlalchemy as sa
 
-from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import NewDesign, NewSample, SavedSession
-from surrogym_server.storage.sql import events
+from surrogym_server.storage.sql import Storage, events
 from surrogym_server.storage.sql.rows import append_event, hold
 
 

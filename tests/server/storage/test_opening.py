@@ -20,9 +20,8 @@ from alembic.script import ScriptDirectory
 from support.postgresql import Postgresql
 from surrogym_server import app  # noqa: F401  # its features define tables
 from surrogym_server.errors import InvalidInput, Unavailable
-from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import NewSurrogate
-from surrogym_server.storage.sql import database, filelock, open_storage
+from surrogym_server.storage.sql import Storage, database, filelock, open_storage
 from surrogym_server.storage.sql.database import connect
 from surrogym_server.storage.sql.filelock import FileLock
 from surrogym_server.storage.sql.storage import SCRIPTS

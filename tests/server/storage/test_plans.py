@@ -10,8 +10,7 @@ import sqlalchemy as sa
 
 from support.million import FIRST, fill
 from support.postgresql import Postgresql
-from surrogym_server.storage.port import Storage
-from surrogym_server.storage.sql import open_storage
+from surrogym_server.storage.sql import Storage, open_storage
 
 SURROGATES, SAMPLES = 20, 20_000
 AFTER, PAGE = 1_500, 100

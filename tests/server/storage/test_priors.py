@@ -7,8 +7,8 @@ from collections.abc import Callable
 import pytest
 
 from surrogym_server.errors import UnknownSurrogate
-from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import NewDesign
+from surrogym_server.storage.sql import Storage
 
 SECONDS = 60.0
 BLOB, ABOUT = bytes(range(256)) * 3, {"source": "textbook", "parameters": [{"name": "mass"}]}

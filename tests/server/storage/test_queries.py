@@ -9,8 +9,9 @@ import pytest
 
 from support.queries import steps
 from surrogym_server.errors import ForeignLease, IdempotencyConflict, LeaseExpired, UnknownQuery
-from surrogym_server.storage.port import MAX_ATTEMPTS, Storage
 from surrogym_server.storage.records import LedgerRecord, NewSample, QueryCounts
+from surrogym_server.storage.sql import Storage
+from surrogym_server.storage.sql.queries import MAX_ATTEMPTS
 
 LONG = 60.0
 SHORT = 0.02

@@ -13,8 +13,7 @@ import pytest
 import sqlalchemy as sa
 
 from surrogym_server.errors import Unavailable
-from surrogym_server.storage.port import Storage
-from surrogym_server.storage.sql import open_storage
+from surrogym_server.storage.sql import Storage, open_storage
 from surrogym_server.storage.sql import storage as sql_storage
 from surrogym_server.storage.sql.database import BUSY_SECONDS
 

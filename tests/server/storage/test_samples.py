@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from surrogym_server.errors import ForeignLease, IdempotencyConflict, InvalidInput, UnknownQuery
-from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import LedgerRecord, NewSample, QueryCounts
+from surrogym_server.storage.sql import Storage
 
 LONG = 60.0
 SHORT = 0.02

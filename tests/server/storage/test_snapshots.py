@@ -7,8 +7,8 @@ from collections.abc import Callable
 import pytest
 
 from surrogym_server.errors import UnknownSurrogate
-from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import LeasedQuery, NewDesign, NewSample, QueryCounts
+from surrogym_server.storage.sql import Storage
 from surrogym_shared.nouns import Query
 
 LONG = 60.0

@@ -10,8 +10,9 @@ import pytest
 import sqlalchemy as sa
 
 from support.queries import steps
-from surrogym_server.storage.port import MAX_ATTEMPTS, Storage
 from surrogym_server.storage.records import LogPart, NewDesign, NewModel, NewSample, SurrogateSummary
+from surrogym_server.storage.sql import Storage
+from surrogym_server.storage.sql.queries import MAX_ATTEMPTS
 
 LONG = 60.0
 

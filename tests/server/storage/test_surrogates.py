@@ -13,9 +13,8 @@ import sqlalchemy as sa
 
 from support.queries import steps
 from surrogym_server.errors import UnknownSurrogate
-from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import NewDesign, NewSurrogate
-from surrogym_server.storage.sql import designs, queries
+from surrogym_server.storage.sql import Storage, designs, queries
 from surrogym_server.storage.sql import surrogates as stored
 from surrogym_server.storage.sql.tables import metadata, surrogates
 

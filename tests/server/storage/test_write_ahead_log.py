@@ -14,9 +14,8 @@ from pathlib import Path
 import pytest
 
 from surrogym_server.errors import Unavailable
-from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import NewSurrogate
-from surrogym_server.storage.sql import filelock, open_storage
+from surrogym_server.storage.sql import Storage, filelock, open_storage
 from surrogym_server.storage.sql import storage as sql_storage
 
 KILLED = """

@@ -15,8 +15,8 @@ from surrogym_server.services.activity import Alive
 from surrogym_server.services.claim_queues import ClaimQueues, Present
 from surrogym_server.services.metrics import ProcessMetrics
 from surrogym_server.services.notices import Notices
-from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import JSON
+from surrogym_server.storage.sql import Storage
 
 
 class _Claim(NamedTuple):

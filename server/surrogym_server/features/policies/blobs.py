@@ -17,7 +17,7 @@ import sqlalchemy as sa
 
 from surrogym_server.errors import Unavailable
 from surrogym_server.features.policies.records import Blobs, Freed
-from surrogym_server.storage.port import Storage
+from surrogym_server.storage.sql import Storage
 from surrogym_server.storage.sql.database import NOW, Database, damaged
 from surrogym_server.storage.sql.tables import checked, metadata
 

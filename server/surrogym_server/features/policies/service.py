@@ -34,8 +34,9 @@ from surrogym_server.features.policies.store import Policies
 from surrogym_server.features.policies.webhook import Webhook
 from surrogym_server.services.notices import Notices
 from surrogym_server.services.surrogates import Complete, difference, short
-from surrogym_server.storage.port import LATEST, Storage
 from surrogym_server.storage.records import JSON
+from surrogym_server.storage.sql import Storage
+from surrogym_server.storage.sql.models import LATEST
 from surrogym_shared import intervals, network
 from surrogym_shared.checks import trace_fault
 from surrogym_shared.environments import is_name, is_same

@@ -19,8 +19,8 @@ from surrogym_server.models.registry import learner_of
 from surrogym_server.sampling.judging import monte_carlo
 from surrogym_server.services.notices import Notices
 from surrogym_server.services.surrogates import difference, short
-from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import PriorRecord
+from surrogym_server.storage.sql import Storage
 from surrogym_shared.faults import first_fault
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.surrogate_file import NotASurrogateFile, SurrogateFile

@@ -32,8 +32,7 @@ from surrogym_server.features.ray.store import LiveSessions
 from surrogym_server.services.definitions import Definitions
 from surrogym_server.services.models import load_model, stored_tolerances
 from surrogym_server.settings import Settings
-from surrogym_server.storage.port import Storage
-from surrogym_server.storage.sql import open_storage
+from surrogym_server.storage.sql import Storage, open_storage
 from surrogym_shared.spec import EnvironmentSpec
 
 PROCESSORS = Path("/proc/cpuinfo")

@@ -27,7 +27,7 @@ from surrogym_server.features.ray.host import HostInfo, HostSettings, SessionHos
 from surrogym_server.features.ray.store import LiveSessions
 from surrogym_server.plugins import in_one_line
 from surrogym_server.settings import Settings
-from surrogym_server.storage.port import Storage
+from surrogym_server.storage.sql import Storage
 from surrogym_shared.ray_address import no_cluster, require_cluster, send_token
 
 logger = logging.getLogger(__name__)

@@ -15,8 +15,8 @@ from surrogym_server.errors import InvalidInput
 from surrogym_server.feature import Core
 from surrogym_server.features.watching.store import Streams
 from surrogym_server.services.definitions import check_coordinates
-from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import JSON
+from surrogym_server.storage.sql import Storage
 from surrogym_shared.environments import is_same
 from surrogym_shared.logs.rows import OFF_PERIOD, impossible
 from surrogym_shared.spec import EnvironmentSpec

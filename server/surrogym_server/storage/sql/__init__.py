@@ -1,5 +1,5 @@
-"""Implementation of the storage interface for SQLite and PostgreSQL, which share their SQL statements."""
+"""Storage in SQLite and PostgreSQL, which share their SQL statements."""
 
-from surrogym_server.storage.sql.storage import SqlStorage, open_storage
+from surrogym_server.storage.sql.storage import Storage, open_storage
 
-__all__ = ["SqlStorage", "open_storage"]
+__all__ = ["Storage", "open_storage"]

@@ -1,4 +1,4 @@
-"""Implementations of ``Designs``, ``Priors`` and ``Occupancy``: leases of fits, the storage of a fit's result, and the
+"""Designs, priors and occupancies: leases of fits, the storage of a fit's result, and the
 prior model and the visited states that a fit reads."""
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import sqlalchemy as sa
 from sqlalchemy.engine import Connection, Row
 
 from surrogym_server.errors import BeyondBudget, LeaseExpired, TooLarge, UnknownSurrogate
-from surrogym_server.storage import port
 from surrogym_server.storage.records import (
     JSON,
     OPEN_STATUSES,
@@ -83,7 +82,10 @@ UNBEGUN = sa.select(surrogates.c.name).where(IS_UNBEGUN | INTERRUPTED).order_by(
 HOPELESS = sa.select(surrogates.c.name).where(IS_HOPELESS).order_by(surrogates.c.id)
 
 
-class SqlDesigns(port.Designs):
+class Designs:
+    """The storage of designs. A server fits a model only while it holds the surrogate's lease for fits, which one
+    server holds at a time."""
+
     def __init__(self, database: Database) -> None:
         self._database = database
 
@@ -96,6 +98,18 @@ class SqlDesigns(port.Designs):
         key: str | None = None,
         raise_budget: bool = False,
     ) -> Granted:
+        """Request that the next fit chooses further queries, even if the design has ended. A fit becomes due.
+
+        Args:
+            name: name of the surrogate.
+            queries: number of real steps of these queries; or a query in which a policy acts, which is stored at once.
+            checkpoint: name of the occupancy that weights the choice; None for no weights.
+            key: idempotency key of the request.
+            raise_budget: whether to raise the budget by the missing steps.
+
+        Raises:
+            BeyondBudget: the budget has fewer steps left, and ``raise_budget`` is False.
+        """
         trial, steps = (queries, queries.steps) if isinstance(queries, Query) else (None, queries)
         body = fingerprint(steps, checkpoint, trial and (trial.policy, trial.actions))
         with self._database.write() as connection:
@@ -116,22 +130,47 @@ class SqlDesigns(port.Designs):
             return Granted(surrogate_rows.read(connection, name), raised)
 
     def left(self, name: str) -> int:
+        """Return the number of real steps that a surrogate's budget has left, at least 0.
+
+        It is the budget minus the steps taken, the steps of unanswered queries (open or set aside), and the steps
+        requested by ``improve`` and not chosen yet.
+        """
         with self._database.read() as connection:
             return max(0, _unspoken(connection, surrogate_rows.read(connection, name)))
 
     def due(self) -> list[str]:
+        """Return the names of the surrogates that have to be fitted now, oldest first.
+
+        Such a surrogate has samples, no pending or leased query, and a change since its last fit (a sample, a query set
+        aside, an ``improve``, another budget or target, a damaged model). After the import of a log, it may have
+        pending or leased queries. It is not paused, does not wait for a prior, and no server holds the lease of its
+        fit. A lease with more time left than its duration, because the clock was set back, counts as expired.
+        """
         with self._database.read() as connection:
             return list(connection.execute(DUE).scalars())
 
     def hopeless(self) -> list[str]:
+        """Return the names of surrogates whose design can't continue, oldest first.
+
+        Such a surrogate is in phase ``collecting`` and not paused. It has no samples, and all its queries were refused
+        by the environment, or set aside after repeated failures.
+        """
         with self._database.read() as connection:
             return list(connection.execute(HOPELESS).scalars())
 
     def unbegun(self) -> list[str]:
+        """Return the names of surrogates whose initial queries are missing, oldest first.
+
+        There are two kinds. The first was created with a budget of 0 and has a larger budget now; it has no query or
+        sample, is in phase ``collecting``, and is not paused. For the second, a crash interrupted ``Surrogates.create``
+        at least a minute ago.
+        """
         with self._database.read() as connection:
             return list(connection.execute(UNBEGUN).scalars())
 
     def ask_first(self, name: str, queries: Sequence[Query]) -> None:
+        """Queue the missing initial queries of a surrogate, given all its initial queries. Does nothing if none is
+        missing."""
         with self._database.write() as connection:
             surrogate = hold(connection, name)
             if connection.execute(
@@ -141,6 +180,10 @@ class SqlDesigns(port.Designs):
         queue_initial(self._database, name, queries)
 
     def begin(self, name: str, owner: str, seconds: float) -> FitLease | None:
+        """Lease the fit of a surrogate to the server ``owner`` for ``seconds``; the phase becomes ``fitting``.
+
+        Returns None if the surrogate is not due.
+        """
         with self._database.write() as connection:
             surrogate = hold(connection, name)
             row = connection.execute(
@@ -158,6 +201,11 @@ class SqlDesigns(port.Designs):
             return lease
 
     def renew(self, lease: FitLease, seconds: float) -> FitLease:
+        """Extend the lease of a fit to ``seconds`` from now, even if it has expired but no other server has taken it.
+
+        Raises:
+            LeaseExpired: another server has taken the lease, or it was withdrawn.
+        """
         with self._database.write() as connection:
             surrogate = _hold_right(connection, lease)
             renewed = replace(lease, expires=surrogate.now + seconds)
@@ -165,6 +213,14 @@ class SqlDesigns(port.Designs):
             return renewed
 
     def commit(self, lease: FitLease, design: NewDesign) -> int:
+        """Store the result of a fit (model, state, phase, next queries), and end its lease. Return the model's version.
+
+        The error of the design is cleared. The queries get the number of this round and the purpose ``adaptive``.
+        Samples that arrived after ``begin`` make the next fit due.
+
+        Raises:
+            LeaseExpired: another server has taken the lease, or it was withdrawn.
+        """
         with self._database.write() as connection:
             surrogate = _hold_right(connection, lease)
             version = insert_model(connection, surrogate, design.model)
@@ -174,6 +230,11 @@ class SqlDesigns(port.Designs):
             return version
 
     def abort(self, lease: FitLease, error: str | None) -> None:
+        """End the lease of a fit without a result. Does nothing if the lease has ended.
+
+        With an ``error``, the phase becomes ``failed``, and the next fit is due once the surrogate has changed since
+        this fit began. With None, as at a shutdown, the fit stays due.
+        """
         with self._database.write() as connection:
             try:
                 surrogate = _hold_right(connection, lease)
@@ -238,11 +299,18 @@ def _phase_after(surrogate: Row[Any], error: str | None) -> Phase:
     return "failed" if error is not None else surrogate_rows.resting_phase(surrogate.round)
 
 
-class SqlPriors(port.Priors):
+class Priors:
+    """The storage of priors: models that are known before the first real step, such as of a simulator.
+
+    Each surrogate has at most one prior. While its design waits for a prior, no fit is due.
+    """
+
     def __init__(self, database: Database) -> None:
         self._database = database
 
     def get(self, name: str) -> PriorRecord | None:
+        """Return the description of a surrogate's prior, also if the design still waits for it; None if there is
+        none."""
         with self._database.read() as connection:
             row = connection.execute(
                 sa.select(priors.c.created_at, priors.c.about, priors.c.blob.is_(None).label("awaited")).where(
@@ -252,6 +320,10 @@ class SqlPriors(port.Priors):
         return None if row is None else PriorRecord(row.created_at, row.about, awaited=bool(row.awaited))
 
     def blob(self, name: str) -> bytes | None:
+        """Return the file of a prior's model; None if it is not stored (yet).
+
+        Raises ``Damaged`` if the file differs from the one that was stored.
+        """
         with self._database.read() as connection:
             own = priors.c.surrogate_id == find(connection, name)
             row = connection.execute(sa.select(priors.c.blob, priors.c.checksum).where(own)).one_or_none()
@@ -264,16 +336,22 @@ class SqlPriors(port.Priors):
         return bytes(row.blob)
 
     def put(self, name: str, blob: bytes, about: JSON) -> None:
+        """Store a prior, which replaces an earlier one. ``blob`` is the file of its model, ``about`` its description.
+
+        Adaptive queries without a real step so far are withdrawn, and a fit becomes due.
+        """
         with self._database.write() as connection:
             self._store(connection, name, blob, about)
 
     def wait(self, name: str) -> None:
+        """Let the design of a surrogate wait for a prior. Does nothing if it has one."""
         with self._database.write() as connection:
             own = priors.c.surrogate_id == hold(connection, name).id
             if connection.execute(sa.select(priors.c.surrogate_id).where(own)).first() is None:
                 self._store(connection, name, None, {})
 
     def drop(self, name: str) -> bool:
+        """Remove a surrogate's prior, or stop waiting for it. Return whether there was one. A fit becomes due."""
         with self._database.write() as connection:
             surrogate = hold(connection, name)
             own = priors.c.surrogate_id == surrogate.id
@@ -301,11 +379,15 @@ def _plan_anew(connection: Connection, name: str) -> None:
 MAX_CHECKPOINTS = 1_000  # largest number of occupancies (named sets of visited states) stored for a surrogate
 
 
-class SqlOccupancy(port.Occupancy):
+class Occupancy:
+    """The storage of occupancies: states that policies visited, by the name of a checkpoint."""
+
     def __init__(self, database: Database) -> None:
         self._database = database
 
     def put(self, name: str, checkpoint: str, states: Array) -> None:
+        """Store visited states (m, C) under the name ``checkpoint``, as the latest occupancy. States that were stored
+        under this name before are replaced."""
         with self._database.write() as connection:
             surrogate = hold(connection, name)
             own = (occupancies.c.surrogate_id == surrogate.id, occupancies.c.checkpoint == checkpoint)
@@ -328,9 +410,11 @@ class SqlOccupancy(port.Occupancy):
             )
 
     def get(self, name: str, checkpoint: str) -> OccupancyRecord | None:
+        """Return the occupancy of a checkpoint; None if none is stored."""
         return self._newest(name, occupancies.c.checkpoint == checkpoint)
 
     def latest(self, name: str) -> OccupancyRecord | None:
+        """Return the occupancy that was stored last; None if none is stored."""
         return self._newest(name, sa.true())
 
     def _newest(self, name: str, condition: sa.ColumnElement[bool]) -> OccupancyRecord | None:

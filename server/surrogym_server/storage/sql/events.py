@@ -1,11 +1,11 @@
-"""Implementations of ``Events`` and ``Announcements``. The announcements use LISTEN and NOTIFY of PostgreSQL, with one
-thread that sends and one that listens."""
+"""Events, and announcements between servers. The announcements use LISTEN and NOTIFY of PostgreSQL, with one thread
+that sends and one that listens."""
 
 from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from typing import TYPE_CHECKING, Any
 from uuid import uuid4
@@ -13,8 +13,6 @@ from uuid import uuid4
 import sqlalchemy as sa
 
 from surrogym_server.errors import Unavailable
-from surrogym_server.storage import port
-from surrogym_server.storage.port import Announcements, Hear
 from surrogym_server.storage.records import EventRecord
 from surrogym_server.storage.sql.database import BATCH, Database
 from surrogym_server.storage.sql.rows import find
@@ -29,16 +27,27 @@ NEWEST = sa.select(
 ).where(surrogates.c.name.in_(sa.bindparam("names", expanding=True)))
 
 
-class SqlEvents(port.Events):
+class Events:
+    """The storage of events of surrogates.
+
+    Each change that may end a wait appends an event, because a claim that waits for queries or jobs looks for them
+    again after each event.
+    """
+
     def __init__(self, database: Database) -> None:
         self._database = database
         self._pruned = 0  # id of the newest event of all surrogates at the last call of ``prune``
 
     def newest(self, names: Sequence[str]) -> dict[str, int]:
+        """Return the id of each surrogate's newest event, by name; 0 if it has none. Unknown surrogates are left out.
+
+        This takes one SQL statement, whose cost does not depend on the number of events.
+        """
         with self._database.read() as connection:
             return {name: id or 0 for name, id in connection.execute(NEWEST, {"names": [*names]})}
 
     def list(self, name: str, after: int = 0, limit: int = 1_000) -> list[EventRecord]:
+        """Return up to ``limit`` events of a surrogate with an id above ``after``, in order of their ids."""
         with self._database.read() as connection:
             own = events.c.surrogate_id == find(connection, name)
             rows = connection.execute(
@@ -50,6 +59,11 @@ class SqlEvents(port.Events):
             return [EventRecord(**row._mapping) for row in rows]
 
     def prune(self, keep: int) -> int:
+        """Remove all but the newest ``keep`` events of each surrogate. Return the number of events removed.
+
+        Surrogates without a new event since the last call are skipped. Events are removed in many short transactions,
+        so that other writers wait only briefly.
+        """
         with self._database.read() as connection:
             newest = connection.execute(sa.select(sa.func.max(events.c.id))).scalar() or 0
             changed = sa.select(events.c.surrogate_id).where(events.c.id > self._pruned).distinct()
@@ -77,6 +91,33 @@ QUIET_SECONDS = 30.0  # after this time without a message, the listening thread 
 FIRST_DELAY, LONGEST_DELAY = 0.1, 10.0  # shortest and longest time in seconds between two attempts to connect
 CLOSING_SECONDS = 2.0
 GAP_SECONDS = 0.05  # pause between announcements, so that several changes of a surrogate are announced as one
+
+
+# Callback that gets the name of a changed surrogate, or None if announcements may have been lost.
+Hear = Callable[[str | None], None]
+
+
+class Announcements:
+    """Messages between the servers of one database that a surrogate has changed. Thread-safe. For a database with a
+    single server, nothing is sent or received.
+
+    A message may be lost, so a receiver also has to look for changed surrogates from time to time.
+    """
+
+    def announce(self, surrogate: str) -> None:
+        """Send to all other servers, soon, that a surrogate has changed. Returns at once, and never raises.
+
+        Several unsent announcements of one surrogate are sent as one.
+        """
+
+    def listen(self, hear: Hear) -> None:
+        """Call ``hear``, in a thread, for each later announcement of another server. May be called once.
+
+        After a lost connection is restored, ``hear`` is called with None, because announcements may have been lost.
+        """
+
+    def close(self) -> None:
+        """Stop sending and listening. A second call does nothing."""
 
 
 class NotifiedAnnouncements(Announcements):

@@ -1,4 +1,4 @@
-"""Implementations of ``Models``, ``PolicyNames`` and ``Sessions``: models by version, versions and aliases of policies,
+"""Models by version, versions and aliases of policies,
 and saved sessions."""
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ import sqlalchemy as sa
 from sqlalchemy.engine import Connection, Row
 
 from surrogym_server.errors import NoModel, UnknownModel, UnknownPolicy
-from surrogym_server.storage import port
-from surrogym_server.storage.port import LATEST
 from surrogym_server.storage.records import ModelRecord, NewModel, SavedSession
 from surrogym_server.storage.sql.database import Database, conflict_insert, damaged
 from surrogym_server.storage.sql.rows import NAMELESS, Span, append_event, checksum, find, hold, touch, within
 from surrogym_server.storage.sql.tables import models, policies, policy_aliases, policy_evaluations
 from surrogym_server.storage.sql.tables import sessions as saved
+
+LATEST = "latest"  # reserved alias of the newest policy
 
 COLUMNS = [
     getattr(models.c, name)
@@ -34,27 +34,44 @@ class _Judged(msgspec.Struct):
 _JUDGED = msgspec.json.Decoder(_Judged)
 
 
-class SqlModels(port.Models):
+class Models:
+    """The storage of models, which have versions 1, 2, ... As an argument, version None stands for the newest version
+    that is not marked as damaged."""
+
     def __init__(self, database: Database) -> None:
         self._database = database
 
     def list(self, name: str) -> list[ModelRecord]:
+        """Return the records of all models of a surrogate, oldest first."""
         with self._database.read() as connection:
             own = models.c.surrogate_id == find(connection, name)
             rows = connection.execute(sa.select(*COLUMNS).where(own).order_by(models.c.version))
             return [ModelRecord(**row._mapping) for row in rows]
 
     def get(self, name: str, version: int | None = None) -> ModelRecord:
+        """Return the record of a model; of the newest undamaged one if ``version`` is None.
+
+        Raises:
+            UnknownModel: the surrogate has no model of this version.
+            NoModel: ``version`` is None, and the surrogate has no undamaged model.
+        """
         with self._database.read() as connection:
             return ModelRecord(**_one(connection, name, version, *COLUMNS)._mapping)
 
     def newest(self) -> dict[int, int]:
+        """Return the newest undamaged model version of each surrogate that has one, by the surrogate's id."""
         with self._database.read() as connection:
             newest = sa.select(models.c.surrogate_id, sa.func.max(models.c.version))
             statement = newest.where(INTACT, models.c.surrogate_id.not_in(NAMELESS)).group_by(models.c.surrogate_id)
             return {int(surrogate): int(version) for surrogate, version in connection.execute(statement)}
 
     def blob(self, name: str, version: int | None = None) -> bytes:
+        """Return the stored file of a model; of the newest undamaged one if ``version`` is None.
+
+        Raises:
+            UnknownModel, NoModel: there is no such model.
+            Damaged: the file differs from the one that was stored.
+        """
         with self._database.read() as connection:
             row = _one(connection, name, version, models.c.version, models.c.blob, models.c.checksum)
         if checksum(row.blob) != row.checksum:
@@ -65,6 +82,11 @@ class SqlModels(port.Models):
         return bytes(row.blob)
 
     def set_aside(self, name: str, version: int, damage: str) -> bool:
+        """Mark a model version as damaged, so that the version before it is used instead, and a fit becomes due.
+
+        ``damage`` describes the damage. Returns False if the version was marked before. The number of the version is
+        not used again.
+        """
         with self._database.write() as connection:
             surrogate = hold(connection, name)
             own = (models.c.surrogate_id == surrogate.id) & (models.c.version == version) & INTACT
@@ -75,6 +97,7 @@ class SqlModels(port.Models):
             return True
 
     def add(self, name: str, model: NewModel) -> int:
+        """Store an imported model as the newest version, and return its version. The design is not changed."""
         with self._database.write() as connection:
             return insert_model(connection, hold(connection, name), model)
 
@@ -142,15 +165,21 @@ def _one(connection: Connection, name: str, version: int | None, *columns: sa.Co
     )
 
 
-class SqlPolicyNames(port.PolicyNames):
+class PolicyNames:
+    """Versions and aliases of policies, which several features read. The feature ``policies`` stores them."""
+
     def __init__(self, database: Database) -> None:
         self._database = database
 
     def version(self, name: str, which: str) -> int:
+        """Return the policy version that ``which`` names: a number, an alias, or ``latest``. Raises
+        ``UnknownPolicy``."""
         with self._database.read() as connection:
             return resolve(connection, find(connection, name), name, which)
 
     def has_evaluation(self, name: str, version: int, id: int) -> bool:
+        """Return whether a policy has an evaluation with this id. Raises ``UnknownPolicy`` if there is no such
+        version."""
         table = policy_evaluations
         with self._database.read() as connection:
             surrogate = find(connection, name)
@@ -192,11 +221,14 @@ def unknown_policy(name: str, which: object) -> UnknownPolicy:
     )
 
 
-class SqlSessions(port.Sessions):
+class Sessions:
+    """The storage of sessions that a server saves at shutdown and restores at the next start."""
+
     def __init__(self, database: Database) -> None:
         self._database = database
 
     def save(self, sessions: Sequence[SavedSession]) -> None:
+        """Store sessions. A stored session with the same id is replaced."""
         rows = [{"id": one.id, "surrogate": one.surrogate, "data": one.data} for one in sessions]
         if not rows:
             return
@@ -206,6 +238,7 @@ class SqlSessions(port.Sessions):
             connection.execute(insert.on_conflict_do_update(index_elements=["id"], set_=values), rows)
 
     def take(self) -> list[SavedSession]:
+        """Return all saved sessions and remove them from the storage, so that each is restored once."""
         with self._database.write() as connection:
             rows = connection.execute(sa.delete(saved).returning(*saved.c)).all()
         return [SavedSession(row.id, row.surrogate, bytes(row.data)) for row in rows]

@@ -1,4 +1,4 @@
-"""Implementations of ``Queries`` and ``Snapshots``: the queue of queries, and the snapshots at which some begin.
+"""The queue of queries, and the snapshots at which some begin.
 
 The initial queries of a design are queued in several short transactions. While some are missing, a row of the table
 ``requests`` holds the number of queued ones, and no fit is due. If a crash interrupts the work, another call of
@@ -29,8 +29,6 @@ from surrogym_server.errors import (
     LeaseExpired,
     UnknownQuery,
 )
-from surrogym_server.storage import port
-from surrogym_server.storage.port import MAX_ATTEMPTS
 from surrogym_server.storage.records import (
     LeasedQuery,
     NewSample,
@@ -57,6 +55,8 @@ from surrogym_server.storage.sql.tables import leases, queries, requests, sample
 from surrogym_shared.nouns import Query, Vector
 from surrogym_shared.states import LEAST_AUDITED, Purpose, QueryStatus
 
+MAX_ATTEMPTS = 3
+
 CONTENT = [getattr(queries.c, name) for name in ("coordinates", "action", "steps", "snapshot", "replan", "policy")]
 STATE = [getattr(queries.c, name) for name in ("id", "purpose", "status", "round", "attempts", "sampler", "error")]
 
@@ -75,7 +75,14 @@ OLDEST_FREE: sa.Select[Any] = (
 )
 
 
-class SqlQueries(port.Queries):
+class Queries:
+    """The storage of queries and their leases.
+
+    A query is pending, leased, answered, set_aside or refused. If its lease fails or expires, it becomes pending again;
+    after ``MAX_ATTEMPTS`` attempts it is set aside. A lease that ended before a real step does not count as an attempt.
+    A query that the original environment refused is not leased again, and does not count towards the budget.
+    """
+
     def __init__(self, database: Database) -> None:
         self._database = database
 
@@ -87,6 +94,11 @@ class SqlQueries(port.Queries):
         purpose: Purpose = "manual",
         key: str | None = None,
     ) -> list[int]:
+        """Queue queries that a person or an audit (``purpose``) chose, and return their ids.
+
+        Raises:
+            BeyondBudget: all audits of the surrogate together would have more steps than its budget, and more than 128.
+        """
         body = fingerprint(purpose, *(asdict(query) for query in new_queries))
         with self._database.write() as connection:
             surrogate = hold(connection, name)
@@ -100,6 +112,10 @@ class SqlQueries(port.Queries):
             return ids
 
     def claim(self, name: str, sampler: str, limit: int, seconds: float) -> list[LeasedQuery]:
+        """Lease up to ``limit`` pending queries to a sampler for ``seconds``, oldest first.
+
+        First, expired leases are ended. If the surrogate is paused, the result is empty.
+        """
         with self._database.write() as connection:
             surrogate = share(connection, name)
             if surrogate.paused:
@@ -108,6 +124,13 @@ class SqlQueries(port.Queries):
             return begin_leases(connection, surrogate, rows, sampler, seconds)
 
     def renew(self, name: str, query_id: int, token: str, seconds: float) -> float:
+        """Extend the lease of a query to ``seconds`` from now, and return the time of its end.
+
+        Raises:
+            UnknownQuery: the surrogate has no such query.
+            ForeignLease: the token is not that of a lease of this query.
+            LeaseExpired: the lease has expired, or ended with an answer or a failure.
+        """
         with self._database.write() as connection:
             lease = find_lease(connection, find(connection, name), query_id, token)
             live = (leases.c.outcome == "open") & (leases.c.expires > NOW)
@@ -124,6 +147,26 @@ class SqlQueries(port.Queries):
     def fail(
         self, name: str, query_id: int, token: str, error: str, *, begun: bool = True, refused: bool = False
     ) -> QueryRecord:
+        """End the lease of a query that could not be answered. The query becomes pending again. After its last attempt
+        it is set aside: it is kept, but not leased again. A refused query is not leased again either.
+
+        A repeat changes nothing. If the query begins at a snapshot that was dropped during the lease, the query is
+        removed, or set aside if a step may have been taken.
+
+        Args:
+            name: name of the surrogate.
+            query_id: id of the query.
+            token: token of the lease.
+            error: description of the failure.
+            begun: whether a real step may have been taken. If so, the ledger counts the steps of the query as
+                unresolved.
+            refused: whether the original environment refused the query before a real step; ``begun`` is then ignored.
+
+        Raises:
+            UnknownQuery: the surrogate has no such query.
+            ForeignLease: the token is not that of a lease of this query.
+            LeaseExpired: the lease has expired, or ended with an answer.
+        """
         outcome: Returned = "refused" if refused else "failed" if begun else "unbegun"
         with self._database.write() as connection:
             surrogate = hold(connection, name)
@@ -139,6 +182,8 @@ class SqlQueries(port.Queries):
             return _read(connection, surrogate.id, query_id)
 
     def withdraw(self, name: str, query_ids: Sequence[int]) -> int:
+        """Remove queries, given by their ids, and return the number removed. A query stays if it is not pending, or if
+        a real step of it may have been taken."""
         with self._database.write() as connection:
             surrogate = hold(connection, name)
             condition = queries.c.id.in_(query_ids) & is_unbegun(surrogate.id)
@@ -148,10 +193,12 @@ class SqlQueries(port.Queries):
             return gone
 
     def get(self, name: str, query_id: int) -> QueryRecord:
+        """Return the record of a query. Raises ``UnknownQuery`` if the surrogate has no such query."""
         with self._database.read() as connection:
             return _read(connection, find(connection, name), query_id)
 
     def list(self, name: str, statuses: Sequence[QueryStatus] = (), limit: int = 10_000) -> list[QueryRecord]:
+        """Return up to ``limit`` queries with one of the ``statuses`` (empty: any status), oldest first."""
         with self._database.read() as connection:
             statement = _records().where(queries.c.surrogate_id == find(connection, name))
             if statuses:
@@ -165,6 +212,10 @@ class SqlQueries(port.Queries):
             return query_counts(connection, (id, id)).get(id, QueryCounts())
 
     def sweep_expired(self) -> int:
+        """End the expired leases of all surrogates, and return their number.
+
+        A lease with more time left than its duration, because the clock was set back, is shortened to its duration.
+        """
         return sweep_table(self._database, leases, IS_OPEN, sweep_leases)
 
 
@@ -222,17 +273,26 @@ def _record(row: Row[Any]) -> QueryRecord:
 GONE = "its snapshot is gone"
 
 
-class SqlSnapshots(port.Snapshots):
+class Snapshots:
+    """The storage of the names and coordinates of samplers' snapshots; ``Samples.add`` adds them."""
+
     def __init__(self, database: Database) -> None:
         self._database = database
 
     def all(self, name: str) -> dict[str, Vector]:
+        """Return the coordinates (C,) of the state in each snapshot of a surrogate, by the snapshot's name, oldest
+        first."""
         with self._database.read() as connection:
             own = snapshots.c.surrogate_id == find(connection, name)
             statement = sa.select(snapshots.c.name, snapshots.c.coordinates).where(own).order_by(snapshots.c.id)
             return {row.name: row.coordinates for row in connection.execute(statement)}
 
     def drop(self, name: str, snapshots: Sequence[str]) -> int:
+        """Remove snapshots, and return the number removed. Unknown names are skipped.
+
+        Pending queries that begin at a removed snapshot are removed too. If a real step may have been taken, they are
+        set aside instead: they are kept, but not leased again. A fit becomes due, which chooses other queries.
+        """
         with self._database.write() as connection:
             surrogate = hold(connection, name)
             gone = _forget(connection, surrogate, snapshots)

@@ -1,4 +1,4 @@
-"""Implementations of ``Samples`` and ``Ledger``: real steps, and their counts by purpose.
+"""Real steps, and their counts by purpose.
 
 Samples are stored once, all or none of a batch, and never changed. Logged samples are identified by their position in
 their log, and a fit uses them when the log is complete.
@@ -26,7 +26,6 @@ import sqlalchemy as sa
 from sqlalchemy.engine import Connection, Row
 
 from surrogym_server.errors import IdempotencyConflict, InvalidInput
-from surrogym_server.storage import port
 from surrogym_server.storage.records import (
     AddedSamples,
     Array,
@@ -55,7 +54,9 @@ NEW_SAMPLES = sa.insert(samples).returning(samples.c.id, sort_by_parameter_order
 Identity = tuple[int | None, int]
 
 
-class SqlSamples(port.Samples):
+class Samples:
+    """The storage of samples, which are never changed, and never lost after ``add`` has returned."""
+
     def __init__(self, database: Database) -> None:
         self._database = database
 
@@ -70,6 +71,29 @@ class SqlSamples(port.Samples):
         at_bound: Sequence[bool] = (),
     ) -> AddedSamples:
         # Content hash, to be compared with that of an earlier request with the same idempotency key.
+        """Store a batch of samples, all or none, and mark the queries that they answer. Committed when this returns.
+
+        A sample gets the purpose of its query, or ``manual`` without a query. If the lease of its query has expired or
+        failed, the sample is stored and marked as late. It still answers the query, unless the query is leased again.
+
+        All samples under one lease are one answer, and come in one batch. The answer to a query of one step is one
+        sample. The answer to a rollout has the samples with ``step`` 0, 1, ..., without gaps; they may be fewer than
+        the query's ``steps``. A repeat of an answer adds nothing and gets the same ids.
+
+        Samples of a ``log`` answer no query, and don't count towards the budget. A logged sample is identified by its
+        values and by all earlier samples of its log. So a repeated or extended log adds only its new samples, and equal
+        steps within a log are all stored. If a log begins like a stored log and a later part differs, it has to be sent
+        again from its start: see ``AddedSamples.restart``. A fit becomes due only after the last part of a log.
+
+        ``at_bound`` (n,) says of each of the n samples whether an entry of its action was at a bound, which the ledger
+        counts as wear; empty: of none. It is ignored for a log.
+
+        Raises:
+            UnknownQuery: the surrogate has no such query.
+            ForeignLease: a lease token is missing, or does not belong to the query.
+            InvalidInput: a logged sample names a query, or an answer lacks a step or has more steps than the query.
+            IdempotencyConflict: the same lease token or idempotency key came with other samples.
+        """
         body = fingerprint(sampler, [asdict(sample) for sample in samples] if key else [])
         with self._database.write() as connection:
             surrogate = hold(connection, name)
@@ -87,6 +111,7 @@ class SqlSamples(port.Samples):
             return added
 
     def arrays(self, name: str) -> RealSteps:
+        """Return all samples of a surrogate as arrays, in order of arrival; of shape (0, 0) if there are none."""
         with self._database.read() as connection:
             rows = connection.execute(_raw_arrays(find(connection, name))).all()
         if not rows:
@@ -103,6 +128,7 @@ class SqlSamples(port.Samples):
         )
 
     def page(self, name: str, after: int, limit: int) -> list[SampleRecord]:
+        """Return up to ``limit`` samples with an id above ``after``, in order of their ids."""
         with self._database.read() as connection:
             own = samples.c.surrogate_id == find(connection, name)
             rows = connection.execute(
@@ -120,6 +146,7 @@ class SqlSamples(port.Samples):
             return int(connection.execute(sa.select(sa.func.count()).where(own)).scalar_one())
 
     def reward_range(self, name: str) -> tuple[float, float] | None:
+        """Return the smallest and the largest reward of a surrogate's samples; None if there are no samples."""
         with self._database.read() as connection:
             extremes = sa.select(sa.func.min(samples.c.reward), sa.func.max(samples.c.reward))
             low, high = connection.execute(extremes.where(samples.c.surrogate_id == find(connection, name))).one()
@@ -398,12 +425,16 @@ def _unresolved() -> sa.Select[Any]:
 OTHERS = sa.union_all(_evaluations(), _unresolved())
 
 
-class SqlLedger(port.Ledger):
+class Ledger:
+    """The counts of a surrogate's real steps by purpose."""
+
     def __init__(self, database: Database, counts: CountedSamples) -> None:
         self._database = database
         self._counted = counts
 
     def report(self, name: str, steps: int, *, key: str, episodes: int = 0, note: str = "") -> LedgerRecord:
+        """Add ``steps`` real steps of an evaluation of ``episodes`` episodes, once for each key. Return the counts of
+        real steps by purpose. ``note`` is a text about the evaluation."""
         body = fingerprint(steps, episodes, note)
         fields = {"steps": steps, "episodes": episodes, "note": note}
         with self._database.write() as connection:

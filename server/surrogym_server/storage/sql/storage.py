@@ -1,4 +1,18 @@
-"""``SqlStorage``: the storage in a SQLite or PostgreSQL database, with migrations and checks of the database."""
+"""The storage of all data in a SQLite or PostgreSQL database, with migrations and checks of the database.
+
+For all methods of the storage and its parts:
+- an operation is atomic, and its changes are durable when it returns;
+- all methods are thread-safe, and on PostgreSQL any number of servers may call them at a time;
+- time is the database's clock, and a lease ends by that clock alone, whichever process dies; if the clock is set back,
+  no lease lasts longer than its duration;
+- an operation on a surrogate that does not exist raises ``UnknownSurrogate``;
+- an operation that raises has changed nothing;
+- a repeat with the same idempotency ``key`` and the same arguments changes nothing and returns the first result;
+  with other arguments it raises ``IdempotencyConflict``;
+- a database that can't be reached raises ``Unavailable``;
+- stored data that differ from what was written raise ``Damaged``, which names them;
+- events are appended by the operations themselves; their ids increase in the order in which they become visible.
+"""
 
 from __future__ import annotations
 
@@ -8,50 +22,59 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from pathlib import Path
 from threading import Event, Lock, Timer
+from typing import TypeVar
 
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
 from surrogym_server.errors import Damaged, Unavailable
-from surrogym_server.storage.port import Alone, Storage, T
 from surrogym_server.storage.records import Synchronous
 from surrogym_server.storage.sql.database import Database, connect, damaged, never_connected
-from surrogym_server.storage.sql.designs import SqlDesigns, SqlOccupancy, SqlPriors
-from surrogym_server.storage.sql.events import NotifiedAnnouncements, SqlEvents
-from surrogym_server.storage.sql.models import SqlModels, SqlPolicyNames, SqlSessions
-from surrogym_server.storage.sql.queries import SqlQueries, SqlSnapshots
-from surrogym_server.storage.sql.samples import CountedSamples, SqlLedger, SqlSamples
-from surrogym_server.storage.sql.surrogates import SqlSurrogates
+from surrogym_server.storage.sql.designs import Designs, Occupancy, Priors
+from surrogym_server.storage.sql.events import Announcements, Events, NotifiedAnnouncements
+from surrogym_server.storage.sql.models import Models, PolicyNames, Sessions
+from surrogym_server.storage.sql.queries import Queries, Snapshots
+from surrogym_server.storage.sql.samples import CountedSamples, Ledger, Samples
+from surrogym_server.storage.sql.surrogates import Surrogates
 from surrogym_server.storage.sql.tables import metadata
 
+T = TypeVar("T")
 
-class SqlStorage(Storage):
-    """Implementation of ``Storage`` with a SQLite or PostgreSQL database."""
+
+class Storage:
+    """The storage, which consists of parts. ``open_storage`` makes one."""
 
     def __init__(self, database: Database) -> None:
         self._database, counts = database, CountedSamples()
         self._readiness = Readiness(database)
-        self.surrogates = SqlSurrogates(database, counts)
-        self.designs = SqlDesigns(database)
-        self.queries = SqlQueries(database)
-        self.samples = SqlSamples(database)
-        self.snapshots = SqlSnapshots(database)
-        self.ledger = SqlLedger(database, counts)
-        self.models = SqlModels(database)
-        self.priors = SqlPriors(database)
-        self.occupancy = SqlOccupancy(database)
-        self.sessions = SqlSessions(database)
-        self.events = SqlEvents(database)
-        self.policy_names = SqlPolicyNames(database)
-        self.announcements = NotifiedAnnouncements(database) if database.notifies else Alone()
+        self.surrogates = Surrogates(database, counts)
+        self.designs = Designs(database)
+        self.queries = Queries(database)
+        self.samples = Samples(database)
+        self.snapshots = Snapshots(database)
+        self.ledger = Ledger(database, counts)
+        self.models = Models(database)
+        self.priors = Priors(database)
+        self.occupancy = Occupancy(database)
+        self.sessions = Sessions(database)
+        self.events = Events(database)
+        self.policy_names = PolicyNames(database)
+        self.announcements = NotifiedAnnouncements(database) if database.notifies else Announcements()
 
     def part(self, store: Callable[[Database], T]) -> T:
+        """Create the store of an optional feature by calling ``store`` with the database of this storage."""
         return store(self._database)
 
     def ping(self) -> None:
+        """Check that all tables exist and that the database accepts writes. The result is cached for a second.
+
+        Raises:
+            Unavailable: the check fails, or a write takes too long.
+        """
         self._readiness.require()
 
     def close(self) -> None:
+        """Release connections and locks. A second call does nothing."""
         self.announcements.close()
         self._readiness.close()
         self._database.close()
@@ -80,7 +103,7 @@ def open_storage(url: str, synchronous: Synchronous = "full") -> Storage:
         if isinstance(error, Unavailable) and never_connected(error.__cause__) and database.notifies:
             raise Unavailable(f"{error}; {_way_out(url, str(error))}") from error
         raise
-    return SqlStorage(database)
+    return Storage(database)
 
 
 def _way_out(url: str, message: str) -> str:

@@ -1,4 +1,4 @@
-"""Implementation of ``Surrogates``: surrogates by name, summaries for their list, and their deletion.
+"""Surrogates by name, summaries for their list, and their deletion.
 
 A deletion first replaces the name, so that the surrogate is not found any more, and then removes its rows in several
 short transactions. A deletion that a crash has interrupted is completed later.
@@ -16,7 +16,6 @@ import sqlalchemy as sa
 from sqlalchemy.engine import Connection, Row
 
 from surrogym_server.errors import UnknownSurrogate
-from surrogym_server.storage import port
 from surrogym_server.storage.records import (
     FREE,
     LedgerRecord,
@@ -55,12 +54,23 @@ READ = sa.select(*COLUMNS).where(NAMED)
 STANDING = sa.select(surrogates.c.id, surrogates.c.phase, surrogates.c.paused).where(NAMED)
 
 
-class SqlSurrogates(port.Surrogates):
+class Surrogates:
+    """The storage of surrogates, which are identified by name."""
+
     def __init__(self, database: Database, counts: CountedSamples) -> None:
         self._database = database
         self._counted = Counted(counts)
 
     def create(self, new: NewSurrogate) -> tuple[SurrogateRecord, bool]:
+        """Create a surrogate in phase ``collecting`` with its initial queries. Return it, and whether it is new.
+
+        Many queries are queued in several transactions, so that other writers wait only briefly. No fit is due before
+        all are queued. If a crash interrupts the call, ``Designs.unbegun`` returns the surrogate, and
+        ``Designs.ask_first`` queues the missing queries.
+
+        If a surrogate of this name exists, it is returned unchanged, with False. The caller has to compare the
+        specifications.
+        """
         with self._database.write() as connection:
             if not _insert(connection, new):
                 return read(connection, new.name), False
@@ -75,6 +85,8 @@ class SqlSurrogates(port.Surrogates):
             return read(connection, name)
 
     def standing(self, name: str) -> Standing:
+        """Return the fields of a surrogate that frequent requests read: its id, its phase, and whether it is paused.
+        Raises ``UnknownSurrogate``."""
         with self._database.read() as connection:
             row = connection.execute(STANDING, {"named": name}).one_or_none()
         if row is None:
@@ -82,6 +94,7 @@ class SqlSurrogates(port.Surrogates):
         return Standing(*row)
 
     def name_of(self, id: int) -> str:
+        """Return the name of a surrogate by its id. Raises ``UnknownSurrogate`` if it was deleted."""
         with self._database.read() as connection:
             statement = sa.select(surrogates.c.name).where(surrogates.c.id == id, IS_THERE)
             name = connection.execute(statement).scalar()
@@ -97,6 +110,11 @@ class SqlSurrogates(port.Surrogates):
         return summaries[0]
 
     def summaries(self, after: int = 0, limit: int | None = None) -> list[SurrogateSummary]:
+        """Return summaries of up to ``limit`` surrogates with an id above ``after``, oldest first.
+
+        The number of SQL statements does not depend on the number of surrogates. No model is loaded, and only the
+        environment's name is parsed from a specification.
+        """
         with self._database.read() as connection:
             return read_summaries(connection, (surrogates.c.id > after) & IS_THERE, limit, self._counted)
 
@@ -109,6 +127,16 @@ class SqlSurrogates(port.Surrogates):
         target: float | None = None,
         tolerances: dict[str, float | None] | None = None,
     ) -> SurrogateRecord:
+        """Change the fields of a surrogate that are given (not None), and return its record.
+
+        ``tolerances`` are by output; None for an output restores its default. Another budget, target or tolerance, or
+        resuming a failed design, makes a fit due. ``paused`` False, even if the surrogate was not paused, retries the
+        queries that were set aside or refused, each with ``MAX_ATTEMPTS`` more attempts.
+
+        After a change of target or tolerance, or a lower budget, adaptive queries without a real step so far are
+        withdrawn, a running fit loses its lease, and the next fit chooses new queries. Queries requested by ``improve``
+        are chosen again, unless the budget is lower. Initial queries are withdrawn only if they exceed the budget.
+        """
         with self._database.write() as connection:
             surrogate = hold(connection, name)
             before = read(connection, name)
@@ -139,11 +167,17 @@ class SqlSurrogates(port.Surrogates):
             update_phase(connection, surrogate, phase, error)
 
     def delete(self, name: str) -> None:
+        """Delete a surrogate and all its data.
+
+        Its name can be used again at once. Its rows are removed in several transactions, so that other writers wait
+        only briefly.
+        """
         with self._database.write() as connection:
             id = _take_name(connection, name)
         _remove(self._database, id)
 
     def complete_removals(self) -> int:
+        """Complete deletions of surrogates that a crash has interrupted, and return their number."""
         with self._database.read() as connection:
             ids = _interrupted(connection)
         for id in ids:

@@ -9,7 +9,7 @@ import pytest
 from surrogym_server.errors import IdempotencyConflict, LeaseExpired, Overloaded, UnknownJob
 from surrogym_server.features.jobs.records import MAX_OPEN, MAX_RUNS, SILENT, JobProgress, JobResult, LeasedJob, NewJob
 from surrogym_server.features.jobs.store import Jobs
-from surrogym_server.storage.port import Storage
+from surrogym_server.storage.sql import Storage
 
 Make = Callable[..., str]
 Until = Callable[[Callable[[], bool]], None]

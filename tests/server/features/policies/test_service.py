@@ -16,9 +16,8 @@ from surrogym_server.features.policies.records import PolicyFile
 from surrogym_server.features.policies.service import PolicyService
 from surrogym_server.features.policies.store import Policies
 from surrogym_server.services.notices import Notices
-from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import NewSurrogate
-from surrogym_server.storage.sql import open_storage
+from surrogym_server.storage.sql import Storage, open_storage
 from surrogym_shared.wire import AddEvaluation
 
 NAME = "pendulum"

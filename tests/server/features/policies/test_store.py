@@ -14,8 +14,7 @@ from surrogym_server.errors import Damaged, InvalidInput, TooLarge, UnknownPolic
 from surrogym_server.features.policies.blobs import open_blobs
 from surrogym_server.features.policies.records import PUSHED_BY, Blobs, NewEvaluation, PolicyFile
 from surrogym_server.features.policies.store import Policies
-from surrogym_server.storage.port import Storage
-from surrogym_server.storage.sql import open_storage
+from surrogym_server.storage.sql import Storage, open_storage
 
 Make = Callable[..., str]
 CARD = {"algorithm": "PPO"}

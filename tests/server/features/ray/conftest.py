@@ -16,9 +16,8 @@ from surrogym_server.engine.port import SessionEngine
 from surrogym_server.environment.samples import Samples
 from surrogym_server.features.ray import pool
 from surrogym_server.settings import Settings
-from surrogym_server.storage.port import Storage
 from surrogym_server.storage.records import NewModel, NewSurrogate
-from surrogym_server.storage.sql import open_storage
+from surrogym_server.storage.sql import Storage, open_storage
 from surrogym_server.testing import EngineCase
 
 NAME, HOSTS = "pendulum", 2

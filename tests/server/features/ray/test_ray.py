@@ -31,7 +31,7 @@ from surrogym_server.features.ray import pool
 from surrogym_server.features.ray.host import Refused
 from surrogym_server.features.ray.store import LiveSessions, SessionHolder
 from surrogym_server.settings import Settings
-from surrogym_server.storage.port import Storage
+from surrogym_server.storage.sql import Storage
 from surrogym_server.testing import LAWS_OF_ENGINES, EngineCase
 from surrogym_shared.wire import OpenSession
 

@@ -22,8 +22,7 @@ from surrogym_server.features.ray.host import HostSettings, recorded_engine
 from surrogym_server.features.ray.leases import Pace
 from surrogym_server.features.ray.recorded import RecordedEngine
 from surrogym_server.features.ray.store import LiveSessions, SessionLease
-from surrogym_server.storage.port import Storage
-from surrogym_server.storage.sql import open_storage
+from surrogym_server.storage.sql import Storage, open_storage
 from surrogym_server.testing import LAWS_OF_ENGINES, EngineCase
 
 NAME, LEASE = "pendulum", 60.0

@@ -18,8 +18,7 @@ from surrogym_server.features.ray.store import (
     TakenSession,
     live,
 )
-from surrogym_server.storage.port import Storage
-from surrogym_server.storage.sql import database, open_storage
+from surrogym_server.storage.sql import Storage, database, open_storage
 
 LONG, SHORT, DAY = 60.0, 0.05, 86_400.0
 Until = Callable[[Callable[[], bool]], None]
