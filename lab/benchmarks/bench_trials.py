@@ -29,13 +29,18 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from common import OUT, append_row
+from dirty_swingup import InProcess
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 
 from support.server import running_server
 from surrogym_client.transport import Api
 from surrogym_sampler import original
+from surrogym_sampler.original.episodes import RolloutEpisode
+from surrogym_sampler.original.rollouts import answering
 from surrogym_shared.spec import EnvironmentSpec, with_history
+from surrogym_trainer.evaluation.evaluator import EvaluationSettings, evaluate
+from surrogym_trainer.policies import load_policy
 
 ROOT = Path(__file__).parents[2]
 MINUTES = 30.0  # longest time of one command
@@ -58,10 +63,22 @@ class Machine:
     changes: int = 0
     actions: int = 0
     largest: tuple[float, ...] = ()
+    algorithm: str = "FASTPPO"
 
 
-def _program(name: str) -> str:
-    return f"exec:{sys.executable} {ROOT}/examples/machines/{name}.py --seed {{seed}}"
+def _program(name: str, folder: str = "examples/machines") -> str:
+    return f"exec:{sys.executable} {ROOT}/{folder}/{name}.py --seed {{seed}}"
+
+
+def _swing_up(kind: str, actions: int = 0) -> Machine:
+    """A swing-up with one kind of dirt and 1.5 times the real steps that a clean one needs."""
+    search = Machine.algorithm if actions else "PLANNER"
+    name = f"{_program('dirty_swingup', 'lab/benchmarks')} --kind '{kind}'"
+    return Machine(name, 100 if kind == "clean" else 150, 0, actions, algorithm=search)
+
+
+# kinds of dirt of the swing-up, and the earlier actions that each needs as coordinates
+SWING_UPS = {"clean": 0, "delay 1": 1, "delay 2.5": 3, "noise 1": 0, "noise 3": 0, "encoder": 0, "stiction": 0}
 
 
 MACHINES = {
@@ -70,6 +87,7 @@ MACHINES = {
     "double_pendulum": Machine(_program("double_pendulum"), 2_000, 1, 2, (0.6, 0.9)),
     "invertedpendulum2": Machine("InvertedDoublePendulum-v5", 120),
     "reacher": Machine("Reacher-v5", 200),
+    **{f"swingup-{kind.replace(' ', '-')}": _swing_up(kind, actions) for kind, actions in SWING_UPS.items()},
 }
 
 
@@ -114,7 +132,8 @@ def _run(machine: str, seed: int, budget: int | None, episodes: int, folder: Pat
         where = ("--env", name, "--spec", str(spec))
         surrogym("register", name, "--spec", str(spec), "--name", machine)
         with _sampling([sys.executable, "-m", "surrogym", "sample", machine, *where], environment):
-            trained = surrogym("train", machine, "--wait", "900", "--seed", str(seed), "--out", str(policy))
+            search = ("--algorithm", made.algorithm, "--seed", str(seed))
+            trained = surrogym("train", machine, "--wait", "900", *search, "--out", str(policy))
         # As the reason says then: one rollout from a reset left states untested, which whole episodes test.
         audited = trained if trained["trusted"] else surrogym("audit", str(policy), *where)
         minutes = (time.monotonic() - begun) / 60
@@ -122,6 +141,10 @@ def _run(machine: str, seed: int, budget: int | None, episodes: int, folder: Pat
             view = api.surrogate(machine)
             trials = [len(query.actions) for query in api.queries(machine) if query.policy]
         found = surrogym("evaluate", str(policy), *where, "--episodes", str(episodes))
+    if machine.startswith("swingup-"):
+        found["success_rate"] = _upright(
+            machine.removeprefix("swingup-").replace("-", " "), seed, policy, spec, episodes
+        )
     promise = audited.get("promise") or {}
     return {
         "machine": machine,
@@ -140,11 +163,18 @@ def _run(machine: str, seed: int, budget: int | None, episodes: int, folder: Pat
     }
 
 
+def _upright(kind: str, seed: int, policy: Path, spec: Path, episodes: int) -> float:
+    """Return the share of episodes in which the rod itself, not what is read of it, is up at the end."""
+    machine = InProcess(kind, seed, EnvironmentSpec.model_validate_json(spec.read_text()))
+    evaluate(load_policy(policy), lambda: RolloutEpisode(answering(machine)), EvaluationSettings(episodes))
+    return sum(machine.ups) / len(machine.ups)
+
+
 def _specification(machine: Machine, name: str, seed: int, budget: int) -> EnvironmentSpec:
     plain = original.make(name, access="reset")
     spec = plain.spec()
     plain.close()
-    if machine.largest:
+    if machine.largest or machine.actions:
         largest = dict(zip([c.name for c in spec.coordinates], machine.largest, strict=True))
         spec = with_history(spec, changes=machine.changes, actions=machine.actions, largest=largest)
     return spec.model_copy(update={"design": spec.design.model_copy(update={"budget": budget, "seed": seed})})
