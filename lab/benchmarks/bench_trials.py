@@ -174,8 +174,8 @@ def _specification(machine: Machine, name: str, seed: int, budget: int) -> Envir
     plain = original.make(name, access="reset")
     spec = plain.spec()
     plain.close()
-    if machine.largest or machine.actions:
-        largest = dict(zip([c.name for c in spec.coordinates], machine.largest, strict=True))
+    if machine.changes or machine.actions:
+        largest = dict(zip([c.name for c in spec.coordinates] if machine.changes else (), machine.largest, strict=True))
         spec = with_history(spec, changes=machine.changes, actions=machine.actions, largest=largest)
     return spec.model_copy(update={"design": spec.design.model_copy(update={"budget": budget, "seed": seed})})
 

@@ -1,7 +1,7 @@
 """Calibration: estimation of a simulator's named physical parameters from real steps, with their uncertainty.
 
 Weighted least squares of the errors of single steps, by the trust region reflective method of SciPy (Branch, Coleman
-and Li, 1999). The uncertainty is Laplace's approximation: the inverse of the Gauss-Newton matrix at the optimum.
+and Li, 1999), and then the posterior beside what no parameter explains (``discrepancy``).
 
 Shapes: n steps, C coordinates, M of them that change, F action entries, P parameters.
 """
@@ -157,12 +157,8 @@ EDGE = 0.01  # the first starting point is at least this share of a parameter's 
 SMALLEST = 1e-9  # an error below this share of the coordinates' changes counts as rounding
 FAR = 1e3  # error that counts for a step which the simulator can't take, in standard deviations of the changes
 CONFIDENCE = 0.9  # probability that a parameter is in the interval that a calibration states
-NUDGE = 1e-5  # step size of numerical derivatives, as a share of a parameter's range
 WITHIN = 0.29  # standard deviation of a uniform distribution as a share of its range: the prior of a parameter
-FINEST = 1e-7  # smallest stated standard deviation of a parameter, as a share of its range: the fit's own precision
-# If the eigenvalue of a combination of parameters is below this share of the largest one, the real steps don't
-# determine this combination.
-ROUNDING = 1e-14
+ROUNDED = 1e-12  # numbers that differ by less than this share are equal but for rounding
 FIT: dict[str, Any] = {"bounds": (0.0, 1.0), "x_scale": 0.3, "ftol": 1e-12, "xtol": 1e-12, "gtol": 1e-12}
 LEAST_SHARE = 1e-3  # coordinates whose errors are below this share of the largest error all get the same weight
 
@@ -193,7 +189,7 @@ class Calibrated:
 
     Attributes:
         name: the parameter's name.
-        value: its most probable value.
+        value: the value with the smallest errors of the real steps.
         low: lower end of its 90 % interval.
         high: upper end of its 90 % interval.
         determined: False if the steps say little more about it than its range does.
@@ -256,9 +252,8 @@ def calibrate(
         return Calibration((), len(real), _rms(before), _rms(before))
     scaling = _Scaling.of(parameters)
     x = _best(errors, scaling, own)
-    return Calibration(
-        _with_intervals(parameters, scaling, errors, x), len(real), _rms(before), _rms(errors(scaling.values(x)))
-    )
+    found = _with_intervals(parameters, scaling, errors, own, x)
+    return Calibration(found, len(real), _rms(before), _rms(errors(scaling.values(x))))
 
 
 class _Errors:
@@ -274,6 +269,17 @@ class _Errors:
         self._scale = scale[self._moves]
         self.failure = ""
         self.moving = max(1, int(self._moves.sum()))
+
+    @property
+    def inputs(self) -> Array:
+        """What the steps depend on (n, I), each in its standard deviations: coordinates, angles as cosine and sine, and
+        actions, those that vary."""
+        q = self._real.coordinates
+        turned = np.where(self._angles, np.sin(q), 0.0)[:, self._angles]
+        columns = np.concatenate([np.where(self._angles, np.cos(q), q), turned, self._real.action], 1)
+        deviation = columns.std(0)
+        vary = deviation > ROUNDED * np.abs(columns).max(0)
+        return np.asarray(columns[:, vary] / deviation[vary])
 
     @property
     def measured(self) -> int:
@@ -363,31 +369,20 @@ def _weights(errors: Array) -> Array:
 
 
 def _with_intervals(
-    parameters: Sequence[Parameter], scaling: _Scaling, errors: _Errors, x: Array
+    parameters: Sequence[Parameter], scaling: _Scaling, errors: _Errors, own: Array, x: Array
 ) -> tuple[Calibrated, ...]:
-    from scipy.stats import t
+    """Return the parameters with their scaled values ``x`` (P,), and intervals of the posterior, which contain them.
 
-    off = errors(scaling.values(x))
-    weights, rows = _weights(off), len(off)
-    jacobian = np.stack([((_moved(errors, scaling, x, i) - off) * weights / NUDGE).ravel() for i in range(len(x))], 1)
-    # Degrees of freedom of one coordinate. Those of all coordinates would be too many, because the weights are computed
-    # from the same steps.
-    left = max(1.0, rows - len(parameters) / errors.moving)
-    variance = float(((off * weights) ** 2).sum()) / errors.moving / left
-    size, axes = np.linalg.eigh(jacobian.T @ jacobian)
-    size = np.where(size > ROUNDING * size.max(), size, 0.0) / max(variance, np.finfo(float).tiny)
-    spread = np.maximum(np.sqrt((axes**2 / (size + 1 / WITHIN**2)).sum(1)), FINEST)
-    reach = spread * t.ppf(0.5 + CONFIDENCE / 2, left)
-    ends = (scaling.values(at) for at in (x, np.clip(x - reach, 0, 1), np.clip(x + reach, 0, 1)))
-    columns = zip(parameters, *(end.tolist() for end in ends), (spread < WITHIN / 2).tolist(), strict=True)
+    The posterior's own most probable values are nearer to the true ones, but leave larger errors to be learned.
+    """
+    from surrogym_sampler.priors.discrepancy import posterior
+
+    present = np.clip(scaling.numbers(own), EDGE, 1 - EDGE)
+    found = posterior(lambda at: errors(scaling.values(at)), errors.inputs, present, WITHIN, x)
+    low, high = found.interval(CONFIDENCE)
+    ends = (scaling.values(at) for at in (x, np.clip(low, 0, x), np.clip(high, x, 1)))
+    columns = zip(parameters, *(end.tolist() for end in ends), (found.deviations < WITHIN / 2).tolist(), strict=True)
     return tuple(Calibrated(parameter.name, *column) for parameter, *column in columns)
-
-
-def _moved(errors: _Errors, scaling: _Scaling, x: Array, index: int) -> Array:
-    """Return the errors with the scaled parameter ``index`` of ``x`` increased by ``NUDGE``."""
-    at = x.copy()
-    at[index] += NUDGE
-    return errors(scaling.values(at))
 
 
 def _rms(errors: Array) -> float:

@@ -41,6 +41,23 @@ def test_calibration_intervals_cover_the_true_parameters_in_90_percent_under_noi
     assert 0.8 <= np.mean(inside) <= 0.99
 
 
+def test_calibration_intervals_cover_the_true_parameters_of_a_plant_with_friction_that_the_simulator_lacks():
+    class WithoutFriction(Textbook):
+        friction = 0.0
+
+    runs = [calibrated(count, 0, seed, RANGES[:2], WithoutFriction) for count in (8, 25) for seed in range(15)]
+    inside = [one.low <= TRUE[one.name] <= one.high for run in runs for one in run.parameters]
+    assert np.mean(inside) >= 0.85
+
+
+def test_calibration_intervals_of_a_right_simulator_shrink_as_the_root_of_the_steps_under_noise():
+    few, many = (
+        np.median([[one.high - one.low for one in calibrated(n, 0.02, seed).parameters] for seed in range(9)], axis=0)
+        for n in (15, 60)
+    )
+    assert (few / many > 1.6).all()
+
+
 def test_a_simulator_parameter_without_effect_on_the_steps_keeps_its_value():
     class WithName(Textbook):
         spare = 3.0
