@@ -55,7 +55,7 @@ TASKS: dict[str, tuple[str, tuple[str, ...], int]] = {  # environment, its param
     "doublependulum": ("InvertedDoublePendulum-v5", ("mass.cart", "mass.pole", "mass.pole2", "gear.slide"), 250),
 }
 ARMS = ("cold", "rough", "calibrated", "wrong", "alone")
-OFF = 0.3  # largest share by which a parameter is off
+OFF = 0.3  # default of the largest share by which a parameter is off
 TESTS = 300
 SEARCH = "FASTPPO"
 
@@ -67,6 +67,7 @@ class Row:
     task: str
     access: str
     without: str
+    off: float
     arm: str
     seed: int
     phase: str
@@ -104,20 +105,20 @@ def main() -> None:
     path: Path = options.out / "priors.csv"
     path.parent.mkdir(parents=True, exist_ok=True)
     rows = read_records(path, Row)
-    done = {(row.task, row.access, row.without, row.arm, row.seed) for row in rows}
+    done = {(row.task, row.access, row.without, row.off, row.arm, row.seed) for row in rows}
     for task in options.task:
         for seed in range(options.first_seed, options.first_seed + options.seeds):
             for arm in options.arms:
-                if (task, options.access, options.without, arm, seed) in done:
+                if (task, options.access, options.without, options.off, arm, seed) in done:
                     continue
-                rows.append(run(task, options.access, options.without, arm, seed, policy=options.policy))
+                rows.append(run(task, options.access, options.without, options.off, arm, seed, policy=options.policy))
                 write_records(path, Row, rows)
                 print(rows[-1])
 
 
-def run(task: str, access: str, without: str, arm: str, seed: int, *, policy: bool) -> Row:
+def run(task: str, access: str, without: str, off: float, arm: str, seed: int, *, policy: bool) -> Row:
     name, names, budget = TASKS[task]
-    factors = np.random.default_rng([seed, 77]).uniform(1 - OFF, 1 + OFF, len(names))
+    factors = np.random.default_rng([seed, 77]).uniform(1 - off, 1 + off, len(names))
 
     def plant(access: Any = "any") -> Any:
         made = original.make(name, budget=budget, seed=seed, access=access)
@@ -142,7 +143,7 @@ def run(task: str, access: str, without: str, arm: str, seed: int, *, policy: bo
         model, phase, steps = design.surrogate(), design.phase, design.steps
     found = () if prior is None or prior.calibration is None else prior.calibration.parameters
     return Row(
-        *(task, access, without, arm, seed, phase, steps, error_of(model, plant(), seed)),
+        *(task, access, without, off, arm, seed, phase, steps, error_of(model, plant(), seed)),
         sum(one.startswith("prior + ") for one in model.model.structures),
         sum(one.low <= truth[one.name] <= one.high for one in found),
         len(found),
@@ -206,6 +207,7 @@ def _options() -> argparse.Namespace:
     made.add_argument("--arms", nargs="+", choices=ARMS, default=list(ARMS))
     made.add_argument("--access", choices=("any", "reset"), default="any")
     made.add_argument("--without", default="", help="parameter that the simulator lacks")
+    made.add_argument("--off", type=float, default=OFF, help="largest share by which a parameter of the plant is off")
     made.add_argument("--first-seed", type=int, default=0)
     made.add_argument("--seeds", type=int, default=1)
     made.add_argument("--policy", action="store_true", help="train a policy, and measure its real return")
