@@ -6,6 +6,10 @@ targets are those of the demo, without its second evaluation. Prints one line fo
 ``resets.csv``. With ``--rounds`` there is a line for each round of the design, with the returns of ten real episodes.
 
     python lab/benchmarks/bench_resets.py --seeds 9903 9904 9905 9906 9907 --tasks pendulum cartpole
+    python lab/benchmarks/bench_resets.py --seeds 121 122 123 124 125 --tasks swingup --dirt encoder --budget 150
+
+``--dirt`` gives the swing-up one kind of dirt, and sizes that each seed draws (``dirty_swingup.py``). A rod that is up
+is judged by its own angle then, not by what is read of it.
 """
 
 from __future__ import annotations
@@ -18,13 +22,16 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from bench_dirt import KINDS
 from common import OUT, append_row
+from dirty_swingup import InProcess
 
 import surrogym
 from surrogym.demo.tasks import TASKS, Outcome
 from surrogym_sampler import original
-from surrogym_sampler.original.episodes import open_episode
+from surrogym_sampler.original.episodes import Episode, RolloutEpisode, open_episode
 from surrogym_sampler.original.protocol import RolloutEnvironment
+from surrogym_sampler.original.rollouts import answering
 from surrogym_server.local import LocalSurrogate
 from surrogym_trainer.evaluation.evaluator import EvaluationSettings, evaluate
 from surrogym_trainer.training.planner import Planner
@@ -47,27 +54,36 @@ def main() -> None:
     made.add_argument("--seeds", nargs="+", type=int, required=True)
     made.add_argument("--episodes", type=int, default=100)
     made.add_argument("--budget", type=int, help="largest number of real steps, instead of the task's")
+    made.add_argument("--dirt", default="", choices=("", *KINDS), help="kind of dirt of the swing-up")
     made.add_argument("--rounds", action="store_true", help="returns after each round of a design")
     made.add_argument("--out", type=Path, default=OUT)
     options = made.parse_args()
     for task in options.tasks:
         for seed in options.seeds:
-            for row in _run(task, seed, options.budget or BUDGETS[task], options.episodes, rounds=options.rounds):
+            for row in _run(task, seed, options):
                 print(json.dumps(row), flush=True)
                 append_row(options.out / "resets.csv", row)
 
 
-def _run(task: str, seed: int, budget: int, episodes: int, *, rounds: bool) -> list[dict[str, object]]:
-    environment, begun = TASKS[task].environment, time.process_time()
-    machine = original.make(environment, access="reset", seed=seed, budget=budget)
+def _run(task: str, seed: int, options: argparse.Namespace) -> list[dict[str, object]]:
+    environment, begun, dirt, rounds = TASKS[task].environment, time.process_time(), options.dirt, options.rounds
+    machine = original.make(environment, access="reset", seed=seed, budget=options.budget or BUDGETS[task])
+    if dirt:
+        machine = answering(InProcess(dirt, seed, machine.spec()))
     assert isinstance(machine, RolloutEnvironment)
     design, starts, rows = surrogym.Design(machine.spec()), np.random.default_rng(seed), []
     resets, known = 0, 0
 
     def row(count: int) -> dict[str, object]:
         taken = time.process_time() - begun
-        earned = _earned(task, design.surrogate(), seed, count)
-        facts = {"task": task, "seed": seed, "steps": design.steps, "resets": resets, "phase": design.phase}
+        earned = _earned(task, dirt, design.surrogate(), seed, count)
+        facts = {
+            "task": f"{task} {dirt}".strip(),
+            "seed": seed,
+            "steps": design.steps,
+            "resets": resets,
+            "phase": design.phase,
+        }
         index = round(design.fidelity["confidence_index"], 4)
         return facts | {"confidence_index": index} | earned | {"episodes": count, "cpu_seconds": round(taken, 1)}
 
@@ -85,16 +101,24 @@ def _run(task: str, seed: int, budget: int, episodes: int, *, rounds: bool) -> l
                 break
         design.tell(query, steps)
     machine.close()
-    return [*rows, row(10 if rounds else episodes)]
+    return [*rows, row(10 if rounds else options.episodes)]
 
 
-def _earned(task: str, surrogate: LocalSurrogate, seed: int, episodes: int) -> dict[str, object]:
+def _earned(task: str, dirt: str, surrogate: LocalSurrogate, seed: int, episodes: int) -> dict[str, object]:
     """Return what a planner earns in the original environment, and whether this reaches the task's target."""
     spec, settings = surrogate.spec(), EvaluationSettings(episodes)
     planner, name = surrogate.planner(Planner.horizon, seed), spec.environment or task
-    real = evaluate(planner, lambda: open_episode(name, spec, partial(original.make, name, spec=spec)), settings)
+    judged = InProcess(dirt or "clean", seed, spec)
+
+    def episode() -> Episode:
+        dirty = answering(judged) if dirt else None
+        if isinstance(dirty, RolloutEnvironment):
+            return RolloutEpisode(dirty)
+        return open_episode(name, spec, partial(original.make, name, spec=spec))
+
+    real = evaluate(planner, episode, settings)
     mean, least = float(real.returns.mean()), float(real.returns.min())
-    success = None if real.success is None else float(real.success.mean())
+    success = None if real.success is None else float(np.mean(judged.ups if dirt else real.success))
     target = replace(TASKS[task].target, also_success=None)
     reached = target.reached(Outcome(mean, least, success))
     return {"mean": round(mean, 2), "least": round(least, 2), "success": success, "reached": reached}
