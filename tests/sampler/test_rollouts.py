@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -14,6 +15,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from support import wheel
 from support.rail import SPEC, HangsRight, Rail, RaisesRight
 from surrogym_client.errors import InvalidInput
 from surrogym_sampler import original
@@ -95,6 +97,26 @@ def test_a_reset_that_misses_the_declared_start_is_said_with_its_value_and_its_s
     assert remark == (
         f"1 of 1 resets led to no declared start, such as x = {x:.4g}, where the specification declares -0.2 to 0.2"
     )
+
+
+def test_a_coordinate_that_wraps_is_said_with_its_jump_and_its_steps_are_learned(api):
+    told, name = [], f"wheel-{uuid.uuid4().hex[:8]}"
+    api.create_surrogate(name, wheel.SPEC)
+    api.add_queries(name, rollouts=[[[1.0]] * 20, [[-1.0]] * 20])
+    settings = SamplerSettings(name="worker", until_done=True, time_limit=60.0)
+    Sampler(api, name, wheel.Wheel(), settings, lambda query, *said: told.append((query.purpose, *said))).run()
+    remarks = [remark for purpose, outcome, remark in told if purpose == "manual" and outcome == "answered"]
+    assert len(remarks) == 2
+    assert all(
+        re.fullmatch(
+            r"x jumps by 2048 in [12] of 20 steps, as an angle or a clock in counts does: multiply it by 2 pi / 2048, "
+            r"and declare it as an angle",
+            remark,
+        )
+        for remark in remarks
+    )
+    assert sum(abs(s.next_coordinates[0] - s.coordinates[0]) > 1024 for s in api.samples(name)) >= 2
+    api.delete_surrogate(name)
 
 
 def test_a_rollout_that_terminates_early_returns_its_unused_budget(api, rail):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -15,7 +16,7 @@ from uuid import uuid4
 import numpy as np
 import pytest
 
-from support import rail
+from support import rail, wheel
 from support.moody import DECLARED, SPEC, Line
 from support.server import ServerProcess
 from surrogym.cli import main
@@ -353,6 +354,23 @@ def test_a_policy_whose_audit_begins_at_no_declared_start_is_not_trusted(
         assert not handover.trusted
         count = 3 if whole else 1
         assert f"{count} of {count} resets led to no declared start, such as x = -0." in handover.audit.faults[0]
+
+
+@pytest.mark.parametrize("whole", [False, True], ids=["queries", "episodes"])
+def test_a_policy_in_whose_audit_an_undeclared_encoder_wraps_is_not_trusted(
+    server_process: ServerProcess, whole: bool
+) -> None:
+    with placed(server_process.url, wheel.SPEC, wheel.Wheel(), wheel.SPEC.design) as place:
+        subject = replace(place.subject(), predict=lambda observations: -np.ones((len(observations), 1)))
+        if whole:
+            make = partial(open_episode, "a wheel", None, wheel.Wheel)
+            handover = judge_episodes(subject, evaluate(subject.predict, make, EvaluationSettings(3)))
+        else:
+            handover = hand_over(subject, AUDIT)
+        assert handover.audit is not None
+        assert not handover.trusted
+        count = 60 if whole else 20
+        assert re.match(rf"x jumps by 2048 in [1-9] of {count} steps, as", handover.audit.faults[0])
 
 
 class Growing(Line):

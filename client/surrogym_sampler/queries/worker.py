@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from base64 import b64decode
+from collections import deque
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass, replace
@@ -34,6 +35,7 @@ from surrogym_sampler.queries.settings import Outcome, SamplerReport, SamplerSet
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.starts import not_declared
 from surrogym_shared.wire import ClaimedQueries, NewSample, Phase, Query, RolloutQuery, StepQuery
+from surrogym_shared.wrapping import undeclared_turns
 
 # Retries of a request while the server or its storage does not answer.
 PATIENCE = Retries(seconds=900.0, first_delay=0.1, longest_delay=5.0)
@@ -41,6 +43,7 @@ LOOK_SECONDS = 0.1  # seconds between two checks by a waiting sampler of whether
 LAST_SECONDS = 5.0  # a stopped sampler tries for these seconds to send its last real step
 END_SECONDS = 2.0  # if the sampler ends with the design, a claim for queries waits at most this many seconds
 AGAIN_SECONDS = 1.0  # seconds to wait after a claim that gave no query which the environment allows
+LATEST = 1_000  # number of latest steps of rollouts in which coordinates that wrap are looked for
 MOST_GONE = 1_000  # largest number of deleted snapshots in one report to the server
 STOPPED = "the sampler was stopped"
 NOT_APPROVED = "the person at the machine did not approve the query"
@@ -128,6 +131,7 @@ class Sampler:
         self._refused: set[int] = set()  # ids of refused queries, which the server may offer again
         self._failures = Failures()
         self._steps = 0
+        self._latest: deque[NewSample] = deque(maxlen=LATEST)  # the latest steps of rollouts
         self._remark = ""  # fault that did not harm the answer of the present query; "" if there was none
         self._begun: Query | None = None  # query whose real steps began last
         self._returning: Returning | None = None  # the environment's snapshots; None if it has none
@@ -287,7 +291,11 @@ class Sampler:
             self._hand_in(taken)
             self._steps += len(taken)
             raise
-        remark = "; ".join(filter(None, (self._remark, self._returning.remarks() if self._returning else "")))
+        turns = ""
+        if query.kind == "rollout":
+            self._latest.extend(taken)
+            turns = undeclared_turns(self._own, list(self._latest), len(taken))
+        remark = "; ".join(filter(None, (self._remark, turns, self._returning.remarks() if self._returning else "")))
         return _Answer(query, taken, outcome, error, remark, for_good)
 
     def _deliver(self, answer: _Answer) -> _Answer:

@@ -21,6 +21,7 @@ from surrogym_shared.spec import LONGEST_ROLLOUT, EnvironmentSpec
 from surrogym_shared.starts import not_declared
 from surrogym_shared.states import LEAST_AUDITED
 from surrogym_shared.wire import QueryView, SampleView, SurrogateView
+from surrogym_shared.wrapping import Step, undeclared_turns
 from surrogym_trainer.evaluation.audit import (
     AUDIT_STEPS,
     MOST_STEPS,
@@ -200,15 +201,22 @@ def take(
     about |= {"range_left": range_left(spec, q), "untested": far}
     firsts = {sample.query_id: sample.coordinates for sample in sorted(answers, key=lambda sample: -sample.id)}
     audit = judge(beside, before, subject.promise(), subject.floor, found).model_copy(update=about)
-    return _with_starts(audit, spec, list(firsts.values()))
+    others = [s for s in api.samples(name) if s.trajectory is not None and s.query_id not in wanted]
+    return _with_machine(audit, spec, list(firsts.values()), others, answers)
 
 
-def _with_starts(audit: Audit, spec: EnvironmentSpec, starts: Sequence[ArrayLike]) -> Audit:
-    """Add a fault to an audit if resets led to ``starts``, each (C,), that are not declared: the promise is one for the
-    declared starts. Environments that can be set to states, or return to saved ones, are not judged by this."""
-    if spec.query != "rollout" or spec.snapshots or not (fault := not_declared(spec, starts)):
+def _with_machine(
+    audit: Audit, spec: EnvironmentSpec, starts: Sequence[ArrayLike], before: Sequence[Step], steps: Sequence[Step]
+) -> Audit:
+    """Add faults to an audit if resets led to ``starts``, each (C,), that are not declared, because the promise is one
+    for the declared starts; or if a coordinate wraps in its steps without being an angle, as those before them show.
+    Environments that can be set to states, or return to saved ones, are not judged by this."""
+    if spec.query != "rollout" or spec.snapshots:
         return audit
-    return audit.model_copy(update={"passed": False, "faults": (fault, *audit.faults)})
+    faults = (not_declared(spec, starts), undeclared_turns(spec, [*before, *steps], len(steps)))
+    if not any(faults):
+        return audit
+    return audit.model_copy(update={"passed": False, "faults": (*filter(None, faults), *audit.faults)})
 
 
 def judge_episodes(subject: Subject, result: Evaluation) -> Handover:
@@ -231,7 +239,9 @@ def judge_episodes(subject: Subject, result: Evaluation) -> Handover:
     if result.limits is not None and result.limits.broken:
         audit = audit.model_copy(update={"passed": False, "faults": (result.limits.words(), *audit.faults)})
     about = {"steps": result.steps, "episodes": len(result.returns), "range_left": range_left(spec, q)}
-    audit = _with_starts(audit.model_copy(update=about), spec, [trace.coordinates[0] for trace in result.traces])
+    starts = [trace.coordinates[0] for trace in result.traces]
+    others = [sample for sample in api.samples(subject.name) if sample.trajectory is not None]
+    audit = _with_machine(audit.model_copy(update=about), spec, starts, others, steps)
     trusted, reason = _verdict(audit, subject.floor)
     return Handover(audit.after, audit, trusted, reason)
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from surrogym_shared.checks import LARGEST, NARROWEST, RESOLUTION
 from surrogym_shared.logs.columns import SECONDS, Roles, heading
-from surrogym_shared.logs.table import Bools, Floats, UnusableLog
+from surrogym_shared.logs.table import Bools, Floats, Ints, UnusableLog
 from surrogym_shared.logs.transitions import Transitions
 from surrogym_shared.spec import (
     Bounds,
@@ -167,7 +167,7 @@ def _is_angle(roles: Roles, steps: Transitions, name: str, index: int, notes: li
         if name in roles.angles:
             notes.append(f"{name}: an angle in radians, as it is declared")
         return name in roles.angles
-    turn = turn_of(steps, index)
+    turn = turn_of(steps.q, steps.u, steps.q_next, steps.row, index)
     if turn is None:
         return False
     if turn.sure and turn.size == FULL_TURN:
@@ -491,16 +491,22 @@ class Turn:
     sure: bool
 
 
-def turn_of(steps: Transitions, index: int) -> Turn | None:
-    """Return the full turn after which the values of state column ``index`` wrap; None if they don't wrap."""
-    before, after = steps.q[:, index], steps.q_next[:, index]
+def turn_of(q: Floats, u: Floats, q_next: Floats, row: Ints, index: int) -> Turn | None:
+    """Return the full turn after which the values of state column ``index`` wrap in m steps; None if they don't wrap.
+
+    Args:
+        q, u, q_next: state (m, C), action (m, F) and next state (m, C) of each step.
+        row: number of each step (m,); a step may follow the step with the number before.
+        index: the column.
+    """
+    before, after = q[:, index], q_next[:, index]
     change, low, high = after - before, min(before.min(), after.min()), max(before.max(), after.max())
     width = float(high - low)
     jumps = np.abs(change) > width / 2
     count = int(jumps.sum())
     if not 0 < count <= MOST_JUMPS * len(change):
         return None
-    forecast, std = _motion(steps, index, change, jumps, width)
+    forecast, std = _motion(q, u, q_next, row, index, jumps, width)
     std = max(std, FINEST * width)
     across = np.abs(change - forecast)[jumps]
     size = float(np.median(across))
@@ -527,19 +533,21 @@ def _lies_in(low: float, high: float, turn: float) -> bool:
     return (low >= -slack and high <= turn + slack) or (low >= -turn / 2 - slack and high <= turn / 2 + slack)
 
 
-def _motion(steps: Transitions, index: int, change: Floats, jumps: Bools, width: float) -> tuple[Floats, float]:
-    """Fit a linear model of the ``change`` (m,) of state column ``index`` to those of m steps that have no jump;
-    ``jumps`` (m,) marks the others. Return the changes (m,) that it predicts for all steps, and the standard deviation
-    of its error at the steps without a jump."""
-    slow = ~jumps
+def _motion(
+    q: Floats, u: Floats, q_next: Floats, row: Ints, index: int, jumps: Bools, width: float
+) -> tuple[Floats, float]:
+    """Fit a linear model of the change of state column ``index`` to those of m steps that have no jump; ``jumps`` (m,)
+    marks the others. Return the changes (m,) that it predicts for all steps, and the standard deviation of its error at
+    the steps without a jump."""
+    change, slow = q_next[:, index] - q[:, index], ~jumps
     follows = np.zeros(len(change), dtype=np.bool_)
-    follows[1:] = (steps.row[1:] == steps.row[:-1] + 1) & (steps.q[1:] == steps.q_next[:-1]).all(1) & slow[:-1]
+    follows[1:] = (row[1:] == row[:-1] + 1) & (q[1:] == q_next[:-1]).all(1) & slow[:-1]
     earlier = np.full(len(change), float(change[slow].mean()))
     earlier[1:][follows[1:]] = change[:-1][follows[1:]]
     turn = min((turn for turn in KNOWN if FILLED * turn <= width <= turn * (1 + NEAR)), default=width)
-    place = 2 * math.pi * steps.q[:, index] / turn
-    others = np.delete(steps.q, index, 1)
-    columns = [np.sin(place)[:, None], np.cos(place)[:, None], earlier[:, None], steps.u, others]
+    place = 2 * math.pi * q[:, index] / turn
+    others = np.delete(q, index, 1)
+    columns = [np.sin(place)[:, None], np.cos(place)[:, None], earlier[:, None], u, others]
     x = np.concatenate(columns, 1)
     x = (x - x[slow].mean(0)) / np.where(x[slow].std(0) > 0, x[slow].std(0), 1)
     x = np.concatenate([np.ones((len(x), 1)), x], 1)
