@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from support.compilers import NEEDS_C, SANITIZED, Compiled, called_by_name, calls, compile_c, recursive, run
-from support.controllers import LEARNERS, learner, limited, network, plant
+from support.controllers import LEARNERS, holding, learner, limited, network, plant
 from surrogym_sampler.original.actions import decode_actions
 from surrogym_sampler.original.lags import begun, followed
 from surrogym_sampler.original.limits import Guard
@@ -35,13 +35,15 @@ PLANTS = {
     "linear": (plant(), 0, None),
     "limits": (limited(plant(**HISTORY)), (16,), None),
     "rates": (limited(plant(**HISTORY, rate=(20.0, None))), (16,), None),
+    "integral": (holding(plant(**HISTORY)), (16,), None),
     "choices": (plant(MultiDiscreteAction(nvec=(2, 5)), actions=1), (16,), (1.0, 3.0)),
 }
 
 
 def made(folder: Path, case: str) -> Controller:
     spec, units, fallback = PLANTS[case]
-    return controller_of(network(folder, spec, units), choices=Choices(fallback=fallback))
+    settings = {"integral": ("slide",)} if case == "integral" else {}
+    return controller_of(network(folder, spec, units, settings=settings), choices=Choices(fallback=fallback))
 
 
 @pytest.mark.parametrize("flags", [(), ("-DARM_FLOAT",)], ids=["double", "float"])

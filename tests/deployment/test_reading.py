@@ -11,7 +11,7 @@ import stable_baselines3
 import torch
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from support.controllers import LEARNERS, Idle, learner, network, plant
+from support.controllers import LEARNERS, Idle, holding, learner, network, plant
 from surrogym_sampler.original.actions import decode_actions
 from surrogym_sampler.original.errors import PolicyMisfit
 from surrogym_sampler.original.lags import begun, followed, read_names
@@ -22,6 +22,7 @@ from surrogym_trainer.deployment.reading import controller_of
 from surrogym_trainer.deployment.reference import begin, decide, observe
 from surrogym_trainer.policies import UnusablePolicy, load_policy
 from surrogym_trainer.policies.card import PolicyCard, card_path, write_card
+from surrogym_trainer.policies.integrals import acting_with_integrals
 
 ANY = Choices(fallback=(0.0,))
 HISTORY = {"changes": 2, "actions": 2, "largest": {"angle": 0.5, "slide": 0.2}, "at_start": {"angle": 0.3}}
@@ -107,6 +108,31 @@ def test_after_a_measurement_fault_only_measurement_lags_are_reset(tmp_path: Pat
     assert rows[5]["slide.change1"] == pytest.approx(rows[5]["slide"] - rows[4]["slide"])
     assert [rows[4]["action1.lag1"], rows[4]["action1.lag2"]] == [actions[3][1], actions[2][1]]
     assert rows[2]["action1.lag1"] == actions[1][1] != 0
+
+
+def test_a_controller_sums_the_errors_that_its_policy_sees_and_a_fault_holds_the_sum(tmp_path: Path):
+    spec, points = holding(plant(**HISTORY)), {"slide": 0.7}
+    path = network(tmp_path, spec, settings={"integral": ("slide",), "session": {"set_points": points}})
+    controller, predict = controller_of(path), load_policy(path)
+    policy = acting_with_integrals(predict, spec, ("slide",), points)
+    memory, q, last, sums = begin(controller), None, None, []
+    rng = np.random.default_rng(3)
+    for turn in range(60):
+        read = np.array([rng.uniform(-3, 3), 0.7 + 0.2 * np.sin(turn / 5), 0.5])
+        q = begun(spec, read) if q is None else followed(spec, q, last, read)
+        decided = decide(controller, memory, read[None])
+        shown = declared(spec, q[None]).astype(np.float32)
+        expected = decode_actions(spec, policy.actions([0], shown), 1)[0]
+        np.testing.assert_allclose(decided.action[0], expected, atol=1e-4 * np.ptp([controller.low, controller.high]))
+        memory, last = decided.memory, decided.action[0].astype(np.float32).astype(np.float64)
+        sums.append(memory.coordinates[0, -1])
+    assert sums[0] == 0
+    assert sums[1] == pytest.approx(0.2 * np.sin(0.2) / (0.05 * 3))
+    assert max(sums) == 1
+    assert min(sums) == -1
+    faulty = decide(controller, memory, np.full((1, 3), np.nan)).memory
+    assert faulty.coordinates[0, -1] == sums[-1]
+    assert "integral of slide" in controller.coordinates
 
 
 def test_deploying_a_policy_without_a_feed_forward_network_is_refused(tmp_path: Path):

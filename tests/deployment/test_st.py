@@ -10,7 +10,7 @@ import pytest
 
 pytest.importorskip("blark")
 
-from support.controllers import limited, network, plant
+from support.controllers import holding, limited, network, plant
 from support.structured_text import FunctionBlock
 from surrogym_shared.spec import MultiDiscreteAction
 from surrogym_trainer.deployment.c.files import sensors_of
@@ -53,6 +53,13 @@ def test_the_structured_text_controller_keeps_limits_and_rates_as_the_reference_
     controller = controller_of(network(tmp_path, limited(plant(**PAST, rate=(20.0, None))), (3,)))
     assert max(decided(controller, real)) <= (1e-6 if real == "LREAL" else 1e-4)
     assert "status := 16" in source_of(controller, real, "arm")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("real", ["LREAL", "REAL"])
+def test_the_structured_text_controller_sums_errors_as_the_reference_does(tmp_path: Path, real: str):
+    policy = network(tmp_path, holding(plant(**PAST)), (3,), settings={"integral": ("slide",)})
+    assert max(decided(controller_of(policy), real)) <= (1e-6 if real == "LREAL" else 1e-4)
 
 
 @pytest.mark.slow

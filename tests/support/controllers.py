@@ -16,12 +16,15 @@ from surrogym_shared.network import Layer, Network
 from surrogym_shared.spec import (
     BoxAction,
     Coordinate,
+    DeclaredReward,
     DiscreteAction,
     EnvironmentSpec,
     Limit,
     Limits,
     MultiDiscreteAction,
     ObservationEntry,
+    Quantity,
+    RewardTerm,
     Term,
     Uniform,
     with_history,
@@ -82,11 +85,23 @@ def limited(spec: EnvironmentSpec) -> EnvironmentSpec:
     return EnvironmentSpec.model_validate({**spec.model_dump(), "limits": limits.model_dump()})
 
 
+def holding(spec: EnvironmentSpec) -> EnvironmentSpec:
+    """The same plant, whose reward says that the slide is to be held at 0.4 m."""
+    error = Quantity(term=Term.linear(slide=1) + Term.constant(-0.4))
+    reward = DeclaredReward(kind="declared", terms=(RewardTerm(shape="bump", of=(error,)),))
+    return spec.model_copy(update={"reward": reward})
+
+
 def network(folder: Path, spec: EnvironmentSpec, units: Any = (64, 64), gain: float = 1.0, **card: Any) -> Path:
-    """A file of a network of arrays with random weights, and a card with the specification."""
-    d, rng = len(spec.observation), np.random.default_rng(0)
-    weights = gain * rng.normal(size=Network.size(spec, units))
-    made = Network.of(spec, rng.normal(size=d), rng.uniform(0.5, 2.0, d), units, weights)
+    """A file of a network of arrays with random weights, and a card with the specification. The network sees the
+    integrals of the card's settings, too."""
+    more = (
+        ObservationEntry(name=name, term=Term.constant(0.0)) for name in card.get("settings", {}).get("integral", ())
+    )
+    shown = spec.model_copy(update={"observation": (*spec.observation, *more)})
+    d, rng = len(shown.observation), np.random.default_rng(0)
+    weights = gain * rng.normal(size=Network.size(shown, units))
+    made = Network.of(shown, rng.normal(size=d), rng.uniform(0.5, 2.0, d), units, weights)
     small = tuple(Layer(layer.weights, 0.1 * layer.bias) for layer in made.layers)  # else one choice is always the best
     replace(made, layers=small).save(folder / "policy.zip")
     write_card(folder / "policy.zip", PolicyCard(surrogate="arm", spec=spec, **card))

@@ -7,7 +7,7 @@ index of a coordinate among all C.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -20,6 +20,7 @@ from surrogym_shared.rates import Rate, rates
 from surrogym_shared.spec import BoxAction, Coordinate, EnvironmentSpec, Lag, Term, limits
 from surrogym_shared.spec.actions import Action
 from surrogym_shared.spec.safety import NamedFallback
+from surrogym_trainer.policies.integrals import Error
 
 Array = NDArray[np.float64]
 Activation = Literal["none", "tanh", "relu"]
@@ -65,29 +66,33 @@ class Measurement:
 
 @dataclass(frozen=True)
 class Remembered:
-    """A lag: a coordinate that the controller computes from earlier measurements or actions.
+    """A lag, or an integral: a coordinate that the controller computes from earlier measurements or actions.
 
     Attributes:
         name: the coordinate's name.
         place: the coordinate's index.
-        kind: what is repeated: an ``action``, an earlier ``value`` or ``change``, or the number of ``steps``.
+        kind: what is repeated: an ``action``, an earlier ``value`` or ``change``, or the number of ``steps``; or
+            ``sum``, the integral of the error of a coordinate, which a fault holds.
         source: index of the repeated coordinate; entry of the action for kind ``action``; -1 for ``steps``.
         angle: whether the repeated coordinate is an angle, so that a change is at most half a turn.
         of_action: whether the lag repeats actions. Other lags begin again at ``start`` after a fault, because a
             measurement is missing.
         start: the lag's value before the first measurement.
         low, high: bounds to which it is clipped; infinite without bounds.
+        set_point, unit: of a ``sum``: an error of ``unit`` from the set point adds 1 in a step.
     """
 
     name: str
     place: int
-    kind: LagKind
+    kind: LagKind | Literal["sum"]
     source: int
     angle: bool
     of_action: bool
     start: float
     low: float
     high: float
+    set_point: float = 0.0
+    unit: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -245,7 +250,12 @@ class Choices:
 
 
 def controller_from(
-    spec: EnvironmentSpec, decision: Decision, name: str, digests: dict[str, str], choices: Choices
+    spec: EnvironmentSpec,
+    decision: Decision,
+    name: str,
+    digests: dict[str, str],
+    choices: Choices,
+    errors: Sequence[Error] = (),
 ) -> Controller:
     """Return the controller of a network and the specification that it was trained for.
 
@@ -255,6 +265,7 @@ def controller_from(
         name: name of the surrogate.
         digests: hashes of policy, specification and samples, by name.
         choices: a person's settings.
+        errors: errors whose integrals the network sees after the entries of the specification's observation.
 
     Raises:
         NotDeployable: network and specification don't fit, a setting does not, or a number is too large for a C float.
@@ -262,19 +273,28 @@ def controller_from(
     _require_small(decision)
     low, high = np.array(spec.action.ranges, dtype=np.float64).T.copy()
     outputs = sum(spec.action.policy_counts) or len(low)
-    shape, expected = (len(decision.mean), len(decision.layers[-1].bias)), (len(spec.observation), outputs)
+    shape, expected = (
+        (len(decision.mean), len(decision.layers[-1].bias)),
+        (len(spec.observation) + len(errors), outputs),
+    )
     if shape != expected or decision.counts != spec.action.policy_counts:
         raise NotDeployable(
             f"expected a network of {expected[0]} inputs and {expected[1]} outputs for this specification, got "
             f"{shape[0]} and {shape[1]}: give the specification that the policy was trained for, with --spec"
         )
-    period = _period(spec, choices.period)
+    period, integrals = _period(spec, choices.period), _integrals(spec, errors)
     made = Controller(
         name=name,
-        coordinates=spec.coordinate_names,
+        coordinates=(*spec.coordinate_names, *(one.name for one in integrals)),
         measurements=_measurements(spec, dict(choices.ranges or {})),
-        lags=tuple(_remembered(spec, i, c, c.lag) for i, c in enumerate(spec.coordinates) if c.lag is not None),
-        observation=tuple(_observed(spec, i) for i in range(len(spec.observation))),
+        lags=(
+            *(_remembered(spec, i, c, c.lag) for i, c in enumerate(spec.coordinates) if c.lag is not None),
+            *integrals,
+        ),
+        observation=(
+            *(_observed(spec, i) for i in range(len(spec.observation))),
+            *(_shown(one) for one in integrals),
+        ),
         decision=decision,
         low=low,
         high=high,
@@ -296,7 +316,7 @@ def _numbers(controller: Controller) -> Iterator[float]:
     for entry in controller.observation:
         yield from (entry.low, entry.high)
     for lag in controller.lags:
-        yield from (lag.start, lag.low, lag.high)
+        yield from (lag.start, lag.low, lag.high, lag.set_point, lag.unit)
     for part in (part for entry in controller.observation for part in entry.parts):
         yield from (part.coefficient, *(weight for _, weight in part.weights))
     yield from (*controller.low, *controller.high, *controller.fallback)
@@ -395,6 +415,32 @@ def _remembered(spec: EnvironmentSpec, place: int, coordinate: Coordinate, lag: 
         low=_bounds(coordinate)[0],
         high=_bounds(coordinate)[1],
     )
+
+
+def _integrals(spec: EnvironmentSpec, errors: Sequence[Error]) -> tuple[Remembered, ...]:
+    """Return the integrals of errors as coordinates after those of the specification."""
+    names = spec.coordinate_names
+    return tuple(
+        Remembered(
+            name=f"integral of {error.name}",
+            place=len(names) + i,
+            kind="sum",
+            source=names.index(error.name),
+            angle=False,
+            of_action=False,
+            start=0.0,
+            low=-1.0,
+            high=1.0,
+            set_point=error.set_point,
+            unit=error.unit,
+        )
+        for i, error in enumerate(errors)
+    )
+
+
+def _shown(integral: Remembered) -> Observed:
+    part = Part("linear", 1.0, ((integral.place, 1.0),))
+    return Observed(integral.name, "", (part,), -np.inf, np.inf, integral.low, integral.high)
 
 
 def _guard(spec: EnvironmentSpec, low: Array, high: Array) -> Guard | None:

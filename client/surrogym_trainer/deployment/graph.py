@@ -244,6 +244,11 @@ def _lag(lag: Remembered, names: tuple[str, ...]) -> str:
             return f"{names[lag.source]} one step before"
         case "change":
             return f"change of {names[lag.source]} in the last step" + (", by at most half a turn" if lag.angle else "")
+        case "sum":
+            return (
+                f"integral: each step but the first adds ({names[lag.source]} - {lag.set_point!r}) / {lag.unit!r}, "
+                f"clipped to {lag.low:g} to {lag.high:g}; a fault adds nothing"
+            )
 
 
 def _finite(value: float) -> float | None:

@@ -30,6 +30,7 @@ from surrogym_trainer.deployment.controller import (
 from surrogym_trainer.deployment.reference import act, scores
 from surrogym_trainer.policies.card import UnusablePolicy, read_card
 from surrogym_trainer.policies.files import ONNX, load_network, load_policy, require_policy
+from surrogym_trainer.policies.integrals import errors_of
 from surrogym_trainer.policies.planner_files import PlannerFile
 from surrogym_trainer.policies.predict import Predict
 
@@ -73,11 +74,6 @@ def controller_of(
     if policy.suffix.lower() == ONNX:
         raise NotDeployable(f"{policy} is an export without its network: expected the policy's zip file; {CAN}")
     card = read_card(policy)
-    if card.integral:
-        raise NotDeployable(
-            f"{policy} sees the integral of the error of {', '.join(card.integral)}, which a controller does not "
-            "compute yet: train it without --integral"
-        )
     meant = spec or card.spec
     if meant is None:
         raise NotDeployable(
@@ -94,7 +90,8 @@ def controller_of(
         **({"samples of the model": card.model} if card.model else {}),
     }
     name = card.surrogate or policy.stem
-    controller = controller_from(meant, decision, name, digests, choices or Choices())
+    errors = errors_of(meant, card.integral, card.set_points)
+    controller = controller_from(meant, decision, name, digests, choices or Choices(), errors)
     _check(controller, meant, predict)
     return controller
 

@@ -167,7 +167,10 @@ def _placed(controller: Controller, memory: Memory, read: Array, sound: Bools) -
             case "change":
                 change = after[:, lag.source] - memory.coordinates[:, lag.source]
                 value = wrapped(change) if lag.angle else change
-        kept = np.where(memory.acted if lag.of_action else known, value, lag.start)
+            case "sum":
+                error = (after[:, lag.source] - lag.set_point) / lag.unit
+                value = memory.coordinates[:, lag.place] + np.where(sound, error, 0.0)
+        kept = np.where(memory.acted if lag.of_action or lag.kind == "sum" else known, value, lag.start)
         after[:, lag.place] = np.clip(kept, lag.low, lag.high)
     return after
 

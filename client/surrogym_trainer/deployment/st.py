@@ -26,7 +26,7 @@ LARGEST = {"LREAL": float(np.finfo(np.float64).max), "REAL": 3.4028234e38}
 PER_LINE = 5  # number of constants in each line of a generated array
 # an angle's reading may be at most this number of turns from 0, because TRUNC returns a DINT (32 bits)
 MOST_TURNS = 1e9
-KINDS = ("action", "steps", "value", "change")
+KINDS = ("action", "steps", "value", "change", "sum")
 
 WRAP = """\
 value := value + HALF_TURN;
@@ -59,7 +59,7 @@ FOR i := 0 TO $last DO
 $wrap
                 END_IF
             END_IF
-    END_CASE
+$sums    END_CASE
     IF value < LAG_LOW[i] THEN
         value := LAG_LOW[i];
     ELSIF value > LAG_HIGH[i] THEN
@@ -67,6 +67,16 @@ $wrap
     END_IF
     q[LAG_PLACE[i]] := value;
 END_FOR"""
+
+SUMS = """\
+        4: (* the integral of an error, which a fault holds *)
+            IF acted THEN
+                value := before[LAG_PLACE[i]];
+                IF status = 0 THEN
+                    value := value + (q[LAG_SOURCE[i]] - LAG_SET_POINT[i]) / LAG_UNIT[i];
+                END_IF
+            END_IF
+"""
 
 LAYER = """\
 FOR k := 0 TO $last DO
@@ -154,7 +164,8 @@ def source_of(controller: Controller, real: str, name: str) -> str:
     wrap, outputs = Template(WRAP).substitute(real=real), "x" if len(sizes) % 2 else "y"
     decide = Template(DISCRETE if decision.counts else CONTINUOUS)
     squash = Template(TANH).substitute(last=sizes[-1] - 1, to=outputs) + "\n" if decision.squash else ""
-    lags = Template(LAGS).substitute(last=len(controller.lags) - 1, wrap=_indented(20, wrap))
+    sums = SUMS if any(lag.kind == "sum" for lag in controller.lags) else ""
+    lags = Template(LAGS).substitute(last=len(controller.lags) - 1, wrap=_indented(20, wrap), sums=sums)
     rounded = _rounded if real == "LREAL" else str
     return _template().substitute(
         _comments(controller),
@@ -274,7 +285,8 @@ def _constants(controller: Controller, real: str) -> Iterable[str]:
     if decision.counts:
         wholes["CHOICES"] = decision.counts
     if lags:
-        numbers |= {f"LAG_{end.upper()}": [getattr(one, end) for one in lags] for end in ("start", "low", "high")}
+        ends = ("start", "low", "high", *(("set_point", "unit") if any(one.kind == "sum" for one in lags) else ()))
+        numbers |= {f"LAG_{end.upper()}": [getattr(one, end) for one in lags] for end in ends}
         wholes |= {
             "LAG_KIND": [KINDS.index(one.kind) for one in lags],
             "LAG_PLACE": [one.place for one in lags],

@@ -26,6 +26,33 @@ UNIT = 0.05  # error, as a share of the coordinate's sampling range, that moves 
 
 
 @dataclass(frozen=True)
+class Error:
+    """The error of a coordinate ``name`` from its ``set_point``; an error of ``unit`` moves the integral by 1."""
+
+    name: str
+    set_point: float
+    unit: float
+
+
+def errors_of(spec: EnvironmentSpec, names: Sequence[str], set_points: Mapping[str, float]) -> tuple[Error, ...]:
+    """Return the errors of coordinates. Arguments are those of ``Integrals.of``.
+
+    Raises:
+        ValueError: the reward does not have a set point of a coordinate.
+    """
+    known, errors = set_points_of(with_set_points(spec, set_points)), []
+    for name in names:
+        if len(known.get(name, ())) != 1:
+            raise ValueError(
+                f"integral: expected a coordinate with one set point in a declared reward, "
+                f"{' or '.join(map(repr, known)) or 'which this reward does not have'}, got {name!r}"
+            )
+        low, high = limits(spec.coordinates[spec.coordinate_names.index(name)].sampling)
+        errors.append(Error(name, known[name][0], UNIT * (high - low)))
+    return tuple(errors)
+
+
+@dataclass(frozen=True)
 class Integrals:
     """Running sums of the errors of K coordinates, computed from observations."""
 
@@ -45,21 +72,13 @@ class Integrals:
         Raises:
             ValueError: the reward does not have a set point of a coordinate, or the observation does not show it.
         """
-        known, rows = set_points_of(with_set_points(spec, set_points)), []
-        for name in names:
-            if len(known.get(name, ())) != 1:
-                raise ValueError(
-                    f"integral: expected a coordinate with one set point in a declared reward, "
-                    f"{' or '.join(map(repr, known)) or 'which this reward does not have'}, got {name!r}"
-                )
-            shown = [(i, line_of(one.term)) for i, one in enumerate(spec.observation)]
-            lines = [(i, *line[1:]) for i, line in shown if line is not None and line[0] == name]
+        shown, rows = [(i, line_of(one.term)) for i, one in enumerate(spec.observation)], []
+        for error in errors_of(spec, names, set_points):
+            lines = [(i, *line[1:]) for i, line in shown if line is not None and line[0] == error.name]
             if not lines:
-                raise ValueError(f"integral: expected a coordinate that an observation entry shows, got {name!r}")
+                raise ValueError(f"integral: expected a coordinate that an observation entry shows, got {error.name!r}")
             column, slope, constant = lines[0]
-            low, high = limits(spec.coordinates[spec.coordinate_names.index(name)].sampling)
-            unit = UNIT * (high - low)
-            rows.append((column, 1 / (slope * unit), -(constant / slope + known[name][0]) / unit))
+            rows.append((column, 1 / (slope * error.unit), -(constant / slope + error.set_point) / error.unit))
         columns, slopes, constants = zip(*rows, strict=True)
         return cls(np.array(columns), np.array(slopes), np.array(constants))
 

@@ -196,7 +196,7 @@ def _part(part: Part) -> str:
 
 def _place(controller: Controller) -> str:
     lines, size = [], len(controller.coordinates)
-    if not all(lag.of_action for lag in controller.lags):
+    if not all(lag.of_action or lag.kind == "sum" for lag in controller.lags):
         lines.append("const int known = controller->acted && controller->measured && measurement;")
     if any(lag.kind != "action" for lag in controller.lags):
         lines += [f"real before[{size}];", "int i;", f"for (i = 0; i < {size}; i++)", "    before[i] = q[i];"]
@@ -211,13 +211,16 @@ def _place(controller: Controller) -> str:
     lines.append("}")
     for lag in controller.lags:
         change = f"q[{lag.source}] - before[{lag.source}]"
+        error = f"(q[{lag.source}] - {real(lag.set_point)}) / {real(lag.unit)}"
         value = {
             "action": f"controller->action[{lag.source}]",
             "steps": f"before[{lag.place}] + R(1.0)",
             "value": f"before[{lag.source}]",
             "change": f"wrapped({change})" if lag.angle else change,
+            "sum": f"before[{lag.place}] + (measurement ? {error} : R(0.0))",
         }[lag.kind]
-        value = f"{'controller->acted' if lag.of_action else 'known'} ? {value} : {real(lag.start)}"
+        begun = "controller->acted" if lag.of_action or lag.kind == "sum" else "known"
+        value = f"{begun} ? {value} : {real(lag.start)}"
         if not (math.isinf(lag.low) and math.isinf(lag.high)):
             value = f"clipped({value}, {real(lag.low)}, {real(lag.high)})"
         lines.append(f"q[{lag.place}] = {value}; /* {plain(lag.name)} */")
