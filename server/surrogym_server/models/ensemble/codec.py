@@ -108,23 +108,20 @@ def _arrays(name: str, networks: Networks) -> dict[str, Tensor]:
 def _regression(name: str, arrays: Arrays, inputs: int, outputs: int, *, quadratic: bool) -> Regression:
     centre, scale = arrays[f"{name}.centre"], arrays[f"{name}.scale"]
     _require_shapes(name, {"centre": centre, "scale": scale}, {"centre": (outputs,), "scale": (outputs,)})
-    if bool((scale < 0).any()):
-        raise InvalidInput(
-            f"model, part {name}: expected each entry of scale (standard deviations of outputs) to be at least 0, "
-            f"got {float(scale.min()):g}; export the model again"
-        )
+    _require_positive(f"{name}: expected each entry of scale (standard deviations of outputs)", scale)
     return Regression(_networks(name, arrays, inputs, outputs, quadratic=quadratic), centre, scale)
 
 
 def _noise(name: str, arrays: Arrays, inputs: int, outputs: int) -> Noise:
     size = arrays[f"{name}.size"]
     _require_shapes(name, {"size": size}, {"size": (outputs,)})
-    if bool((size < 0).any()):
-        raise InvalidInput(
-            f"model, part {name}: expected each entry of size (standard deviations of noise) to be at least 0, "
-            f"got {float(size.min()):g}; export the model again"
-        )
+    _require_positive(f"{name}: expected each entry of size (standard deviations of noise)", size)
     return Noise(_networks(name, arrays, inputs, outputs, quadratic=False), size)
+
+
+def _require_positive(what: str, values: Tensor) -> None:
+    if bool((values < 0).any()):
+        raise InvalidInput(f"model, part {what} to be at least 0, got {float(values.min()):g}; export the model again")
 
 
 def _networks(name: str, arrays: Arrays, d: int, p: int, *, quadratic: bool) -> Networks:

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property, partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from surrogym_server.environment.definition import EnvironmentDefinition
-from surrogym_server.environment.step_rules import paid
-from surrogym_server.models.abilities import LearnedNoise
+from surrogym_server.environment.observation_inverse import ObservationInverse
+from surrogym_server.environment.step_rules import moved, paid, placed
+from surrogym_server.models.abilities import FunctionDraws, LearnedNoise
+from surrogym_server.models.ensemble.inputs import Inputs
 from surrogym_server.models.ensemble.networks import Networks, bounded
-from surrogym_server.models.ensemble.stepping import SteppedInBlocks, between, drawn_member
-from surrogym_server.tensors import cached
+from surrogym_server.models.port import DynamicsModel, Transition
+from surrogym_server.tensors import cached, in_blocks
+
+ROWS = 8_192  # steps are predicted in blocks of at most this number of steps, to bound memory
 
 
 @dataclass(frozen=True)
@@ -53,11 +58,9 @@ class Regression:
 
 
 @dataclass(frozen=True)
-class NetworkEnsembleModel(SteppedInBlocks, LearnedNoise):
+class NetworkEnsembleModel(DynamicsModel, FunctionDraws, LearnedNoise):
     """Model of K networks (members). A prediction has the mean and the standard deviation of the networks' predictions.
     The learned noise of a transition depends on the state; no noise of the reward is learned."""
-
-    rows = 8_192
 
     definition: EnvironmentDefinition
     transitions: Regression  # networks that predict the M transition outputs (changes of coordinates)
@@ -82,7 +85,9 @@ class NetworkEnsembleModel(SteppedInBlocks, LearnedNoise):
     def draw(self, noise: Tensor) -> Tensor:
         """Sample N functions from standard normal numbers ``noise`` (N, 1). Each function is one of the networks
         (members), chosen with equal probability; its weight (N, 1) is the index of the network."""
-        return drawn_member(noise, self.transitions.networks.members)
+        members = self.transitions.networks.members
+        chosen: Tensor = (members * torch.special.ndtr(noise)).floor().clamp_max(members - 1)
+        return chosen
 
     def means(self, q: Tensor, u: Tensor) -> Tensor:
         change = self.transitions(self._inputs.of_transition(q, u)).mean(0)
@@ -121,6 +126,36 @@ class NetworkEnsembleModel(SteppedInBlocks, LearnedNoise):
         ]
         return {"outputs": outputs, "terminal_reward": self.terminal_reward, "samples": self.samples}
 
+    def transition(
+        self,
+        q: Tensor,
+        u: Tensor,
+        *,
+        noise: Tensor | None = None,
+        process: Tensor | None = None,
+        stds: bool = False,
+        reward_std: bool = False,
+    ) -> Transition:
+        q_next, reward, spread, doubt = in_blocks(
+            ROWS, partial(self._step, stds, reward_std), q, u, noise, process, None
+        )
+        return Transition(q_next, reward, spread if stds else None, doubt if reward_std else None)
+
+    def transition_along(
+        self,
+        paths: Tensor,
+        q: Tensor,
+        u: Tensor,
+        *,
+        process: Tensor | None = None,
+        stds: bool = False,
+        reward_std: bool = False,
+    ) -> Transition:
+        q_next, reward, spread, doubt = in_blocks(
+            ROWS, partial(self._step, stds, reward_std), q, u, None, process, paths
+        )
+        return Transition(q_next, reward, spread if stds else None, doubt if reward_std else None)
+
     def _step(
         self,
         stds: bool,
@@ -131,6 +166,20 @@ class NetworkEnsembleModel(SteppedInBlocks, LearnedNoise):
         process: Tensor | None,
         paths: Tensor | None,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Predict one block of m steps.
+
+        Args:
+            stds, reward_std: whether standard deviations of transition outputs and of the reward are needed.
+            q: coordinates (m, C).
+            u: actions (m, F).
+            noise: number of standard deviations that are added to the mean of each transition output, (m, M), or None.
+            process: standard normal numbers, (m, M), by which the learned noise moves each transition output, or None.
+            paths: weights of the sampled function that each row follows, (m, W), or None for the mean.
+
+        Returns:
+            Next coordinates (m, C), rewards (m,), standard deviations of transition outputs (m, M), and standard
+            deviations of the reward (m,). Standard deviations that are not needed are (m, 0).
+        """
         member = None if paths is None else paths[:, 0].long()
         x = self._inputs.of_transition(q, u)
         changes = self.transitions(x)
@@ -143,6 +192,17 @@ class NetworkEnsembleModel(SteppedInBlocks, LearnedNoise):
         doubt = between(rewards).sqrt() if reward_std else q.new_zeros(len(q), 0)
         return q_next, _of_member(rewards, member), spread, doubt
 
+    def _arrived(self, q: Tensor, u: Tensor, change: Tensor) -> Tensor:
+        return moved(self.definition, self._inverse, q, u, placed(self.definition, change))
+
+    @cached_property
+    def _inverse(self) -> ObservationInverse | None:
+        return ObservationInverse.of(self.definition) if self.definition.moves_observation else None
+
+    @cached_property
+    def _inputs(self) -> Inputs:
+        return Inputs(self.definition)
+
     def _rewards(self, q: Tensor, u: Tensor, q_next: Tensor) -> Tensor:
         """Return the rewards (K, m) that each of the K networks predicts for m steps from q (m, C) under u (m, F) to
         q_next (m, C)."""
@@ -150,6 +210,12 @@ class NetworkEnsembleModel(SteppedInBlocks, LearnedNoise):
             return declared(q_next if declared.after else q, u).expand(self.transitions.networks.members, -1)
         assert self.reward is not None
         return self.reward(self._inputs.of_reward(q, u, q_next))[..., 0]
+
+
+def between(values: Tensor) -> Tensor:
+    """Return the variance of values (K, ...) over the K networks (members). Unlike ``torch.var`` it gives no warning
+    for an empty tensor."""
+    return values.var(0) if values.numel() else values[0]
 
 
 def _of_member(values: Tensor, member: Tensor | None) -> Tensor:
