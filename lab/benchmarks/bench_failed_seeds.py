@@ -17,6 +17,7 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 
 from common import parser, started, write
 
+from surrogym.demo.learning import SurrogateRun
 from surrogym.demo.run import run_demo
 from surrogym.demo.settings import DemoSettings
 
@@ -40,7 +41,7 @@ def run(seed: int) -> dict[str, Any]:
     kept: list[dict[str, Any]] = []
     with TemporaryDirectory() as place:
         settings = DemoSettings(TASK, seed, pictures=False)
-        run_demo(settings, Path(place) / "run", lambda metrics, _: kept.append(metrics), quiet=True)
+        run_demo(settings, SurrogateRun, Path(place) / "run", lambda metrics, _: kept.append(metrics), quiet=True)
     found = kept[0]
     earned, steps = found["real_return"]["mean"], found["real_queries"]["total"]
     return {"seed": seed, "once": SEEDS[seed], "now": earned, "real_steps": steps, "trusted": found["trusted"]}

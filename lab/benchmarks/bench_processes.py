@@ -42,7 +42,7 @@ def run(task: str, seed: int, arm: str) -> dict[str, Any]:
     kept: list[dict[str, Any]] = []
     with TemporaryDirectory() as place:
         settings = StudySettings(task, seed, pictures=False, arm=arm)
-        run_demo(settings, Path(place) / "run", lambda metrics, _: kept.append(metrics), begin, quiet=True)
+        run_demo(settings, begin, Path(place) / "run", lambda metrics, _: kept.append(metrics), quiet=True)
     found = kept[0]
     fields = ("real_queries", "phase", "confidence_index", "imagined_return", "promise", "trusted", "virtual_steps")
     real = {name: found["real_return"][name] for name in ("mean", "min")}

@@ -8,7 +8,6 @@ from pathlib import Path
 from surrogym.demo.judging import Judgement, episodes_of
 from surrogym.demo.learning import Learned, SurrogateRun
 from surrogym.demo.processes import Children
-from surrogym.demo.run import Run
 from surrogym_lab.original_port import OriginalPort
 from surrogym_lab.settings import StudySettings
 from surrogym_shared.terminal import progress
@@ -17,7 +16,7 @@ from surrogym_trainer.training import TrainProgress, TrainSettings, train
 from surrogym_trainer.training.words import words_of
 
 
-def begin(settings: StudySettings, folder: Path, children: Children, *, quiet: bool) -> Run:
+def begin(settings: StudySettings, folder: Path, children: Children, *, quiet: bool) -> SurrogateRun:
     """Begin the run of an arm."""
     if settings.way.original:
         return OriginalRun(settings, folder, quiet=quiet)
@@ -48,12 +47,12 @@ class DesignFirstRun(SurrogateRun):
                 view = self._wait_for_design(update, after_round=view.round)
 
 
-class OriginalRun:
+class OriginalRun(SurrogateRun):
     """The default training in the original environment. Its steps are real, including those of its checks."""
 
     def __init__(self, settings: StudySettings, folder: Path, *, quiet: bool) -> None:
         self._settings = settings
-        self._policy = folder / "policy.zip"
+        self._folder = folder
         self._quiet = quiet
 
     def learn(self) -> Learned:

@@ -15,7 +15,7 @@ from gymnasium.wrappers import RecordVideo
 from support.exact_pendulum import ExactPendulum
 from surrogym_client.environments import RemoteEnv, RemoteVectorEnv
 from surrogym_client.environments.pictures import NotRenderable, Pictures, coordinates_from_observation
-from surrogym_client.environments.render_modes import metadata_of
+from surrogym_client.environments.render_modes import drawn
 from surrogym_client.registration import SWING_UP
 from surrogym_sampler.original.classic import TASKS
 from surrogym_sampler.original.episodes import draw
@@ -177,7 +177,7 @@ def test_the_declared_render_modes_are_those_that_can_be_drawn(
 ) -> None:
     for module in ("pygame", "mujoco"):
         monkeypatch.setitem(sys.modules, module, None)
-    assert metadata_of(spec, original, None) == {"render_modes": modes}
+    assert drawn(spec, original, None) == (None, {"render_modes": modes})
 
 
 def test_rendering_before_the_first_reset_is_refused() -> None:

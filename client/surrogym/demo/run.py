@@ -7,10 +7,10 @@ import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any
 
-from surrogym.demo.judging import Judgement, judge
-from surrogym.demo.learning import Learned, SurrogateRun
+from surrogym.demo.judging import judge
+from surrogym.demo.learning import SurrogateRun
 from surrogym.demo.processes import Children, RunFailed
 from surrogym.demo.report import metrics_of
 from surrogym.demo.settings import DemoSettings
@@ -18,46 +18,22 @@ from surrogym_client.runtime.lifetime import terminations_as_interrupts
 from surrogym_client.runtime.versions import commit
 from surrogym_shared.terminal import on_interrupt, say
 
-S = TypeVar("S", bound=DemoSettings, contravariant=True)
-
-
-class Run(Protocol):
-    """Protocol of one run of the demo: learning a policy, and storing the results."""
-
-    def learn(self) -> Learned:
-        """Learn a policy, and return it with the real steps, virtual steps and seconds that it took."""
-        ...
-
-    def keep(self, judgement: Judgement) -> None:
-        """Report the real steps of the evaluation to the server, and write pictures and data into the run folder."""
-        ...
-
-    def linger(self) -> None:
-        """Keep the server running until Ctrl-C, so that a person can view its page."""
-        ...
-
-
-class Begin(Protocol[S]):
-    """Protocol of a function that starts a run in a folder. Its child processes end with the run."""
-
-    def __call__(self, settings: S, folder: Path, children: Children, *, quiet: bool) -> Run: ...
-
 
 def run_demo(
-    settings: S,
-    out: Path | None = None,
-    tell: Callable[[dict[str, Any], Path], None] | None = None,
-    begin: Begin[S] = SurrogateRun,
+    settings: DemoSettings,
+    begin: Callable[..., SurrogateRun],
+    out: Path | None,
+    tell: Callable[[dict[str, Any], Path], None],
     *,
-    quiet: bool = False,
+    quiet: bool,
 ) -> None:
     """Run a demo: learn a policy, evaluate it, and write metrics and data into the run folder.
 
     Args:
         settings: settings of the demo.
+        begin: starts the run that learns the policy, from the settings, its folder and its child processes.
         out: an empty folder for the results; None makes one.
         tell: called at the end with the metrics and the run folder.
-        begin: starts the run that learns the policy.
         quiet: whether progress is hidden.
 
     Raises:
@@ -78,8 +54,7 @@ def run_demo(
         metrics = metrics_of(settings, learned, judgement, learned.seconds | seconds)
         metrics["commit"] = code if code == commit() else f"{code} to {commit()}"
         (folder / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
-        if tell is not None:
-            tell(metrics, folder)
+        tell(metrics, folder)
         if settings.keep:
             run.linger()
         elif (database := _database(folder)).exists():

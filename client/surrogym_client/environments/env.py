@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surrogym_client.environments.lanes import LaneReset, Lanes, LaneStep, session_request
-from surrogym_client.environments.render_modes import RENDER_MODES, metadata_of
+from surrogym_client.environments.render_modes import RENDER_MODES, drawn
 from surrogym_client.environments.spaces import space
 from surrogym_shared.port import SurrogatePort
 
 if TYPE_CHECKING:
-    from surrogym_client.environments.pictures import Picture, Pictures
+    from surrogym_client.environments.pictures import Picture
 
 LOST = "surrogym_session_lost"
 
@@ -64,13 +64,8 @@ class RemoteEnv(gymnasium.Env[Observation, Any]):
     ) -> None:
         request, spec = session_request(1, "disabled", options), port.spec()
         self.render_mode = render_mode
-        self._pictures: Pictures | None = None
-        if render_mode is not None:
-            from surrogym_client.environments.pictures import pictures_for
-
-            self._pictures = pictures_for(render_mode, spec, original)
+        self._pictures, self.metadata = drawn(spec, original, render_mode)
         self._shown: Observation | None = None
-        self.metadata = metadata_of(spec, original, self._pictures.frames_per_second if self._pictures else None)
         self._lanes = Lanes(port, request, deviations=deviations)
         self.observation_space = space(self._lanes.view.observation_space)
         self.action_space = space(self._lanes.view.action_space)

@@ -7,13 +7,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from importlib.util import find_spec
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
 from surrogym_shared.spec import EnvironmentSpec, Part
+
+if TYPE_CHECKING:
+    from surrogym_client.environments.pictures import Pictures
 
 Array = NDArray[np.float64]
 Read = Callable[[Array], float]  # computes a coordinate from an observation (D,)
@@ -27,11 +30,16 @@ DRAWN_WITH: dict[str, tuple[str, str] | None] = {
 }
 
 
-def metadata_of(spec: EnvironmentSpec, original: str | None, frames_per_second: int | None) -> dict[str, Any]:
-    """Return Gymnasium's ``metadata`` of a surrogate: the render modes that work here, and the pictures' frames per
-    second."""
-    fps = {} if frames_per_second is None else {"render_fps": frames_per_second}
-    return {"render_modes": _render_modes(spec, original), **fps}
+def drawn(spec: EnvironmentSpec, original: str | None, mode: str | None) -> tuple[Pictures | None, dict[str, Any]]:
+    """Return what draws observations of a surrogate in a render mode (None: nothing draws), and Gymnasium's
+    ``metadata``: the render modes that work here, and the pictures' frames per second."""
+    metadata: dict[str, Any] = {"render_modes": _render_modes(spec, original)}
+    if mode is None:
+        return None, metadata
+    from surrogym_client.environments.pictures import pictures_for
+
+    pictures = pictures_for(mode, spec, original)
+    return pictures, metadata | {"render_fps": pictures.frames_per_second}
 
 
 def _render_modes(spec: EnvironmentSpec, original: str | None) -> list[str]:

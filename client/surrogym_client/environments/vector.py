@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 
 from surrogym_client.environments.env import LOST, Observation
 from surrogym_client.environments.lanes import Lanes, LaneStep, session_request
-from surrogym_client.environments.render_modes import metadata_of
+from surrogym_client.environments.render_modes import drawn
 from surrogym_client.environments.spaces import space
 from surrogym_shared import wire
 from surrogym_shared.port import Bools, SurrogatePort
 
 if TYPE_CHECKING:
-    from surrogym_client.environments.pictures import Picture, Pictures
+    from surrogym_client.environments.pictures import Picture
 
 WIRE_MODE: dict[AutoresetMode, wire.AutoresetMode] = {
     AutoresetMode.NEXT_STEP: "next_step",
@@ -73,16 +73,9 @@ class RemoteVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         self.num_envs = num_envs
         self.autoreset_mode = mode  # an attribute, as in SyncVectorEnv, because TorchRL reads it
         self.render_mode = render_mode
-        self._pictures: Pictures | None = None
-        if render_mode is not None:
-            from surrogym_client.environments.pictures import pictures_for
-
-            self._pictures = pictures_for(render_mode, spec, original)
+        self._pictures, metadata = drawn(spec, original, render_mode)
         self._shown: Observation | None = None
-        self.metadata = {
-            "autoreset_mode": mode,
-            **metadata_of(spec, original, self._pictures.frames_per_second if self._pictures else None),
-        }
+        self.metadata = {"autoreset_mode": mode, **metadata}
         self._lanes = Lanes(port, request, deviations=deviations)
         self.single_observation_space = space(self._lanes.view.observation_space)
         self.single_action_space = space(self._lanes.view.action_space)

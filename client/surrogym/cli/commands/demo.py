@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -13,7 +14,8 @@ from surrogym.demo.tasks import TASKS
 from surrogym_shared.kinds import Access
 
 if TYPE_CHECKING:
-    from surrogym.demo.run import Begin, S
+    from surrogym.demo.learning import SurrogateRun
+    from surrogym.demo.settings import DemoSettings
 
     Task = str
 else:
@@ -77,7 +79,13 @@ def command(
 
 
 def perform(
-    settings: S, begin: Begin[S], out: Path | None, json_file: Path | None, *, exit_with_parent: bool, quiet: bool
+    settings: DemoSettings,
+    begin: Callable[..., SurrogateRun],
+    out: Path | None,
+    json_file: Path | None,
+    *,
+    exit_with_parent: bool,
+    quiet: bool,
 ) -> None:
     """Run a demo, and show its metrics as a table, or write them to a file.
 
@@ -111,4 +119,4 @@ def perform(
             json_file.write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
         give(metrics, lambda: table(metrics, folder), as_json=as_json, quiet=quiet)
 
-    run_demo(settings, out, tell, begin, quiet=quiet)
+    run_demo(settings, begin, out, tell, quiet=quiet)
