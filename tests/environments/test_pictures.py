@@ -14,8 +14,8 @@ from gymnasium.wrappers import RecordVideo
 
 from support.exact_pendulum import ExactPendulum
 from surrogym_client.environments import RemoteEnv, RemoteVectorEnv
+from surrogym_client.environments.env import drawn
 from surrogym_client.environments.pictures import NotRenderable, Pictures, coordinates_from_observation
-from surrogym_client.environments.render_modes import drawn
 from surrogym_client.registration import SWING_UP
 from surrogym_sampler.original.classic import TASKS
 from surrogym_sampler.original.episodes import draw

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from surrogym.cli.errors import CommandError
+
 if TYPE_CHECKING:
     from collections.abc import Callable
 
@@ -46,8 +48,6 @@ class Beside:
     def check(self, settings: EvaluationSettings) -> None:
         """Raise ``CommandError`` if --compare or --reference is given together with --explore, which changes actions
         at random."""
-        from surrogym.cli.errors import CommandError
-
         if settings.explore and (self.compare or self.reference):
             option = "--compare" if self.compare else "--reference"
             raise CommandError(f"expected {option} without --explore, which changes actions; give one of the two")
@@ -92,7 +92,6 @@ def spec_of_reference(given: str) -> EnvironmentSpec | None:
 
 
 def _baseline(opener: Callable[[], Episode], compare: Compare) -> Predict:
-    from surrogym.cli.errors import CommandError
     from surrogym_trainer.evaluation.baselines import baseline
 
     episode = opener()
@@ -110,7 +109,6 @@ def reference_of(given: str, reading: PolicyReading) -> Acting:
     Raises:
         CommandError, OriginalError, UnusablePolicy: there is no controller of this name, or it can't be used.
     """
-    from surrogym.cli.errors import CommandError
     from surrogym_trainer.evaluation.baselines import load_reference
     from surrogym_trainer.policies.card import read_card
 

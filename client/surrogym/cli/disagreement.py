@@ -9,6 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from surrogym.cli.errors import CommandError, sentence
+from surrogym.cli.options import await_model, connect
+from surrogym_shared.terminal import say
+
 if TYPE_CHECKING:
     from surrogym.cli.learning import Learning, Steps
     from surrogym_client.transport.api import Api
@@ -68,8 +72,6 @@ class Differences:
             CommandError: ``--learn`` or ``--learn-all`` was given together with ``--perturb``, or with each other, or
                 ``--wait`` without either.
         """
-        from surrogym.cli.errors import CommandError
-
         if self.learn and self.learn_all:
             raise CommandError("expected --learn or --learn-all, got both; give one of the two")
         if self.wait and not self.learns:
@@ -122,10 +124,7 @@ class Differences:
             imagining: imagines episodes of the policy, to find effects of errors on its return.
             quiet: whether remarks are hidden.
         """
-        from surrogym.cli.errors import sentence
-        from surrogym.cli.options import connect
         from surrogym_client.errors import SurrogymClientError
-        from surrogym_shared.terminal import say
         from surrogym_trainer.evaluation.comparing import samples_of
 
         if surrogate is None or not (self.where or self.learns or left(promise, result)):
@@ -233,10 +232,8 @@ def _not_compared(first_seed: int, why: str) -> Differing:
 
 def _await_model(server: str | None, token: str | None, surrogate: str, seconds: float, *, quiet: bool) -> None:
     """Wait until the server has fitted a model to all samples. If that fails or takes too long, print the reason."""
-    from surrogym.cli.options import await_model
     from surrogym_client.errors import SurrogymClientError
     from surrogym_client.surrogates.waiting import DesignUnfinished, words_of_design
-    from surrogym_shared.terminal import say
 
     try:
         await_model(server, token, surrogate, seconds, lambda view, _: words_of_design(view), quiet=quiet)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 import typer
 
 from surrogym.cli.options import AsJson, Quiet, Server, Token, TokenFile, TrustPolicy, connect, token_from
+from surrogym_shared.terminal import give
 
 if TYPE_CHECKING:
     from surrogym_client.transport import Api
@@ -47,8 +48,6 @@ class Output:
 
     def give(self, result: dict[str, Any], words: Callable[[], str]) -> None:
         """Print the result of a command: ``result`` as JSON, or the text that ``words`` returns."""
-        from surrogym_shared.terminal import give
-
         give(result, words, as_json=self.as_json, quiet=self.quiet)
 
 

@@ -10,6 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from surrogym.cli.errors import CommandError
+from surrogym.cli.options import connect
+from surrogym_shared.terminal import say
+from surrogym_shared.words import counted
+
 if TYPE_CHECKING:
     from surrogym_client.transport.api import Api
     from surrogym_sampler.original.episode import Episode
@@ -54,7 +59,6 @@ class Learning:
         return opened
 
     def _require(self, own: EnvironmentSpec) -> None:
-        from surrogym.cli.errors import CommandError
         from surrogym_sampler.original.fitting import shape_in_words
 
         wanted = self.spec
@@ -76,9 +80,6 @@ def learning_of(option: str, surrogate: str | None, server: str | None, token: s
         CommandError: no surrogate is named, or ``--learn`` was given and the surrogate has no model to compare with.
         SurrogymClientError: the server does not answer, or has no such surrogate.
     """
-    from surrogym.cli.errors import CommandError
-    from surrogym.cli.options import connect
-
     if surrogate is None:
         raise CommandError(f"expected --surrogate with {option}, got none; no real step was taken")
     with connect(server, token) as api:
@@ -137,8 +138,6 @@ class Steps:
     def require_stored(self) -> None:
         """Raise ``CommandError`` if the server has not confirmed all steps. The message names the file with the steps,
         and the command that sends this file."""
-        from surrogym.cli.errors import CommandError
-
         if self.waiting:
             raise CommandError(self.in_words())
 
@@ -163,7 +162,6 @@ def kept(learning: Learning | None, policy: Path, result: Evaluation, *, quiet: 
 
     After an error or Ctrl-C, it prints where the steps are. Yields None if no surrogate learns from the steps.
     """
-    from surrogym_shared.terminal import say
     from surrogym_trainer.evaluation.reporting import write_steps
 
     if learning is None:
@@ -186,8 +184,6 @@ def kept(learning: Learning | None, policy: Path, result: Evaluation, *, quiet: 
 def _learnable(spec: EnvironmentSpec, result: Evaluation, *, quiet: bool) -> list[NewSample]:
     """Return the steps of an evaluation that a model can learn from. Print how many are left out because of numbers
     that are not finite or too large."""
-    from surrogym_shared.terminal import say
-    from surrogym_shared.words import counted
     from surrogym_trainer.evaluation.comparing import as_samples, steady, steps_of
     from surrogym_trainer.evaluation.reporting import as_logged, is_storable
 

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from surrogym.cli.errors import CommandError
+from surrogym_shared.terminal import say
+
 if TYPE_CHECKING:
     from collections.abc import Callable
 
@@ -48,7 +51,6 @@ def opener_of(
     """Return a function that opens an episode. An environment that only a policy's card names is opened only if its
     name runs no file of the user's, because the name of a module would run unknown code.
     """
-    from surrogym.cli.errors import CommandError
     from surrogym_sampler.original.episodes import open_episode
     from surrogym_sampler.original.loading import fits, is_known, is_own, make
 
@@ -69,7 +71,6 @@ def _limited(noted: EnvironmentSpec, name: str, *, quiet: bool) -> EnvironmentSp
     """Return the card's specification with a time limit no longer than the environment's own. A longer limit would cost
     real steps that the user did not request."""
     from surrogym_sampler.original.loading import own_time_limit
-    from surrogym_shared.terminal import say
 
     own = own_time_limit(name)
     if noted.time_limit is not None and noted.time_limit <= own:

@@ -13,6 +13,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from surrogym.cli.errors import CommandError
+from surrogym_shared.terminal import on_interrupt, progress, say
+
 if TYPE_CHECKING:
     from surrogym_client.transport.api import Api
     from surrogym_shared.spec import EnvironmentSpec
@@ -134,10 +137,8 @@ def token_from(context: typer.Context, token: str | None, file: Path | None) -> 
         CommandError: --token and --token-file are both on the command line.
         UnusableToken: the file does not contain a token.
     """
-    from surrogym.cli.errors import CommandError
     from surrogym_client.transport.connection import token_in
     from surrogym_shared.secret_files import open_to_others
-    from surrogym_shared.terminal import say
 
     quiet, typed_file = bool(context.params.get("quiet")), given_here(context, "token_file")
     if given_here(context, "token"):
@@ -174,8 +175,6 @@ def awaited_surrogate(api: Api, name: str, wait: float, *, quiet: bool) -> Surro
 def working(what: str, stays: str, *, quiet: bool) -> Iterator[Update]:
     """Context of a command's work, whose progress the terminal shows under the name ``what``. Yields the function that
     shows it. Ctrl-C prints ``stays``, which says what is kept."""
-    from surrogym_shared.terminal import on_interrupt, progress
-
     with on_interrupt(lambda: stays), progress(what, quiet=quiet) as update:
         yield update
 
@@ -265,7 +264,6 @@ def read_spec_file(path: Path) -> SpecContent:
     """
     from pydantic import ValidationError
 
-    from surrogym.cli.errors import CommandError
     from surrogym_shared.faults import first_fault
     from surrogym_shared.spec import EnvironmentSpec
 
@@ -307,8 +305,6 @@ def read_tolerances(given: list[str]) -> dict[str, float]:
     Raises:
         CommandError: a text does not have this form.
     """
-    from surrogym.cli.errors import CommandError
-
     tolerances: dict[str, float] = {}
     for text in given:
         name, _, number = text.partition("=")
@@ -325,7 +321,6 @@ def require_known(algorithm: str) -> str:
     Raises:
         CommandError: no policy search has this name.
     """
-    from surrogym.cli.errors import CommandError
     from surrogym_trainer.training.search import SEARCHES
 
     try:
@@ -344,7 +339,6 @@ def push_or_say(
     """
     from surrogym.cli.options import connect
     from surrogym_client.errors import SurrogymClientError
-    from surrogym_shared.terminal import say
     from surrogym_trainer.policies.pushing import push
 
     try:

@@ -7,6 +7,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout
 from typing import TYPE_CHECKING
 
+from surrogym.cli.errors import CommandError
+from surrogym_shared.terminal import say
+
 if TYPE_CHECKING:
     from surrogym_sampler.diagnosis.doctor import Finding
 
@@ -18,7 +21,6 @@ def prints_aside() -> Iterator[None]:
     Raises:
         CommandError: an environment called ``sys.exit``, such as while it was closed.
     """
-    from surrogym.cli.errors import CommandError
     from surrogym_sampler.original.errors import sentence
 
     with redirect_stdout(sys.stderr):
@@ -40,8 +42,6 @@ def unregistered(steps: Callable[[], int], what: str) -> Iterator[None]:
             how many steps the draft had taken.
         what: end of the printed sentence, such as "nothing was registered".
     """
-    from surrogym_shared.terminal import say
-
     try:
         yield
     except KeyboardInterrupt as interruption:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from surrogym.cli.errors import CommandError
 from surrogym_shared.kinds import Variant
 
 if TYPE_CHECKING:
@@ -64,8 +65,6 @@ class SearchOptions:
 
     def hyperparameters(self) -> dict[str, Any]:
         """Return the hyperparameters of ``--set`` by name. Values are parsed as JSON, or are text if that fails."""
-        from surrogym.cli.errors import CommandError
-
         found: dict[str, Any] = {}
         for pair in self.chosen or []:
             name, equals, value = pair.partition("=")
@@ -138,7 +137,6 @@ class SessionOptions:
             CommandError: an option of particles was given with another variant than ``probabilistic``, or a set point
                 is not COORDINATE=VALUE.
         """
-        from surrogym.cli.errors import CommandError
         from surrogym_shared.wire import OF_PARTICLES
 
         given = {name: value for name, value in vars(self).items() if value is not None and value is not False}
@@ -154,8 +152,6 @@ class SessionOptions:
 
 def _set_point(pair: str) -> tuple[str, float]:
     """Return the coordinate and the value of COORDINATE=VALUE. Raises ``CommandError`` for another text."""
-    from surrogym.cli.errors import CommandError
-
     name, _, value = pair.rpartition("=")
     try:
         return name, float(value)

@@ -9,12 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surrogym_client.environments.lanes import LaneReset, Lanes, LaneStep, session_request
-from surrogym_client.environments.render_modes import RENDER_MODES, drawn
+from surrogym_client.environments.render_modes import RENDER_MODES, render_modes_of
 from surrogym_client.environments.spaces import space
 from surrogym_shared.port import SurrogatePort
+from surrogym_shared.spec import EnvironmentSpec
 
 if TYPE_CHECKING:
-    from surrogym_client.environments.pictures import Picture
+    from surrogym_client.environments.pictures import Picture, Pictures
 
 LOST = "surrogym_session_lost"
 
@@ -96,6 +97,18 @@ class RemoteEnv(gymnasium.Env[Observation, Any]):
         if self._pictures is not None:
             self._pictures.close()
         self._lanes.close()
+
+
+def drawn(spec: EnvironmentSpec, original: str | None, mode: str | None) -> tuple[Pictures | None, dict[str, Any]]:
+    """Return what draws observations of a surrogate in a render mode (None: nothing draws), and Gymnasium's
+    ``metadata``: the render modes that work here, and the pictures' frames per second."""
+    metadata: dict[str, Any] = {"render_modes": render_modes_of(spec, original)}
+    if mode is None:
+        return None, metadata
+    from surrogym_client.environments.pictures import pictures_for
+
+    pictures = pictures_for(mode, spec, original)
+    return pictures, metadata | {"render_fps": pictures.frames_per_second}
 
 
 def start_info(start: LaneReset, lane: int) -> dict[str, Any]:

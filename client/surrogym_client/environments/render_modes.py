@@ -7,16 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
 from surrogym_shared.spec import EnvironmentSpec, Part
-
-if TYPE_CHECKING:
-    from surrogym_client.environments.pictures import Pictures
 
 Array = NDArray[np.float64]
 Read = Callable[[Array], float]  # computes a coordinate from an observation (D,)
@@ -30,19 +26,8 @@ DRAWN_WITH: dict[str, tuple[str, str] | None] = {
 }
 
 
-def drawn(spec: EnvironmentSpec, original: str | None, mode: str | None) -> tuple[Pictures | None, dict[str, Any]]:
-    """Return what draws observations of a surrogate in a render mode (None: nothing draws), and Gymnasium's
-    ``metadata``: the render modes that work here, and the pictures' frames per second."""
-    metadata: dict[str, Any] = {"render_modes": _render_modes(spec, original)}
-    if mode is None:
-        return None, metadata
-    from surrogym_client.environments.pictures import pictures_for
-
-    pictures = pictures_for(mode, spec, original)
-    return pictures, metadata | {"render_fps": pictures.frames_per_second}
-
-
-def _render_modes(spec: EnvironmentSpec, original: str | None) -> list[str]:
+def render_modes_of(spec: EnvironmentSpec, original: str | None) -> list[str]:
+    """Return the render modes of a surrogate that work here."""
     shown = all(read_of(spec, name) is not None for name in spec.coordinate_names) and can_be_drawn(spec, original)
     return list(RENDER_MODES) if shown else []
 

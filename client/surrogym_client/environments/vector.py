@@ -10,9 +10,8 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from surrogym_client.environments.env import LOST, Observation
+from surrogym_client.environments.env import LOST, Observation, drawn
 from surrogym_client.environments.lanes import Lanes, LaneStep, session_request
-from surrogym_client.environments.render_modes import drawn
 from surrogym_client.environments.spaces import space
 from surrogym_shared import wire
 from surrogym_shared.port import Bools, SurrogatePort

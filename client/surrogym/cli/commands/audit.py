@@ -8,8 +8,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from surrogym.cli.errors import CommandError
 from surrogym.cli.groups import Output, PolicyReading, Service
+from surrogym.cli.opening import opener_for_policy
 from surrogym.cli.options import FallbackProgram, SpecFile, push_or_say, read_spec
+from surrogym_shared.environments import is_elsewhere
+from surrogym_shared.terminal import progress, say
+from surrogym_shared.words import counted
 
 if TYPE_CHECKING:
     from surrogym_sampler.original.episode import Episode
@@ -67,12 +72,8 @@ def command(
 
     Example: surrogym audit policy.zip --env rig:Rig --episodes 3
     """
-    from surrogym.cli.errors import CommandError
-    from surrogym.cli.opening import opener_for_policy
     from surrogym_client.surrogates.waiting import words_of_audit
     from surrogym_client.transport import HttpSurrogate
-    from surrogym_shared.environments import is_elsewhere
-    from surrogym_shared.terminal import progress
     from surrogym_trainer.evaluation.evaluator import EvaluationSettings
     from surrogym_trainer.policies.card import read_card, write_card
     from surrogym_trainer.policies.integrals import with_integrals
@@ -128,11 +129,8 @@ def by_episodes(
 ) -> Handover:
     """Audit a policy by whole episodes in an environment. The largest number of real steps is printed before the first
     episode. The steps taken are reported to the server, even after an error."""
-    from surrogym.cli.errors import CommandError
     from surrogym_sampler.original.errors import EvaluationFailed
     from surrogym_sampler.original.protocol import LONGEST_EPISODE
-    from surrogym_shared.terminal import say
-    from surrogym_shared.words import counted
     from surrogym_trainer.evaluation.evaluator import EvaluationInterrupted, evaluate
     from surrogym_trainer.policies.integrals import IntegralPort
     from surrogym_trainer.training.handover import judge_episodes
@@ -171,7 +169,6 @@ def _not_made(view: SurrogateView, reason: str) -> str:
 def _require_fit(predict: Predict, spec: EnvironmentSpec, misfit: str) -> None:
     """Raise ``CommandError`` if a policy network has other observations or actions than the surrogate. The message
     begins with ``misfit``."""
-    from surrogym.cli.errors import CommandError
     from surrogym_shared.network import Network
 
     if isinstance(predict, Network):

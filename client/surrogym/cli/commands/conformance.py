@@ -9,6 +9,8 @@ import typer
 
 from surrogym.cli.groups import Output, Service
 from surrogym.cli.options import StepLimit
+from surrogym_shared.terminal import on_interrupt
+from surrogym_shared.words import visible
 
 if TYPE_CHECKING:
     from surrogym_sampler.diagnosis.outcomes import Outcome
@@ -38,8 +40,6 @@ def command(
 
     Example: surrogym conformance --exec "./plant --port 7"
     """
-    from surrogym_shared.terminal import on_interrupt
-
     if program is not None:
         from surrogym_sampler.diagnosis import executables
 
@@ -54,8 +54,6 @@ def command(
 
 def _show(checked: Iterable[Outcome], output: Output) -> None:
     """Print the outcome of each check as soon as it is known, then the number of passed checks."""
-    from surrogym_shared.words import visible
-
     outcomes = []
     for outcome in checked:
         outcomes.append(outcome)

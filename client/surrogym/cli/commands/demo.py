@@ -9,9 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from surrogym.cli.errors import CommandError
 from surrogym.cli.options import ExitWithParent, Quiet, require_known
 from surrogym.demo.tasks import TASKS
+from surrogym_client.runtime.lifetime import exit_with_parent as watch_parent
 from surrogym_shared.kinds import Access
+from surrogym_shared.terminal import give
 
 if TYPE_CHECKING:
     from surrogym.demo.learning import SurrogateRun
@@ -100,11 +103,8 @@ def perform(
     Raises:
         CommandError: the folder of ``json_file`` does not exist; nothing was run.
     """
-    from surrogym.cli.errors import CommandError
     from surrogym.demo.report import table
     from surrogym.demo.run import run_demo
-    from surrogym_client.runtime.lifetime import exit_with_parent as watch_parent
-    from surrogym_shared.terminal import give
 
     if exit_with_parent:
         watch_parent()

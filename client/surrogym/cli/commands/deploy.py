@@ -13,8 +13,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from surrogym.cli.errors import CommandError
 from surrogym.cli.groups import Output, PolicyReading, Service
-from surrogym.cli.options import NAMES, SpecFile
+from surrogym.cli.opening import opener_for_policy
+from surrogym.cli.options import NAMES, SpecFile, read_spec
+from surrogym_client.runtime.lifetime import terminations_as_interrupts
+from surrogym_shared.terminal import progress, say
+from surrogym_shared.words import counted
 
 if TYPE_CHECKING:
     import typer
@@ -102,8 +107,6 @@ class Checking:
             CannotCompile: there is no C compiler.
             ModuleNotFoundError: a package that runs the target is missing.
         """
-        from surrogym.cli.errors import CommandError
-        from surrogym_client.runtime.lifetime import terminations_as_interrupts
         from surrogym_trainer.deployment.running import Comparison
 
         if not self.check:
@@ -134,7 +137,6 @@ class Checking:
         Raises:
             PolicyMisfit: the policy was trained for another environment.
         """
-        from surrogym.cli.opening import opener_for_policy
         from surrogym_client.transport.http_surrogate import HttpSurrogate
         from surrogym_sampler.original.fitting import check_policy
         from surrogym_trainer.deployment.virtual import VirtualEpisode
@@ -155,7 +157,6 @@ class Checking:
 
     def run(self, comparison: Comparison, output: Output) -> Checked:
         """Run the episodes of the check, and return their comparison."""
-        from surrogym_shared.terminal import progress, say
         from surrogym_trainer.evaluation.evaluator import FIRST_SEED
 
         seeds = range(FIRST_SEED, FIRST_SEED + self.episodes)
@@ -247,8 +248,6 @@ def command(
     Example: surrogym deploy pendulum --target fmu --period 0.05 --out twin
     """
     from surrogym.cli.commands.deploy import in_words, is_surrogate, write_twin
-    from surrogym.cli.errors import CommandError
-    from surrogym.cli.options import read_spec
     from surrogym_trainer.deployment.reading import controller_of
     from surrogym_trainer.deployment.targets import deploy, target_of
     from surrogym_trainer.policies.controller_check import write_check
@@ -304,7 +303,6 @@ def _local(
     from tempfile import TemporaryDirectory
 
     from surrogym.cli.commands.policy import parsed, stored_card
-    from surrogym.cli.errors import CommandError
     from surrogym_trainer.policies.card import write_card
     from surrogym_trainer.policies.files import card_of_policy
 
@@ -345,8 +343,6 @@ def _warning(policy: str, card: PolicyCard) -> str:
 
 def _range(text: str) -> tuple[str, tuple[float, float]]:
     """Parse a range of a sensor given as ``name=low:high``. Raises ``CommandError`` for another form."""
-    from surrogym.cli.errors import CommandError
-
     name, _, ends = text.partition("=")
     low, _, high = ends.partition(":")
     try:
@@ -356,8 +352,6 @@ def _range(text: str) -> tuple[str, tuple[float, float]]:
 
 
 def _in_words(checked: Checked, environment: str) -> list[str]:
-    from surrogym_shared.words import counted
-
     lines = [
         f"{counted(len(checked.returns), 'episode')} in {environment}, {checked.steps} steps: mean return "
         f"{checked.returns.mean():.6g}, of the policy {checked.policy_returns.mean():.6g}",
@@ -396,7 +390,6 @@ def write_twin(
     Raises:
         CommandError: the extra ``server`` is missing, the surrogate can't be written, or the folder has other files.
     """
-    from surrogym.cli.errors import CommandError
     from surrogym_client.surrogates.transfer import export_surrogate
 
     (entry,) = entry_points(group=ENTRY_POINTS, name="fmu")

@@ -7,6 +7,8 @@ from typing import Annotated
 import typer
 
 from surrogym.cli.options import Quiet
+from surrogym.cli.printing import prints_aside, unregistered
+from surrogym_shared.terminal import say
 
 
 def command(
@@ -31,9 +33,6 @@ def command(
 
     Example: surrogym describe Swimmer-v5 > env.json
     """
-    from surrogym.cli.printing import prints_aside, unregistered
-    from surrogym_shared.terminal import say
-
     del as_json  # the output is JSON with and without --json
     with unregistered(lambda: 0, "nothing was described or registered"), prints_aside():
         from surrogym_sampler.original.describing import describe  # this import may take seconds

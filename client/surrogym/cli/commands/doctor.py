@@ -15,6 +15,8 @@ from surrogym.cli.options import (
     StepLimit,
     read_spec,
 )
+from surrogym.cli.printing import found_aside, prints_aside
+from surrogym_shared.terminal import give
 
 if TYPE_CHECKING:
     from surrogym_sampler.diagnosis.doctor import Finding
@@ -56,7 +58,6 @@ def command(
 
     from surrogym_sampler.diagnosis.doctor import installation
     from surrogym_sampler.diagnosis.doctor import service as findings_of
-    from surrogym_shared.terminal import give
 
     def findings() -> Iterator[Finding]:
         given = read_spec(spec)
@@ -81,7 +82,6 @@ def command(
 
 def _of_environment(env: str, given: EnvironmentSpec | None, step_limit: float, history: int) -> Iterator[Finding]:
     """Yield the findings of the checks of an environment. Output of the environment goes to standard error."""
-    from surrogym.cli.printing import found_aside, prints_aside
     from surrogym_sampler.diagnosis.doctor import environment
     from surrogym_sampler.original.loading import isolated
 

@@ -10,11 +10,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from surrogym.cli.beside import Beside
+from surrogym.cli.columns import columns
 from surrogym.cli.disagreement import Differences, Imagining
+from surrogym.cli.errors import CommandError, invalid, sentence
 from surrogym.cli.groups import Output, PolicyReading, Service
 from surrogym.cli.learning import kept
 from surrogym.cli.opening import opener_for_policy
-from surrogym.cli.options import NAMES, FallbackProgram, SpecFile, push_or_say, read_spec
+from surrogym.cli.options import NAMES, FallbackProgram, SpecFile, connect, push_or_say, read_spec
+from surrogym_client.runtime.lifetime import terminations_as_interrupts
+from surrogym_shared.environments import is_elsewhere
+from surrogym_shared.terminal import give, progress, say
+from surrogym_shared.words import counted
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -89,7 +95,6 @@ class Episodes:
         Raises:
             CommandError: two options contradict each other.
         """
-        from surrogym.cli.errors import CommandError
         from surrogym_trainer.evaluation.evaluator import EvaluationSettings
 
         if self.wide and self.start_scale != 1:
@@ -143,7 +148,6 @@ def command(
 
     Example: surrogym evaluate policy.zip --env Pendulum-v1 --episodes 10 --learn 16
     """
-    from surrogym_shared.terminal import give
     from surrogym_trainer.evaluation.evaluator import for_set_points
     from surrogym_trainer.evaluation.reporting import is_promised
     from surrogym_trainer.policies.files import card_of_policy
@@ -222,8 +226,6 @@ def _named(env: str | None, card: PolicyCard) -> str:
 def _elsewhere(env: str | None, card: PolicyCard, promise: Promise | None) -> list[str]:
     """Return a remark if the episodes ran in another environment than the one that the policy was trained for, because
     they can't test the promised return then. Empty if it is the same environment, or if one of the two is unknown."""
-    from surrogym_shared.environments import is_elsewhere
-
     own = card.spec.environment if card.spec else ""
     return [_apart(env, own, promise)] if env is not None and is_elsewhere(env, own) else []
 
@@ -234,7 +236,6 @@ def _elsewhere_by_server(
     """Return the remark of :func:`_elsewhere` for a specification that names no environment, such as that of a log.
     The server then takes the environment of the surrogate's first evaluation for its own. The remark is empty if that
     is ``env``, or if the server can't be asked."""
-    from surrogym.cli.options import connect
     from surrogym_client.errors import SurrogymClientError
 
     try:
@@ -335,8 +336,6 @@ def _reports(
         settings: settings of the evaluation.
         policy: file of the policy.
     """
-    from surrogym_shared.words import counted
-
     reports: list[tuple[Controller, Evaluation]] = []
     for controller, load in controllers.items():
         actions = {"policy": "", "reference": "the reference controller"}.get(controller, f"{controller} actions")
@@ -365,8 +364,6 @@ def _keep(
 
     from pydantic import ValidationError
 
-    from surrogym.cli.errors import invalid
-    from surrogym_shared.terminal import say
     from surrogym_trainer.evaluation.reporting import as_reported, paired_start
     from surrogym_trainer.policies.pushing import keep
 
@@ -394,8 +391,6 @@ def _keep(
 def _announce(spec: EnvironmentSpec, *, episodes: int, environment: str, quiet: bool) -> None:
     """Print how many real episodes the evaluation takes in all, and at most how many real steps."""
     from surrogym_sampler.original.protocol import LONGEST_EPISODE
-    from surrogym_shared.terminal import say
-    from surrogym_shared.words import counted
 
     most, count = episodes * (spec.time_limit or LONGEST_EPISODE), counted(episodes, "real episode")
     say(f"the evaluation takes {count} in {environment}: at most {most} real steps", quiet=quiet)
@@ -413,9 +408,7 @@ def _run(
     quiet: bool,
 ) -> Evaluation:
     """Run the episodes of one controller. If they fail or are interrupted, report the real steps taken so far."""
-    from surrogym_client.runtime.lifetime import terminations_as_interrupts
     from surrogym_sampler.original.errors import EvaluationFailed
-    from surrogym_shared.terminal import progress, say
     from surrogym_trainer.evaluation.evaluator import EvaluationInterrupted, evaluate
 
     try:
@@ -437,8 +430,6 @@ def _run(
 
 
 def _telling(update: Update, episodes: int) -> Progress:
-    from surrogym_shared.words import counted
-
     return lambda share, terminated: update(share, f"{counted(episodes, 'real episode')}, {terminated} terminated")
 
 
@@ -448,7 +439,6 @@ def ledger_of(surrogate: str | None, server: str | None, card: PolicyCard, polic
     An address that only the policy's card names is never contacted, unless it is this machine's default address.
     """
     from surrogym_client.transport.connection import DEFAULT_URL
-    from surrogym_shared.terminal import say
     from surrogym_trainer.policies.card import card_path
 
     if surrogate or server or card.server is None or str(card.server).rstrip("/") == DEFAULT_URL:
@@ -472,10 +462,7 @@ def enter_steps(
     quiet: bool,
 ) -> None:
     """Report real steps to the server, as steps of a surrogate. If the server does not answer, only print a remark."""
-    from surrogym.cli.errors import sentence
-    from surrogym.cli.options import connect
     from surrogym_client.errors import SurrogymClientError
-    from surrogym_shared.terminal import say
 
     if surrogate is None or steps == 0:
         return
@@ -493,9 +480,7 @@ def _kept(promise: Promise | None, result: Evaluation) -> bool | None:
 
 
 def _words(reports: Sequence[tuple[Controller, Evaluation]], promise: Promise | None) -> str:
-    from surrogym.cli.columns import columns
     from surrogym_shared.wire import FEWEST_TO_JUDGE
-    from surrogym_shared.words import counted
 
     names = ("mean", "iqm", "min", "max", "std", "mean_length", "success_rate", "episodes", "steps")
     several = len(reports) > 1
@@ -529,7 +514,6 @@ def film(
     must not spoil an evaluation.
     """
     from surrogym_client.environments.pictures import NotRenderable
-    from surrogym_shared.terminal import progress, say
     from surrogym_trainer.evaluation.reporting import words_of
     from surrogym_trainer.evaluation.videos import FORMS, record
 

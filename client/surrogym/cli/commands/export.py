@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from surrogym.cli.errors import CommandError
 from surrogym.cli.groups import Output, Service
 from surrogym.cli.options import Surrogate, connect, working
 
@@ -50,8 +51,6 @@ def command(
 
 
 def _content(api: Api, surrogate: str, out: Path) -> bytes:
-    from surrogym.cli.errors import CommandError
-
     match out.suffix.lower():
         case ".surrogate":
             from surrogym_client.surrogates.transfer import export_surrogate

@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from surrogym.cli.errors import CommandError
 from surrogym.cli.groups import Output, Service
 from surrogym.cli.options import SpecFile, Wait, await_model, connect, given_here, read_spec, typed, working
+from surrogym_shared.words import counted, has
 
 if TYPE_CHECKING:
     from surrogym_sampler.logs import Imported, ReadLog
@@ -99,7 +101,6 @@ def command(
 
     Example: surrogym import reactor.csv --register reactor --wait 120
     """
-    from surrogym.cli.errors import CommandError
     from surrogym_sampler.logs.reading import format_of
 
     if format_of(file) == "surrogate":
@@ -257,7 +258,6 @@ def _covered(log: ReadLog) -> dict[str, float]:
 
 
 def _words(file: Path, imported: Imported, view: SurrogateView | None) -> list[str]:
-    from surrogym_shared.words import counted, has
     from surrogym_trainer.coverage import coverage_of
 
     log = imported.log
@@ -289,8 +289,6 @@ def _columns(log: ReadLog) -> list[str]:
 
 
 def _rejected(imported: Imported) -> list[str]:
-    from surrogym_shared.words import counted
-
     rejected = imported.log.rejected
     if not rejected:
         return []

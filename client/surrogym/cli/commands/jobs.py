@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from surrogym.cli.columns import columns
+from surrogym.cli.errors import CommandError
 from surrogym.cli.groups import Output, Service
 from surrogym.cli.options import Surrogate
 
@@ -33,8 +35,6 @@ def command(
 
     Example: surrogym jobs pendulum
     """
-    from surrogym.cli.errors import CommandError
-
     if cancel and job is None:
         raise CommandError(f"--cancel: expected the number of a job, as surrogym jobs {surrogate} lists them, got none")
     with service.connect(context) as api:
@@ -49,8 +49,6 @@ def command(
 
 
 def _table(surrogate: str, found: JobList) -> str:
-    from surrogym.cli.columns import columns
-
     names = ", ".join(worker.name for worker in found.workers)
     workers = f"workers: {names}" if names else f"no worker is connected; to start one: surrogym work {surrogate}"
     if not found.jobs:
@@ -78,8 +76,6 @@ def _share(job: JobView) -> str:
 
 
 def _words(job: JobDetail) -> str:
-    from surrogym.cli.columns import columns
-
     rows = [[point.steps, "-" if point.imagined_return is None else point.imagined_return] for point in job.curve]
     curve = "" if not rows else "\n" + columns([["virtual steps", "imagined return"], *rows[-10:]])
     return f"{columns([HEADING, _row(job)])}{curve}"

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from surrogym.cli.columns import columns
 from surrogym.cli.groups import Output, Service
 from surrogym.cli.options import names_of_surrogates
 
@@ -39,8 +40,6 @@ def command(
 
 
 def _table(rows: Sequence[tuple[str, PolicyView]]) -> str:
-    from surrogym.cli.columns import columns
-
     if not rows:
         return "no policies yet; next: surrogym train SURROGATE, or surrogym policy push POLICY"
     return columns([HEADING, *(_row(name, policy) for name, policy in rows)])

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from surrogym.cli.columns import columns
 from surrogym.cli.groups import Output, Service, add
 
 if TYPE_CHECKING:
@@ -224,7 +225,6 @@ def _from_zip(content: bytes, form: str, algorithm: str) -> bytes:
 
 
 def _words(name: str, policy: PolicyDetail) -> str:
-    from surrogym.cli.columns import columns
     from surrogym_trainer.policies.card import set_points_in, words_of_set_points
 
     aliases = f", {', '.join(policy.aliases)}" if policy.aliases else ""

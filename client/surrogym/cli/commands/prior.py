@@ -9,8 +9,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from surrogym.cli.errors import CommandError
 from surrogym.cli.groups import Output, Service
 from surrogym.cli.options import NAMES, Surrogate
+from surrogym.cli.printing import prints_aside
+from surrogym_shared.terminal import on_interrupt, progress
 
 if TYPE_CHECKING:
     from surrogym_client.transport.api import Api
@@ -73,10 +76,7 @@ def command(
 
     Example: surrogym prior arm surrogate:arm-of-last-year
     """
-    from surrogym.cli.errors import CommandError
-    from surrogym.cli.printing import prints_aside
     from surrogym_client.transport.priors import PriorCalls
-    from surrogym_shared.terminal import on_interrupt, progress
 
     if drop == (simulator is not None):
         raise CommandError("expected a simulator or --drop, got both" if drop else "expected a simulator, got none")
@@ -122,7 +122,6 @@ class _Target:
     def follow(self, prior: ServerPrior, update: Update) -> tuple[PriorView, SurrogateView]:
         """Set the prior once the initial queries are answered, and again whenever calibration changes it, until the
         design ends. Returns the prior and the surrogate."""
-        from surrogym.cli.errors import CommandError
         from surrogym_client.surrogates.waiting import share_of_design, words_of_design
 
         name, used, fitted = self.view.name, 0, self.view.round
@@ -165,7 +164,6 @@ class _Target:
 
 
 def _opened(api: Api, view: SurrogateView, simulator: str, parameters: list[str], steps: int | None) -> ServerPrior:
-    from surrogym.cli.errors import CommandError
     from surrogym_sampler.priors.on_server import ServerPrior
 
     try:
@@ -183,7 +181,6 @@ def _is_model(source: str) -> bool:
 def _file_of(api: Api, source: str) -> bytes | None:
     """Return the content of another surrogate's file, from the server or from disk; None if the source is a
     simulator."""
-    from surrogym.cli.errors import CommandError
     from surrogym.files import SUFFIX, existing
     from surrogym_client.surrogates.transfer import export_surrogate
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from surrogym.cli.errors import CommandError, invalid
 from surrogym.cli.groups import Output, Service
 from surrogym.cli.options import (
     NAMES,
@@ -21,8 +22,11 @@ from surrogym.cli.options import (
     read_spec_file,
     read_tolerances,
 )
+from surrogym.cli.printing import prints_aside, unregistered
+from surrogym_shared.environments import is_name
 from surrogym_shared.kinds import Access
 from surrogym_shared.presets import PresetName
+from surrogym_shared.terminal import say
 
 if TYPE_CHECKING:
     from surrogym_client.transport.api import Api
@@ -131,8 +135,6 @@ def command(
 
     Example: surrogym register Pendulum-v1 --name pendulum --budget 30
     """
-    from surrogym.cli.printing import prints_aside, unregistered
-
     environment, name, spec = _sorted_out(environment, file, env, name, spec)
     read = None if spec is None else read_spec_file(spec)
     given, steps = (None, 0) if read is None else (read.spec, read.steps)
@@ -167,8 +169,6 @@ def _sorted_out(
 
     The first argument is the environment. With ``--env`` or a file as the second argument, it is the surrogate's name.
     """
-    from surrogym.cli.errors import CommandError
-
     if file is not None:
         if spec is not None:
             raise CommandError(
@@ -186,7 +186,6 @@ def _sorted_out(
 def _lacks_specification(environment: str) -> bool:
     """Whether an environment has no built-in specification, so that one has to be drafted. Raises an error if the
     environment can't be opened."""
-    from surrogym.cli.printing import prints_aside
     from surrogym_sampler.original.adapters import open_simulator
     from surrogym_sampler.original.loading import has_specification
 
@@ -209,7 +208,6 @@ def _require_free(api: Api, name: str) -> None:
     Raises:
         CommandError: a surrogate has this name.
     """
-    from surrogym.cli.errors import CommandError
     from surrogym_client.errors import UnknownSurrogate
 
     with suppress(UnknownSurrogate):
@@ -222,9 +220,7 @@ def _require_free(api: Api, name: str) -> None:
 
 def _described(environment: str, *, quiet: bool) -> tuple[EnvironmentSpec, int]:
     """Draft an environment's specification by real steps. Return it with the number of these steps."""
-    from surrogym.cli.printing import prints_aside
     from surrogym_sampler.original.describing import describe
-    from surrogym_shared.terminal import say
 
     with prints_aside():
         description = describe(environment)
@@ -240,7 +236,6 @@ def default_name(environment: str) -> str:
 
 
 def _specification(environment: str | None, spec: EnvironmentSpec | None, **choices: object) -> EnvironmentSpec:
-    from surrogym.cli.errors import CommandError, invalid
     from surrogym_sampler.original.loading import make, with_choices
 
     given = {key: value for key, value in choices.items() if value is not None}
@@ -263,7 +258,6 @@ def _close(original: Environment, name: str) -> None:
     """Close an environment that was opened for its specification. An error of its ``close`` is only printed, because
     the specification is valid nevertheless."""
     from surrogym_sampler.original.errors import sentence
-    from surrogym_shared.terminal import say
 
     try:
         original.close()
@@ -275,7 +269,6 @@ def _opened_by(environment: str, spec: EnvironmentSpec) -> EnvironmentSpec:
     """Return the specification with the environment's name in place of free text about it, so that commands that are
     suggested later can contain the name."""
     from surrogym_sampler.original.executables import is_executable
-    from surrogym_shared.environments import is_name
 
     # the command line of a program is not sent to the server
     if is_name(spec.environment) or is_executable(environment):
@@ -284,8 +277,6 @@ def _opened_by(environment: str, spec: EnvironmentSpec) -> EnvironmentSpec:
 
 
 def _with_tolerances(spec: EnvironmentSpec, tolerances: dict[str, float]) -> EnvironmentSpec:
-    from surrogym.cli.errors import CommandError, invalid
-
     try:
         return type(spec).model_validate(spec.model_dump() | {"tolerances": spec.tolerances | tolerances})
     except ValueError as error:

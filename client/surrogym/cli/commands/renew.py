@@ -12,8 +12,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from surrogym.cli.errors import CommandError
 from surrogym.cli.groups import Output, Service
+from surrogym.cli.opening import opener_for_policy
 from surrogym.cli.options import NAMES, FallbackProgram, Surrogate
+from surrogym_client.runtime.lifetime import terminations_as_interrupts
+from surrogym_shared.terminal import on_interrupt, progress, say
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -77,11 +81,8 @@ def command(
     Example: surrogym renew arm --policy arm@production --env arm:Real
     """
     from surrogym.cli.commands.sample import environment_of
-    from surrogym.cli.errors import CommandError
-    from surrogym_client.runtime.lifetime import terminations_as_interrupts
     from surrogym_sampler.original.loading import for_queries
     from surrogym_sampler.queries.query_limits import check_environment
-    from surrogym_shared.terminal import on_interrupt, progress, say
 
     name, _, alias = policy.rpartition("@")
     if name not in ("", surrogate):
@@ -130,7 +131,6 @@ def command(
 def _require_first(api: Api, surrogate: str, alias: str) -> None:
     """Raise ``CommandError`` if a surrogate is a renewal of another one whose alias leads to a renewal, because that
     alias, which controllers ask for, would stay where it is."""
-    from surrogym.cli.errors import CommandError
     from surrogym_client.errors import UnknownPolicy, UnknownSurrogate
 
     first, _, number = surrogate.rpartition("-")
@@ -169,8 +169,6 @@ def chain(api: Api, surrogate: str, alias: str) -> tuple[SurrogateView, str]:
 
 def _budget(view: SurrogateView) -> int:
     """Return a quarter of the real steps of a design. Raises ``CommandError`` if it has taken none."""
-    from surrogym.cli.errors import CommandError
-
     if not view.ledger.total:
         raise CommandError(f"{view.name!r} has learned from a log alone: expected --budget with a number of real steps")
     return max(FEWEST, view.ledger.total // SHARE)
@@ -178,8 +176,6 @@ def _budget(view: SurrogateView) -> int:
 
 def _require_environment(earlier: SurrogateView, env: str) -> None:
     """Raise ``CommandError`` if an earlier run has created the new surrogate for another environment."""
-    from surrogym.cli.errors import CommandError
-
     if earlier.spec.environment != env:
         raise CommandError(
             f"expected {earlier.spec.environment!r}, with which an earlier run began {earlier.name!r}, got {env!r}: "
@@ -370,8 +366,6 @@ class _Renewal:
 
     def _require_alias_at(self, version: int) -> None:
         """Raise ``CommandError`` if the alias does not lead to ``version``, because somebody else has moved it."""
-        from surrogym.cli.errors import CommandError
-
         if (now := self._version_of_alias()) != version:
             got = "no such alias" if now is None else f"version {now}"
             raise CommandError(
@@ -382,7 +376,6 @@ class _Renewal:
     def _episodes(self, path: Path, env: str, episodes: int, fallback: str | None, *, quiet: bool) -> Handover:
         """Run real episodes with the new policy, and judge its promise by them."""
         from surrogym.cli.commands.audit import by_episodes
-        from surrogym.cli.opening import opener_for_policy
         from surrogym_client.transport import HttpSurrogate
         from surrogym_trainer.evaluation.evaluator import EvaluationSettings
         from surrogym_trainer.policies.card import read_card

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from surrogym.cli.errors import CommandError
 from surrogym.cli.groups import Output, Service
 from surrogym.cli.options import (
     NAMES,
@@ -26,6 +27,11 @@ from surrogym.cli.options import (
     read_spec,
 )
 from surrogym.cli.sampling_on_ray import RayOptions
+from surrogym_client.runtime.lifetime import exit_with_parent as watch_parent
+from surrogym_client.runtime.lifetime import terminations, terminations_as_interrupts
+from surrogym_shared.environments import is_name
+from surrogym_shared.terminal import on_interrupt, progress, say
+from surrogym_shared.words import counted
 
 if TYPE_CHECKING:
     from surrogym_client.transport.api import Api
@@ -97,8 +103,6 @@ class CautionOptions:
 
     def require_fit(self, cluster: RayOptions, output: Output) -> None:
         """Raise ``CommandError`` if ``--approve`` is given, but the command can't ask a person on a terminal."""
-        from surrogym.cli.errors import CommandError
-
         if self.approve and (cluster.on_ray is not None or output.quiet or not sys.stdin.isatty()):
             raise CommandError(
                 "--approve asks a person before each query: expected a terminal, without --quiet and --on-ray"
@@ -138,7 +142,6 @@ def command(
 
     Example: surrogym sample cart --env cart:Cart --on-ray 32 --ray-resources CPU=2 --runtime-env env.yaml
     """
-    from surrogym_client.runtime.lifetime import exit_with_parent as watch_parent
     from surrogym_sampler.queries.settings import SamplerPlan, SamplerSettings, worker_name
     from surrogym_sampler.queries.snapshots import Bounds
 
@@ -192,7 +195,6 @@ def approved(spec: EnvironmentSpec, query: Query) -> bool:
         KeyboardInterrupt: the person pressed Ctrl-C, or ended the input.
     """
     from surrogym_sampler.queries.words import words_of_query
-    from surrogym_shared.terminal import say
 
     for line in words_of_query(spec, query):
         say(line)
@@ -205,11 +207,9 @@ def approved(spec: EnvironmentSpec, query: Query) -> bool:
 def _sample_here(
     api: Api, plan: SamplerPlan, output: Output, ask: Callable[[EnvironmentSpec, Query], bool] | None = None
 ) -> None:
-    from surrogym_client.runtime.lifetime import terminations
     from surrogym_sampler.original.loading import for_queries
     from surrogym_sampler.queries.words import Line, line_of
     from surrogym_sampler.queries.worker import Sampler
-    from surrogym_shared.terminal import on_interrupt, say
 
     with (
         closing(for_queries(plan.environment, plan.step_limit, plan.spec, plan.fallback)) as environment,
@@ -244,7 +244,6 @@ def _warn_of_kill(name: str, spec: EnvironmentSpec, output: Output) -> None:
     program itself can keep them. Other environments run in a process that survives the sampler until the machine rests.
     """
     from surrogym_sampler.original.executables import is_executable
-    from surrogym_shared.terminal import say
 
     if spec.limits is not None and is_executable(name):
         say(UNWATCHED, quiet=output.quiet)
@@ -252,8 +251,6 @@ def _warn_of_kill(name: str, spec: EnvironmentSpec, output: Output) -> None:
 
 def _require_shared(asked: EnvironmentSpec, settings: SamplerSettings) -> None:
     """Raise ``CommandError`` if several samplers need snapshots, but have no folder to share them."""
-    from surrogym.cli.errors import CommandError
-
     if asked.snapshots and settings.snapshots is None:
         raise CommandError(
             "several samplers share their snapshots: expected --snapshots with a folder that all of them can reach"
@@ -262,8 +259,6 @@ def _require_shared(asked: EnvironmentSpec, settings: SamplerSettings) -> None:
 
 def _sample_on_ray(api: Api, plan: SamplerPlan, cluster: RayOptions, output: Output) -> None:
     from surrogym.cli.sampling_on_ray import run_samplers, samplers_on_ray
-    from surrogym_client.runtime.lifetime import terminations_as_interrupts
-    from surrogym_shared.terminal import on_interrupt, say
 
     time_limit, endless = plan.settings.time_limit, replace(plan.settings, time_limit=None)
     samplers = samplers_on_ray(cluster, replace(plan, settings=endless))
@@ -283,7 +278,6 @@ def _sample_on_ray(api: Api, plan: SamplerPlan, cluster: RayOptions, output: Out
 
 def _named(env: str | None, program: str | None) -> str | None:
     """Return the name of the environment from the option --env or --exec. Raises ``CommandError`` if both are given."""
-    from surrogym.cli.errors import CommandError
     from surrogym_sampler.original.executables import name_of
 
     if env is not None and program is not None:
@@ -298,7 +292,6 @@ def environment_of(
 
     A name from the server (``asked``) is only opened if it is a Gymnasium id, because others would run unknown code.
     """
-    from surrogym.cli.errors import CommandError
     from surrogym_sampler.original.loading import is_known, is_own
 
     if env is None and not is_known(asked.environment):
@@ -313,7 +306,6 @@ def _words_of_consent(name: str) -> str:
     by which the user can give the name."""
     from surrogym_sampler.original.executables import is_executable
     from surrogym_sampler.original.loading import env_option
-    from surrogym_shared.environments import is_name
 
     if not is_executable(name) and is_name(name):
         return (
@@ -330,8 +322,6 @@ def _words_of_consent(name: str) -> str:
 def _telling(api: Api, surrogate: str, *, quiet: bool, plain: bool = False) -> Iterator[Tell | None]:
     """Context that shows progress: a bar for the design on a terminal, otherwise a line for each query. Yields the
     function that shows a line; None if ``quiet``. With ``plain``, a terminal shows lines too, and no bar."""
-    from surrogym_shared.terminal import progress, say
-
     if quiet or plain or not sys.stderr.isatty():
         yield None if quiet else lambda line: say(line.text)
         return
@@ -357,7 +347,6 @@ def _without_queries(view: SurrogateView, output: Output, *, until_done: bool) -
     """Print a remark if the design has no queries until a log is imported. Returns whether the command ends now."""
     from surrogym_client.surrogates.waiting import awaits_log, words_of_no_log
     from surrogym_sampler.queries.settings import SamplerReport
-    from surrogym_shared.terminal import say
 
     if not awaits_log(view):
         return False
@@ -387,8 +376,6 @@ def _words_of_interruption(report: SamplerReport) -> str:
 
 
 def _of_fallback(steps: int) -> str:
-    from surrogym_shared.words import counted
-
     are = "is" if steps == 1 else "are"
     return f"; {counted(steps, 'step')} of the fallback, which {are} not in the ledger" if steps else ""
 

@@ -8,8 +8,11 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from surrogym.cli.columns import columns
 from surrogym.cli.groups import Service
 from surrogym.cli.options import AsJson, names_of_surrogates
+from surrogym_shared.terminal import watch
+from surrogym_shared.words import counted, visible
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -46,9 +49,6 @@ def command(
 
     Example: surrogym status pendulum --watch
     """
-    from surrogym_shared.terminal import watch
-    from surrogym_shared.words import visible
-
     form: Form = "json" if as_json else "short" if quiet else "words"
     with service.connect(context) as api:
         look = partial(_all, api, form) if surrogate is None else partial(_one, api, surrogate, form)
@@ -131,8 +131,6 @@ def _phase(seen: SurrogateSummary) -> str:
 
 
 def _table(surrogates: Sequence[SurrogateSummary]) -> str:
-    from surrogym.cli.columns import columns
-
     if not surrogates:
         return "no surrogates yet; next: surrogym register Pendulum-v1 --name pendulum"
     heading = ("name", "environment", "phase", "real steps", "queries", "model", "confidence index", "target")
@@ -151,7 +149,6 @@ def _row(seen: SurrogateSummary) -> tuple[str | float | None, ...]:
 
 
 def _detail(view: SurrogateView, models: Sequence[ModelView]) -> str:
-    from surrogym.cli.columns import columns
     from surrogym_client.surrogates.advice import advice, noise_in_words, verdict
 
     ledger = view.ledger
@@ -189,8 +186,6 @@ def _detail(view: SurrogateView, models: Sequence[ModelView]) -> str:
 
 def _given(view: SurrogateView) -> list[str]:
     """Return a line on what the machine gave beside real steps: resets, seconds and wear; empty before a real step."""
-    from surrogym_shared.words import counted
-
     ledger = view.ledger
     if not ledger.total + ledger.audit:
         return []
@@ -241,8 +236,6 @@ def _judged(output: OutputFidelity) -> tuple[str | float | None, ...]:
 
 def _predicted(outputs: Sequence[OutputFidelity]) -> list[str]:
     """Return a table about the samples that were predicted before the model learned from them; empty without any."""
-    from surrogym.cli.columns import columns
-
     rows = [
         (output.name, scores.predictions, scores.within_50, scores.within_80, scores.within_90, scores.interval_score)
         for output in outputs

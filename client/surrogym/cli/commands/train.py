@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from surrogym.cli.errors import CommandError
 from surrogym.cli.groups import Output, Service
 from surrogym.cli.options import (
     ExitWithParent,
@@ -27,6 +28,10 @@ from surrogym.cli.options import (
     working,
 )
 from surrogym.cli.train_options import LogOptions, LoopOptions, SearchOptions, SessionOptions, StartOptions
+from surrogym_client.runtime.lifetime import exit_with_parent as watch_parent
+from surrogym_client.runtime.lifetime import terminations_as_interrupts
+from surrogym_shared.terminal import progress, say
+from surrogym_shared.words import counted
 
 if TYPE_CHECKING:
     from surrogym_shared.spec import EnvironmentSpec
@@ -64,11 +69,9 @@ def command(
 
     Example: surrogym train pendulum --out policy.zip --seed 0
     """
-    from surrogym_client.runtime.lifetime import exit_with_parent as watch_parent
     from surrogym_client.surrogates.waiting import words_of_rounds
     from surrogym_sampler.original.fitting import check_shape
     from surrogym_sampler.original.loading import env_option, sample_command
-    from surrogym_shared.terminal import say
     from surrogym_trainer.policies.card import require_place
     from surrogym_trainer.training.search import with_algorithm
     from surrogym_trainer.training.words import words_of_no_sampler, words_of_result
@@ -145,8 +148,6 @@ def _keeping(write_card: Callable[[TrainResult], object], asked: str) -> Iterato
         write_card: writes the card of the policy.
         asked: arguments of the command, for the advice.
     """
-    from surrogym_client.runtime.lifetime import terminations_as_interrupts
-    from surrogym_shared.terminal import say
     from surrogym_trainer.training.settings import TrainingInterrupted
     from surrogym_trainer.training.words import words_of_interruption
 
@@ -165,8 +166,6 @@ def _keeping(write_card: Callable[[TrainResult], object], asked: str) -> Iterato
 
 def _words_of_sessions(view: SurrogateView) -> str:
     """Return a warning about open sessions of the surrogate, which may belong to another running training."""
-    from surrogym_shared.words import counted
-
     are = "is" if view.sessions == 1 else "are"
     return (
         f"warning: {counted(view.sessions, 'session')} of {view.name!r} {are} open, perhaps of another training. "
@@ -185,7 +184,6 @@ def _trainable(
     Raises:
         CommandError: the surrogate has no model yet, or its reward lacks a set point or an integral of the settings.
     """
-    from surrogym.cli.errors import CommandError
     from surrogym_client.surrogates.waiting import (
         COMPLETED,
         share_of_design,
@@ -194,7 +192,6 @@ def _trainable(
         words_of_uncertainty,
     )
     from surrogym_shared.set_points import with_set_points
-    from surrogym_shared.terminal import say
     from surrogym_trainer.policies.integrals import Integrals
     from surrogym_trainer.training.search import SEARCHES, name_of
 
@@ -287,9 +284,7 @@ def _train(
     *,
     quiet: bool,
 ) -> tuple[TrainResult, Handover]:
-    from surrogym.cli.errors import CommandError
     from surrogym_client.transport import Api, HttpSurrogate
-    from surrogym_shared.terminal import progress
     from surrogym_trainer.training.audited import AuditedTraining
 
     with (

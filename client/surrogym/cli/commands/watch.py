@@ -13,8 +13,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from surrogym.cli.errors import CommandError
 from surrogym.cli.groups import Output, Service
 from surrogym.cli.options import names_of_surrogates
+from surrogym_shared.terminal import on_interrupt, progress, say
+from surrogym_shared.words import counted, has
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -70,8 +73,6 @@ def command(
 
     Example: surrogym watch pendulum --policy production --follow
     """
-    from surrogym.cli.errors import CommandError
-    from surrogym_shared.terminal import on_interrupt, progress, say
     from surrogym_trainer.watching.units import OtherUnits
     from surrogym_trainer.watching.watcher import Watcher
 
@@ -126,7 +127,6 @@ def _require_own(api: Api, surrogate: str, which: str, origin: str | None) -> No
     """Raise ``CommandError`` if the watched policy is a copy of one of another surrogate (``origin``), because its
     promise is that of the other model, with which the steps have to be compared."""
     from surrogym.cli.commands.policy import parsed
-    from surrogym.cli.errors import CommandError
 
     if origin is not None:
         home, version = parsed(origin)
@@ -223,7 +223,6 @@ class _Seen:
     def add(self, read: ReadLog) -> None:
         """Add a reading of the log. Rows that earlier readings had are left out."""
         from surrogym_shared.logs.rows import impossible
-        from surrogym_shared.words import has
         from surrogym_trainer.watching.logs import steps_after
 
         new = steps_after(read, self._line)
@@ -269,7 +268,6 @@ def _withdrawn(watcher: Watcher, version: int, alarm: Alarm, place: str) -> Poli
     """Report a drift to the server, after which the policy's promised return is not trusted. If the report fails, print
     the drift, and raise the error."""
     from surrogym_client.errors import SurrogymClientError
-    from surrogym_shared.terminal import say
 
     try:
         return watcher.withdraw(version, alarm)
@@ -291,8 +289,6 @@ def _words_of_trust(stored: PolicyView | None, named: str, moved: str | None) ->
 
 
 def _words(seen: _Seen, watcher: Watcher, alarm: Alarm | None, units: OtherUnits | None) -> list[str]:
-    from surrogym_shared.words import counted
-
     lines = [*seen.notes]
     if seen.rejected:
         lines.append(f"{counted(len(seen.rejected), 'row')} can't be compared:")

@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from surrogym.cli.errors import CommandError
 from surrogym.cli.groups import Output, Service
+from surrogym.cli.opening import opener_of
 from surrogym.cli.options import (
     NAMES,
     ExitWithParent,
@@ -21,6 +23,9 @@ from surrogym.cli.options import (
     awaited_surrogate,
     read_spec,
 )
+from surrogym_client.runtime.lifetime import exit_with_parent as watch_parent
+from surrogym_client.runtime.lifetime import terminations_as_interrupts
+from surrogym_shared.terminal import on_interrupt, progress, say
 
 if TYPE_CHECKING:
     from surrogym_shared.spec import EnvironmentSpec
@@ -75,10 +80,7 @@ def command(
 
     Example: surrogym work pendulum --env Pendulum-v1
     """
-    from surrogym_client.runtime.lifetime import exit_with_parent as watch_parent
-    from surrogym_client.runtime.lifetime import terminations_as_interrupts
     from surrogym_sampler.queries.settings import worker_name
-    from surrogym_shared.terminal import on_interrupt, progress, say
     from surrogym_trainer.work.worker import Worker, WorkerSettings
 
     if exit_with_parent:
@@ -110,10 +112,8 @@ def _environment(
 ) -> Environment | None:
     """Return the environment for evaluations, after a check that it fits the surrogate; None if the worker only
     trains."""
-    from surrogym.cli.opening import opener_of
     from surrogym_sampler.original.loading import is_known
     from surrogym_sampler.queries.query_limits import check_environment
-    from surrogym_shared.terminal import say
     from surrogym_trainer.policies.card import PolicyCard
     from surrogym_trainer.work.tasks import Environment
 
@@ -136,7 +136,6 @@ def _with_reference(environment: Environment | None, reference: str | None) -> E
         CommandError, OriginalError, UnusablePolicy: there is no such controller, or no environment for it.
     """
     from surrogym.cli.beside import reference_of, spec_of_reference
-    from surrogym.cli.errors import CommandError
     from surrogym.cli.groups import PolicyReading
     from surrogym_sampler.original.fitting import check_policy
 
