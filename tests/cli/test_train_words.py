@@ -122,9 +122,18 @@ def test_the_train_command_warns_if_another_session_of_the_surrogate_is_open(
     assert ("warning" in capsys.readouterr().err) is (sessions > 0)
 
 
-def test_a_training_without_a_sampler_says_how_its_policies_could_try():
-    said = train._words_without_trials(SimpleNamespace(name="rail", environment="plant:Rail", budget_left=70))
-    assert said == (
+def test_a_training_says_why_its_policies_try_no_episodes():
+    spec = SimpleNamespace(needs_trials=True, preset=SimpleNamespace(search="FASTPPO"), action=pendulum().action)
+    view = SimpleNamespace(name="rail", environment="plant:Rail", budget_left=70, samplers=0, spec=spec)
+    assert train._words_without_trials(view, TrainSettings(algorithm="FASTPPO")) == (
         "no sampler is running, so no trials take the other 70 real steps of the budget: for trials, start surrogym "
         "sample rail --env plant:Rail in another terminal first"
     )
+    view.samplers = 1
+    assert train._words_without_trials(view, TrainSettings(algorithm="CMAES")) == ""
+    assert train._words_without_trials(view, TrainSettings(algorithm="sac")) == (
+        "samplers can't run policies of SAC, so no trials take the other 70 real steps of the budget: for trials, "
+        "train without --algorithm and --integral"
+    )
+    seeing = TrainSettings(algorithm="FASTPPO", integral=("x",))
+    assert "policies that see integrals, so no trials" in train._words_without_trials(view, seeing)

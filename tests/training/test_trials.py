@@ -38,6 +38,7 @@ from surrogym_trainer.training.closed_loop import LoopSettings
 from surrogym_trainer.training.handover import AuditSettings, Subject, hand_over
 from surrogym_trainer.training.settings import TrainingInterrupted
 from surrogym_trainer.training.trials import Trials, allows_trials, encoded, is_waiting_for_trials
+from surrogym_trainer.training.words import words_of_result
 
 BUDGET, FIRST, EPISODE = 100, 60, 15
 SETTINGS = TrainSettings(algorithm="FASTPPO", total_steps=4_096, num_envs=16, seed=0)
@@ -226,6 +227,7 @@ def test_trials_end_with_the_best_policy_if_the_machine_takes_no_first_step(
     result = trials.train()
     (failed,) = [query for query in trials.api.queries(waiting) if query.policy]
     assert (failed.status, failed.attempts, len(trials.trained)) == ("set_aside", 3, 1)
+    assert "; 1 round;" in words_of_result(result, closed_loop=True)
     load_network(result.path)
 
 

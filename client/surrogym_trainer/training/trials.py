@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from base64 import b64encode
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,6 +61,7 @@ def _is_trial(query: QueryView) -> bool:
     return query.policy and query.purpose == "adaptive"  # an audit lets a policy act, too
 
 
+@dataclass
 class Trials(TrainingInRounds):
     """Train policies, each with a new network, and let the best one try an episode after each training.
 
@@ -70,6 +71,8 @@ class Trials(TrainingInRounds):
     succeeds by the criterion of the specification, if there is one. Without a number of steps in ``rounds``, a
     trial is a whole episode, and the trials take the rest of the budget.
     """
+
+    _tried: int = field(default=0, init=False)  # number of trials
 
     def _run(self) -> None:
         tried: tuple[Network, NDArray[np.float64]] | None = None
@@ -85,6 +88,9 @@ class Trials(TrainingInRounds):
             if (success := self._try(policy, steps, number)) is None:
                 break
             tried = (policy, earned) if success else None
+
+    def result(self) -> TrainResult:
+        return replace(super().result(), visited_confidence=(None,) * self._tried)
 
     @property
     def _most(self) -> int:
@@ -121,6 +127,7 @@ class Trials(TrainingInRounds):
         actions = expected_actions(self.port, policy, steps, self.settings.seed + number)
         trial = Trial(policy=encoded(policy), actions=actions)
         self.api.improve(self.name, trial=trial)
+        self._tried += 1
         wait_for_design(self.api, self.name, self.rounds.patience_seconds, self.waiting, after_round=view.round)
         # other trainings may have added trials since
         added = [query for query in self.api.queries(self.name) if _is_trial(query) and query.id not in earlier]

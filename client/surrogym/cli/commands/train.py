@@ -216,8 +216,10 @@ def _trainable(
             say(_words_of_sessions(view), quiet=quiet)
         if view.phase in ("over_budget", "unsure"):
             say(words_of_uncertainty(view), quiet=quiet)
-        if view.phase == "unsure" and view.spec.needs_trials and view.budget_left and not view.samplers:
-            say(_words_without_trials(view), quiet=quiet)
+        if view.phase == "unsure" and view.spec.needs_trials and view.budget_left:
+            _import(settings, quiet=quiet)
+            if words := _words_without_trials(view, settings):
+                say(words, quiet=quiet)
         if view.phase not in COMPLETED and not view.paused:
             typer.echo(
                 f"the design of {surrogate!r} continues; training starts with model {view.model_version}", err=True
@@ -225,14 +227,21 @@ def _trainable(
         return view.spec, api.url
 
 
-def _words_without_trials(view: SurrogateView) -> str:
-    """Return a hint that no policy can try the original environment, because no sampler is running."""
+def _words_without_trials(view: SurrogateView, settings: TrainSettings) -> str:
+    """Return why no policy can try the original environment, with advice: the training's settings, or no sampler is
+    running. Return an empty string if a policy can."""
     from surrogym_sampler.original.loading import sample_command
+    from surrogym_trainer.training.search import name_of
+    from surrogym_trainer.training.trials import allows_trials
 
-    return (
-        f"no sampler is running, so no trials take the other {view.budget_left} real steps of the budget: for trials, "
-        f"start {sample_command(view.name, view.environment)} in another terminal first"
-    )
+    none = f"so no trials take the other {view.budget_left} real steps of the budget"
+    if not allows_trials(view.spec, settings):
+        sees = "that see integrals" if settings.integral else f"of {name_of(settings)}"
+        return f"samplers can't run policies {sees}, {none}: for trials, train without --algorithm and --integral"
+    if view.samplers:
+        return ""
+    start = sample_command(view.name, view.environment)
+    return f"no sampler is running, {none}: for trials, start {start} in another terminal first"
 
 
 def _words_without_model(view: SurrogateView) -> str:
