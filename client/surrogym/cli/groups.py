@@ -18,6 +18,7 @@ from surrogym_shared.terminal import give
 
 if TYPE_CHECKING:
     from surrogym_client.transport import Api
+    from surrogym_shared.spec import EnvironmentSpec
     from surrogym_trainer.policies.card import PolicyCard
     from surrogym_trainer.policies.predict import Acting, Predict
 
@@ -69,11 +70,12 @@ class PolicyReading:
 
         return load_policy(policy, self.algorithm or card.algorithm, trust=self.trust_policy)
 
-    def acting(self, policy: Path, card: PolicyCard) -> Acting:
-        """Load the policy as a controller of the original environment. Raises the errors of ``load_policy``."""
+    def acting(self, policy: Path, card: PolicyCard, given: EnvironmentSpec | None = None) -> Acting:
+        """Load the policy as a controller of the original environment, whose specification is ``given`` or the card's.
+        Raises the errors of ``load_policy``."""
         from surrogym_trainer.policies.integrals import acting_with_integrals
 
-        return acting_with_integrals(self.load(policy, card), card.spec, card.integral, card.set_points)
+        return acting_with_integrals(self.load(policy, card), given or card.spec, card.integral, card.set_points)
 
 
 def add(app: typer.Typer, name: str, command: Callable[..., None]) -> None:

@@ -8,15 +8,17 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from surrogym_sampler.original.actions import decode_actions
 from surrogym_sampler.original.episode import Episode, Moment
 from surrogym_sampler.original.protocol import LONGEST_EPISODE
 from surrogym_shared.rates import within_rates
 from surrogym_trainer.deployment.controller import LIMITED, Array, Controller
-from surrogym_trainer.policies.predict import Predict
+from surrogym_trainer.policies.predict import Acting, PerEpisode
 
 # if a controller computes in double, and in float: largest negligible difference of an action, as a share of its range
 NEGLIGIBLE = 1e-6, 1e-4
@@ -70,7 +72,7 @@ class Comparison:
         episode: an instance of the environment.
     """
 
-    def __init__(self, controller: Controller, running: Running, policy: Predict, episode: Episode) -> None:
+    def __init__(self, controller: Controller, running: Running, policy: Acting, episode: Episode) -> None:
         self.begun = 0  # number of steps of the environment that have begun, of controller and policy together
         self.ended = 0  # number of episodes that have ended, of controller and policy together
         self._running, self._policy, self._episode = running, policy, episode
@@ -104,7 +106,7 @@ class Comparison:
         moment, total = self._episode.reset(seed), 0.0
         self._running.reset()
         for _ in range(self._episode.spec.time_limit or LONGEST_EPISODE):
-            action = decode_actions(self._episode.spec, self._policy(moment.observation[None].astype(np.float32)), 1)[0]
+            action = decode_actions(self._episode.spec, self._acting(moment.observation[None].astype(np.float32)), 1)[0]
             if deployed:
                 action = self._decided(moment, within_rates(self._rates, moment.coordinates, action))
             self.begun += 1
@@ -114,6 +116,12 @@ class Comparison:
                 break
         self.ended += 1
         return total
+
+    def _acting(self, observation: NDArray[np.float32]) -> NDArray[Any]:
+        """Return the policy's action (1, F) for an observation (1, D) of the present episode."""
+        if isinstance(self._policy, PerEpisode):
+            return self._policy.actions([self.ended], observation)
+        return self._policy(observation)
 
     def _decided(self, moment: Moment, expected: Array) -> Array:
         """Return the deployed controller's action (F,) for the coordinates of this moment, and record its difference

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from surrogym_trainer.deployment.targets import Target
     from surrogym_trainer.policies.card import PolicyCard
     from surrogym_trainer.policies.controller_check import StoredCheck
-    from surrogym_trainer.policies.predict import Predict
+    from surrogym_trainer.policies.predict import Acting
 
 
 @dataclass(frozen=True)
@@ -199,9 +199,9 @@ class LocalPolicy:
     service: Service
     output: Output
 
-    def load(self) -> Predict:
+    def load(self) -> Acting:
         """Load the policy as a function of observations."""
-        return self.reading.load(self.path, self.card)
+        return self.reading.acting(self.path, self.card, self.given)
 
     def enter(self, comparison: Comparison) -> None:
         """Report the real steps of a check to the server, as steps of the surrogate."""
