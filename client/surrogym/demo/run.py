@@ -41,7 +41,9 @@ def run_demo(
         SurrogymClientError: the server refused, or the design failed.
     """
     started, code = time.monotonic(), commit()
-    folder = _empty_folder(out or _new_folder(settings))
+    folder = _empty_folder(
+        out or (Path("runs") / f"{settings.run_name}-seed{settings.seed}-{time.strftime('%Y%m%d-%H%M%S')}")
+    )
     with terminations_as_interrupts(), on_interrupt(partial(_what_stays, folder)), Children(folder) as children:
         run = begin(settings, folder, children, quiet=quiet)
         learned = run.learn()
@@ -59,10 +61,6 @@ def run_demo(
             run.linger()
         elif (database := _database(folder)).exists():
             say(f"next: surrogym serve --database {database}, and look at its page", quiet=quiet)
-
-
-def _new_folder(settings: DemoSettings) -> Path:
-    return Path("runs") / f"{settings.run_name}-seed{settings.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
 
 
 def _empty_folder(folder: Path) -> Path:

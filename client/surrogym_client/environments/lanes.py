@@ -258,7 +258,7 @@ class Lanes:
         repeatable.
         """
         self._losses += 1
-        seed = _successor(self._seed, self._losses)
+        seed = int(np.random.SeedSequence([self._seed, self._losses]).generate_state(1, np.uint64)[0] >> np.uint64(1))
         view = self.port.open(self._request.model_copy(update={"seed": seed, "idempotency_key": None}))
         if self.mode != "disabled":
             try:
@@ -275,7 +275,3 @@ class Lanes:
 
 def _none(num_envs: int) -> Bools:
     return np.zeros(num_envs, dtype=bool)
-
-
-def _successor(seed: int, losses: int) -> int:
-    return int(np.random.SeedSequence([seed, losses]).generate_state(1, np.uint64)[0] >> np.uint64(1))

@@ -213,7 +213,7 @@ class Connection:
             except (httpx.TransportError, OSError, Unavailable) as failure:
                 # The connection of a failed request is closed, so that its late reply is not read for another request.
                 delays = (retries or self.retries).delays() if delays is None else delays
-                pause = next(delays, None) if _may_repeat(failure, repeatable) else None
+                pause = next(delays, None) if repeatable or isinstance(failure, (*_NOT_SENT, Unavailable)) else None
                 if pause is None:
                     raise _given_up(failure, self.url) from None
                 time.sleep(pause)
@@ -363,10 +363,6 @@ def _body(response: httpx.Response, content: bytes) -> bytes:
             f"content type {kind or 'unknown'!r}: check the address"
         ) from None
     raise error_from_problem(problem)
-
-
-def _may_repeat(failure: Exception, repeatable: bool) -> bool:
-    return repeatable or isinstance(failure, (*_NOT_SENT, Unavailable))
 
 
 def _given_up(failure: Exception, url: str) -> SurrogymClientError:

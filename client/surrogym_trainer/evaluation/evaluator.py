@@ -459,7 +459,9 @@ def _account(tallies: Sequence[_Tally]) -> Evaluation:
     return Evaluation(
         returns=np.array([t.total for t in tallies]),
         lengths=np.array([t.length for t in tallies], dtype=np.int64),
-        success=None if criterion is None else np.array([_succeeds(criterion, t) for t in tallies]),
+        success=None
+        if criterion is None
+        else np.array([_meets(criterion, t.held, t.length, t.total, terminated=t.moment.terminated) for t in tallies]),
         traces=tuple(tally.trace for tally in tallies),
         varied=_varied(spec, tallies),
         limit=_limit(tallies),
@@ -487,10 +489,6 @@ def _holds(spec: EnvironmentSpec, coordinates: Array) -> bool:
     if spec.success is None:
         return False
     return all(bool(holds(spec, inequality, coordinates[None])[0]) for inequality in spec.success.hold)
-
-
-def _succeeds(success: Success, tally: _Tally) -> bool:
-    return _meets(success, tally.held, tally.length, tally.total, terminated=tally.moment.terminated)
 
 
 def _meets(success: Success, held: int, length: int, total: float, *, terminated: bool) -> bool:

@@ -8,7 +8,7 @@ differ in stroke, so that they can be distinguished in black and white.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import fmean
 from typing import Literal, NamedTuple
@@ -761,14 +761,10 @@ def term(one: Term) -> str:
 def _part(part: Part) -> str:
     if part.function == "one":
         return f"{part.coefficient:g}"
-    inner = _weighted(part.weights)
+    inner = " + ".join(_times(weight, name) for name, weight in part.weights.items()).replace("+ -", "- ")
     if part.function != "linear":
         return _times(part.coefficient, f"{part.function}({inner})")
     return _times(part.coefficient, inner if len(part.weights) == 1 or part.coefficient == 1 else f"({inner})")
-
-
-def _weighted(weights: Mapping[str, float]) -> str:
-    return " + ".join(_times(weight, name) for name, weight in weights.items()).replace("+ -", "- ")
 
 
 def _times(factor: float, words: str) -> str:

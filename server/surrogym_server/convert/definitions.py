@@ -42,7 +42,7 @@ def stored_definition(spec: wire.EnvironmentSpec) -> core.EnvironmentDefinition:
         reward=spec.reward,
         penalty=_penalty(spec),
         tolerances=tuple(spec.tolerances.items()),
-        learning=_learning(spec),
+        learning=core.LearningDefinition(_model(spec), spec.preset.moves, limits_rewards=spec.preset.limits_rewards),
         design=_design(spec),
         learns_termination=spec.termination == "learned",
         max_rollout=_max_rollout(spec) if spec.query == "rollout" else None,
@@ -87,10 +87,6 @@ def _design(spec: wire.EnvironmentSpec) -> core.DesignDefinition:
     )
 
 
-def _learning(spec: wire.EnvironmentSpec) -> core.LearningDefinition:
-    return core.LearningDefinition(_model(spec), spec.preset.moves, limits_rewards=spec.preset.limits_rewards)
-
-
 def _model(spec: wire.EnvironmentSpec) -> Choice:
     """Return the model family that a specification chooses, with its settings. For ``gaussian_process``, settings that
     the specification leaves open have the values of its preset."""
@@ -115,8 +111,4 @@ def _max_rollout(spec: wire.EnvironmentSpec) -> int:
 def _penalty(spec: wire.EnvironmentSpec) -> float:
     if isinstance(spec.reward, wire.DeclaredReward):
         return 0.0
-    return _or(spec.reward.penalty, spec.preset.penalty)
-
-
-def _or(value: float | None, default: float) -> float:
-    return default if value is None else value
+    return spec.preset.penalty if spec.reward.penalty is None else spec.reward.penalty

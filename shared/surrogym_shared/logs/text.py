@@ -187,7 +187,7 @@ def table_of_text(text: str, where: str, most_rows: int = MOST_ROWS, remarks: Se
     # Arrays of objects, because an array of text reserves the width of its longest cell in every row.
     columns = {
         name: np.array([row[i] for row in padded], dtype=object)
-        for i, name in enumerate(_with_places(names))
+        for i, name in enumerate([name or f"unnamed column {place}" for place, name in enumerate(names, 1)])
         if names[i] == "" or names.count(names[i]) == 1
     }
     return Table(
@@ -206,10 +206,6 @@ def table_of_text(text: str, where: str, most_rows: int = MOST_ROWS, remarks: Se
 def is_unnamed(name: str) -> bool:
     """Whether a name is only a placeholder: pandas' name of a table's index, or that of a column without a heading."""
     return UNNAMED.match(name) is not None
-
-
-def _with_places(names: Sequence[str]) -> list[str]:
-    return [name or f"unnamed column {place}" for place, name in enumerate(names, 1)]
 
 
 def _head(text: str) -> _Head:
