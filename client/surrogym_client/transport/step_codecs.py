@@ -6,7 +6,7 @@ An encoding turns arguments into the body of a request, and the body of a reply 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import msgspec
 import numpy as np
@@ -27,29 +27,6 @@ Seeds = int | Sequence[int] | None
 UNREADABLE = (msgspec.DecodeError, FrameError)  # errors that decoding raises if a body is not a reply
 
 R = TypeVar("R", frames.ResetReply, frames.StepReply, frames.RolloutReply, frames.PolicyReply)
-
-
-class Form(Protocol):
-    """Encoding of requests and replies. The methods that encode a request raise ``InvalidInput`` for values that can't
-    be sent, such as NaN in JSON."""
-
-    media_type: str
-
-    def reset(self, seq: int, seed: Seeds, mask: Bools | None, shape: Shape) -> bytes: ...
-
-    def step(self, seq: int, action: Array, mask: Bools | None, deviations: bool, shape: Shape) -> bytes: ...
-
-    def rollout(self, seq: int, actions: Array, shape: Shape) -> bytes: ...
-
-    def policy(self, seq: int, run: PolicyRun, shape: Shape) -> bytes: ...
-
-    def read_reset(self, content: bytes, shape: Shape) -> tuple[int, ResetResult]: ...
-
-    def read_step(self, content: bytes, shape: Shape) -> tuple[int, StepResult]: ...
-
-    def read_rollout(self, content: bytes, shape: Shape) -> tuple[int, list[StepResult]]: ...
-
-    def read_policy(self, content: bytes, shape: Shape) -> tuple[int, PolicyRollout]: ...
 
 
 class BinaryForm:
@@ -187,6 +164,11 @@ class JsonForm:
         log = None if body.log_probability is None else np.array(body.log_probability, dtype=np.float64)
         steps = [_step_result(step, shape) for step in body.steps]
         return body.seq, PolicyRollout.of(steps, np.array(body.action, dtype=np.float64), log)
+
+
+# Encoding of requests and replies. The methods that encode a request raise ``InvalidInput`` for values that can't be
+# sent, such as NaN in JSON.
+Form = BinaryForm | JsonForm
 
 
 def _reply(content: bytes, kind: type[R]) -> R:
