@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 from fastapi import APIRouter, Depends, Request
 from prometheus_client import Metric
@@ -24,8 +24,8 @@ from surrogym_server.storage.sql import Storage
 S = TypeVar("S")
 
 
-class Service(Protocol):
-    """Interface of an optional feature's service, of which a server process has one: periodic work and metrics."""
+class Service:
+    """Base class of an optional feature's service, of which a server process has one: periodic work and metrics."""
 
     async def sweep(self) -> None:
         """Do the periodic work of the feature. The server calls this after each interval of its setting
@@ -33,6 +33,7 @@ class Service(Protocol):
 
     def metrics(self) -> Iterable[Metric]:
         """Return the Prometheus metrics of the feature, which the endpoint ``/metrics`` shows."""
+        return ()
 
 
 @dataclass(frozen=True)

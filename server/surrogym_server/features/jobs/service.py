@@ -8,7 +8,7 @@ from typing import NamedTuple, Self
 
 from surrogym_server.api.door import Waiting
 from surrogym_server.errors import UnknownPolicy
-from surrogym_server.feature import Core
+from surrogym_server.feature import Core, Service
 from surrogym_server.features.jobs.records import JobProgress, JobRecord, JobResult, LeasedJob, NewJob
 from surrogym_server.features.jobs.store import Jobs
 from surrogym_server.services.activity import Alive
@@ -25,7 +25,7 @@ class _Claim(NamedTuple):
     job: LeasedJob | None
 
 
-class JobService:
+class JobService(Service):
     """Queues jobs, and leases them to trainer workers."""
 
     def __init__(self, storage: Storage, notices: Notices, metrics: ProcessMetrics) -> None:
@@ -44,10 +44,6 @@ class JobService:
     async def sweep(self) -> None:
         """End the expired leases of jobs."""
         self._metrics.expired_leases += await asyncio.to_thread(self._jobs.sweep_expired)
-
-    def metrics(self) -> tuple[()]:
-        """Return no metrics: jobs have none."""
-        return ()
 
     def train(self, name: str, task: JSON, key: str | None) -> JobRecord:
         """Queue a training, once for each idempotency key; ``task`` has its settings.

@@ -19,7 +19,7 @@ from prometheus_client import Metric
 from prometheus_client.core import GaugeMetricFamily
 
 from surrogym_server.errors import Damaged, Forbidden, InvalidInput, NotThere, SpecConflict, UnknownPolicy
-from surrogym_server.feature import Core
+from surrogym_server.feature import Core, Service
 from surrogym_server.features.policies.blobs import open_blobs
 from surrogym_server.features.policies.records import (
     DRIFT,
@@ -53,7 +53,7 @@ MUST_AGREE = ("observation", "action")
 DESCRIPTION = {"controller", "note", "declared", "environment", "seeded", "first_seed"}
 
 
-class PolicyService:
+class PolicyService(Service):
     def __init__(
         self,
         storage: Storage,

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from typing import Any, Self
 
-from prometheus_client import Metric
 from pydantic import ValidationError
 
 from surrogym_server.convert import stored_definition
 from surrogym_server.convert.stored import read_stored
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import InvalidInput, PluginFailed
-from surrogym_server.feature import Core
+from surrogym_server.feature import Core, Service
 from surrogym_server.models.abilities import TakesPrior
 from surrogym_server.models.files import from_bytes
 from surrogym_server.models.guard import POINTS, plugin_calls, require_sound
@@ -29,7 +28,7 @@ from surrogym_shared.wire.priors import PriorAbout
 SHARED = ("name", "kind", "unit", "lag")  # fields of a coordinate that a prior and the surrogate must have in common
 
 
-class PriorService:
+class PriorService(Service):
     """Checks and stores priors. The next fit of a design uses its prior."""
 
     def __init__(self, storage: Storage, notices: Notices) -> None:
@@ -39,13 +38,6 @@ class PriorService:
     @classmethod
     def start(cls, core: Core) -> Self:
         return cls(core.storage, core.notices)
-
-    async def sweep(self) -> None:
-        """Do nothing, because a prior never expires."""
-
-    def metrics(self) -> tuple[Metric, ...]:
-        """Return no metrics: priors have none."""
-        return ()
 
     def get(self, name: str) -> PriorRecord | None:
         """Return the description of a surrogate's prior; None if it has none. Raises ``UnknownSurrogate``."""

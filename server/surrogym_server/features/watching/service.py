@@ -5,14 +5,13 @@ from __future__ import annotations
 from typing import Self
 
 import numpy as np
-from prometheus_client import Metric
 
 from surrogym_server.convert import stored_definition
 from surrogym_server.convert.stored import read_stored
 from surrogym_server.environment.actions import model_actions
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import InvalidInput
-from surrogym_server.feature import Core
+from surrogym_server.feature import Core, Service
 from surrogym_server.features.watching.store import Streams
 from surrogym_server.services.definitions import check_coordinates
 from surrogym_server.storage.records import JSON
@@ -23,7 +22,7 @@ from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire.watching import AddSteps, MachineStep
 
 
-class WatchingService:
+class WatchingService(Service):
     """Stores the steps of streams."""
 
     def __init__(self, storage: Storage) -> None:
@@ -33,13 +32,6 @@ class WatchingService:
     @classmethod
     def start(cls, core: Core) -> Self:
         return cls(core.storage)
-
-    async def sweep(self) -> None:
-        """Do nothing: old steps are removed when new ones are stored."""
-
-    def metrics(self) -> tuple[Metric, ...]:
-        """Return no metrics: streams have none."""
-        return ()
 
     def add(self, name: str, body: AddSteps) -> tuple[int, int]:
         """Append steps to a stream, all or none. Return the number of steps that were not stored before, and the number
