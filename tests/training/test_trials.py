@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 from uuid import uuid4
 
 import numpy as np
@@ -226,7 +227,7 @@ def test_trials_end_with_the_best_policy_if_the_machine_takes_no_first_step(
     monkeypatch.setattr(Late, "step", lambda *_: 1 / 0)
     result = trials.train()
     (failed,) = [query for query in trials.api.queries(waiting) if query.policy]
-    assert (failed.status, failed.attempts, len(trials.trained)) == ("set_aside", 3, 1)
+    assert (failed.status, len(trials.trained)) == ("set_aside", 1)
     assert "; 1 round;" in words_of_result(result, closed_loop=True)
     load_network(result.path)
 
@@ -273,3 +274,33 @@ def test_a_training_judges_its_own_trial_beside_that_of_another_training(
     )
     assert trials._try(idle(), EPISODE, 0)
     assert judged == [EPISODE]
+
+
+def test_an_interrupted_training_withdraws_a_trial_that_no_sampler_has_begun(
+    trials: Trials, waiting: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        assert trials.api.surrogate(waiting).queries.pending == 1
+        raise KeyboardInterrupt
+
+    before = trials.api.patch_surrogate(waiting, paused=True)  # so that the sampler does not begin the trial
+    monkeypatch.setattr("surrogym_trainer.training.trials.wait_for_design", interrupted)
+    with pytest.raises(TrainingInterrupted):
+        trials.train()
+    trials.api.patch_surrogate(waiting, paused=False)
+    after = wait_for_design(trials.api, waiting, 60)
+    assert (after.phase, after.ledger, after.budget_left) == ("unsure", before.ledger, before.budget_left)
+    assert not [query for query in trials.api.queries(waiting) if query.policy]
+
+
+def test_trials_end_if_their_query_is_withdrawn_meanwhile(
+    trials: Trials, waiting: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def changed(*arguments: Any, **after: Any) -> None:
+        trials.api.withdraw_audit(waiting, [query.id for query in trials.api.queries(waiting)])
+        trials.api.patch_surrogate(waiting, paused=False)
+        wait_for_design(*arguments, **after)
+
+    trials.api.patch_surrogate(waiting, paused=True)
+    monkeypatch.setattr("surrogym_trainer.training.trials.wait_for_design", changed)
+    assert trials._try(idle(), EPISODE, 0) is None

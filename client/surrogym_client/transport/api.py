@@ -469,7 +469,7 @@ class Api:
         return self._post(wire.QueryList, f"{routes.surrogate(name)}/{'audit' if audit else 'queries'}", body).queries
 
     def withdraw_audit(self, name: str, query_ids: Sequence[int]) -> int:
-        """Withdraw queries of an audit that no sampler has begun, and return how many were withdrawn."""
+        """Withdraw queries of an audit, or trials, that no sampler has begun, and return how many were withdrawn."""
         body = wire.WithdrawQueries(query_ids=list(query_ids))
         return self._post(wire.WithdrawnQueries, f"{routes.surrogate(name)}/audit:withdraw", body).withdrawn
 

@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import math
 from base64 import b64encode
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from surrogym_client.environments.lanes import Lanes, session_request
+from surrogym_client.errors import SurrogymClientError
 from surrogym_client.surrogates.waiting import COMPLETED, wait_for_design
 from surrogym_client.transport.api import Api
 from surrogym_sampler.original.protocol import LONGEST_EPISODE
@@ -67,9 +69,9 @@ class Trials(TrainingInRounds):
 
     The trials end when one has succeeded, the model that has learned from it expects no less of its policy than before,
     and no other policy is clearly better in that model; or after the number of rounds; or when the budget is spent; or
-    when the original environment failed at each attempt to take a trial's first step, or refused the trial. A trial
-    succeeds by the criterion of the specification, if there is one. Without a number of steps in ``rounds``, a
-    trial is a whole episode, and the trials take the rest of the budget.
+    when the original environment failed at each attempt to take a trial's first step, or the trial was refused or
+    withdrawn. A trial succeeds by the criterion of the specification, if there is one. Without a number of steps in
+    ``rounds``, a trial is a whole episode, and the trials take the rest of the budget.
     """
 
     _tried: int = field(default=0, init=False)  # number of trials
@@ -125,21 +127,29 @@ class Trials(TrainingInRounds):
         error or a stopped sampler cut off has not. Return None if no step could be taken."""
         view, earlier = self.api.surrogate(self.name), {query.id for query in self.api.queries(self.name)}
         actions = expected_actions(self.port, policy, steps, self.settings.seed + number)
-        trial = Trial(policy=encoded(policy), actions=actions)
-        self.api.improve(self.name, trial=trial)
+        self.api.improve(self.name, trial=Trial(policy=encoded(policy), actions=actions))
         self._tried += 1
-        wait_for_design(self.api, self.name, self.rounds.patience_seconds, self.waiting, after_round=view.round)
-        # other trainings may have added trials since
-        added = [query for query in self.api.queries(self.name) if _is_trial(query) and query.id not in earlier]
-        shape = np.shape(actions)
-        asked = next(q.id for q in added if np.shape(q.actions) == shape and np.allclose(q.actions, actions))
-        taken = [sample for sample in self.api.samples(self.name) if sample.query_id == asked and not sample.late]
+        asked = self._asked(actions, earlier)
+        try:
+            wait_for_design(self.api, self.name, self.rounds.patience_seconds, self.waiting, after_round=view.round)
+        except BaseException:
+            with suppress(SurrogymClientError):  # the first error matters
+                self.api.withdraw_audit(self.name, asked)
+            raise
+        taken = [sample for sample in self.api.samples(self.name) if sample.query_id in asked and not sample.late]
         if not taken:
             return None
         whole = len(taken) >= steps or taken[-1].terminated or taken[-1].truncated
         states, rewards = np.array([s.next_coordinates for s in taken]), np.array([s.reward for s in taken])
         spec = with_set_points(self.port.spec(), self.settings.set_points)
         return whole and succeeded(spec, states, rewards, terminated=taken[-1].terminated)
+
+    def _asked(self, actions: list[list[float]], earlier: set[int]) -> list[int]:
+        """Return the id of the trial that expects ``actions`` (T, F) and is not among ``earlier`` queries; none if it
+        was withdrawn. Other trainings may have added trials since."""
+        added = [query for query in self.api.queries(self.name) if _is_trial(query) and query.id not in earlier]
+        same = [q.id for q in added if len(q.actions) == len(actions) and np.allclose(q.actions, actions)]
+        return same[:1]
 
     def _trials_left(self, number: int) -> int:
         """Return the largest number of trials of whole episodes after ``number`` trials."""

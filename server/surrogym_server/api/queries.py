@@ -111,12 +111,13 @@ def audit(name: str, body: Annotated[AuditModel, example(examples.ADD_QUERIES)],
 
 @router.post(
     "/audit:withdraw",
-    summary="Remove queries of an audit",
+    summary="Remove queries of an audit, or trials",
     dependencies=[TRAIN],
     responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST),
 )
 def withdraw(name: str, body: Annotated[WithdrawQueries, example(examples.WITHDRAW)], use: Use) -> WithdrawnQueries:
-    """Remove queries of an audit, given by their ids. A query stays if a sampler may have taken a real step of it."""
+    """Remove queries of an audit, or trials, given by their ids. A query stays if a sampler may have taken a real step
+    of it."""
     return WithdrawnQueries(withdrawn=use.queries.withdraw_audit(name, body.query_ids))
 
 

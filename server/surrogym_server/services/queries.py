@@ -130,13 +130,15 @@ class QueryService:
         return [self._storage.queries.get(name, id) for id in ids]
 
     def withdraw_audit(self, name: str, query_ids: Sequence[int]) -> int:
-        """Remove queries of an audit, given by their ids. A query stays if a sampler may have taken a real step of it.
+        """Remove queries of an audit, or trials, given by their ids. A query stays if a sampler may have taken a real
+        step of it.
 
         Returns the number of removed queries.
         """
         pending = self._storage.queries.list(name, ("pending",))
-        audits = [query.id for query in pending if query.purpose == "audit" and query.id in set(query_ids)]
-        withdrawn = self._storage.queries.withdraw(name, audits) if audits else 0
+        asked = [query for query in pending if query.purpose == "audit" or query.policy is not None]
+        ids = [query.id for query in asked if query.id in set(query_ids)]
+        withdrawn = self._storage.queries.withdraw(name, ids) if ids else 0
         if withdrawn:
             self._notices.post(name)
         return withdrawn
