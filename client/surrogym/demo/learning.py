@@ -15,7 +15,7 @@ from typing import Any
 from uuid import uuid4
 
 from surrogym.demo.judging import Judgement
-from surrogym.demo.processes import Child, Children, await_file
+from surrogym.demo.processes import Child, Children, await_file, free_port
 from surrogym.demo.settings import DemoSettings
 from surrogym_client.surrogates.waiting import share_of_design, wait_for_design, words_of_design
 from surrogym_client.transport.api import Api
@@ -63,13 +63,15 @@ class SurrogateRun:
         self._children = children
         self._quiet = quiet
         self._seconds: dict[str, float] = {}
+        self._url = f"http://127.0.0.1:{free_port()}"
         with self._timed("start"):
-            self._api = Api(self._serve(), token="", retries=Retries(seconds=10.0))
+            self._start()
+            self._api = Api(self._url, token="", retries=Retries(seconds=10.0))
 
     def learn(self) -> Learned:
         """Run the design and the training. The trainer starts early, so that it imports its packages during the
         design."""
-        self._employ_sampler()
+        self._register()
         trainer = self._employ_trainer()
         with self._timed("design"):
             self._design()
@@ -125,21 +127,24 @@ class SurrogateRun:
             while True:
                 time.sleep(3_600)
 
-    def _serve(self) -> str:
+    def _start(self) -> None:
+        """Start the server and, so that both import their packages at once, the sampler, and wait for the server."""
         say("starting server, sampler and trainer", quiet=self._quiet)
         ready, database = self._folder / "server.url", self._folder / "surrogym.db"
-        options = ["--port", "0", "--database", str(database), "--ready-file", str(ready), "--log-level", "warning"]
-        return await_file(self._children.start("server", "surrogym_server", ["serve", *options]), ready)
-
-    def _employ_sampler(self) -> None:
-        say(f"live server, with a page to look at: {self._api.url}  (run folder: {self._folder})", quiet=self._quiet)
-        self._api.create_surrogate(self._settings.task, self._settings.spec())
-        if steps := self._settings.description_steps:
-            self._api.report_steps(self._settings.task, steps, note="description")
+        port = self._url.rpartition(":")[2]
+        options = ["--port", port, "--database", str(database), "--ready-file", str(ready), "--log-level", "warning"]
+        server = self._children.start("server", "surrogym_server", ["serve", *options])
         named = self._settings.demo_task.environment
         # a sampler imports a user's module only if --env names the module
         own = ["--env", named] if ":" in named else []
         self._children.start("sampler", "surrogym", ["sample", *self._common, *own])
+        await_file(server, ready)
+
+    def _register(self) -> None:
+        say(f"live server, with a page to look at: {self._api.url}  (run folder: {self._folder})", quiet=self._quiet)
+        self._api.create_surrogate(self._settings.task, self._settings.spec())
+        if steps := self._settings.description_steps:
+            self._api.report_steps(self._settings.task, steps, note="description")
 
     def _employ_trainer(self) -> Child:
         options = [*self._settings.training_options, "--out", str(self._policy), "--seed", str(self._settings.seed)]
@@ -151,7 +156,7 @@ class SurrogateRun:
 
     @property
     def _common(self) -> list[str]:
-        return [self._settings.task, "--server", self._api.url, "--wait", str(PATIENCE_SECONDS)]
+        return [self._settings.task, "--server", self._url, "--wait", str(PATIENCE_SECONDS)]
 
     def _design(self) -> None:
         with progress("design", quiet=self._quiet) as update:
