@@ -1,7 +1,7 @@
 """Two interfaces: ``SessionEngine`` runs sessions, and ``Compute`` computes rounds of designs.
 
 Requests and replies are plain data. The docstrings state laws that each implementation has to keep, and functions in
-``surrogym_server.testing`` test them.
+``tests/support`` test them.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Test functions for authors of a model family, an engine or a ``Compute``. Each checks one law of the interface, and
-raises ``AssertionError`` if it is broken.
+"""Test functions for authors of a model family. Each checks one law of the interface, and raises ``AssertionError`` if
+it is broken.
 
 Examples:
     >>> import pytest
@@ -12,18 +12,8 @@ Examples:
 
 from surrogym_server.testing.ability_laws import LAWS_OF_ABILITIES
 from surrogym_server.testing.cases import ModelCase, model_cases
-from surrogym_server.testing.compute_laws import LAWS_OF_COMPUTE, ComputeCase
-from surrogym_server.testing.engine_laws import LAWS_OF_ENGINES, EngineCase
 from surrogym_server.testing.model_laws import LAWS_OF_MODELS as _BASIC
 
 LAWS_OF_MODELS = (*_BASIC, *LAWS_OF_ABILITIES)
 
-__all__ = [
-    "LAWS_OF_COMPUTE",
-    "LAWS_OF_ENGINES",
-    "LAWS_OF_MODELS",
-    "ComputeCase",
-    "EngineCase",
-    "ModelCase",
-    "model_cases",
-]
+__all__ = ["LAWS_OF_MODELS", "ModelCase", "model_cases"]

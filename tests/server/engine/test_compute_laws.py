@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from support.compute_laws import LAWS_OF_COMPUTE, ComputeCase
 from surrogym_server.engine.design_job import DesignJob
 from surrogym_server.engine.fits import Fits
-from surrogym_server.testing import LAWS_OF_COMPUTE, ComputeCase
 
 
 @pytest.mark.parametrize("law", LAWS_OF_COMPUTE, ids=lambda law: law.__name__)

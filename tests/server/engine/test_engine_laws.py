@@ -8,12 +8,12 @@ from collections.abc import Callable
 
 import pytest
 
+from support.engine_laws import LAWS_OF_ENGINES, EngineCase
 from surrogym_server.engine.local import Limits, LocalEngine
 from surrogym_server.engine.models import ModelCache
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import UnknownModel
 from surrogym_server.models.port import DynamicsModel
-from surrogym_server.testing import LAWS_OF_ENGINES, EngineCase
 
 SURROGATE = 5
 

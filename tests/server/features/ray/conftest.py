@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
+from support.engine_laws import EngineCase
 from support.postgresql import Postgresql
 from support.real_steps import columns
 from surrogym_sampler.original import classic
@@ -18,7 +19,6 @@ from surrogym_server.features.ray import pool
 from surrogym_server.settings import Settings
 from surrogym_server.storage.records import NewModel, NewSurrogate
 from surrogym_server.storage.sql import Storage, open_storage
-from surrogym_server.testing import EngineCase
 
 NAME, HOSTS = "pendulum", 2
 LEASE = 6.0  # a busy machine may keep a host from renewing for some seconds

@@ -20,6 +20,7 @@ import sqlalchemy as sa
 
 from support import pendulum
 from support.alternating import alternating
+from support.engine_laws import LAWS_OF_ENGINES, EngineCase
 from support.postgresql import Postgresql
 from support.server import ServerProcess, running_server
 from surrogym_client.transport import HttpSurrogate, Transport
@@ -32,7 +33,6 @@ from surrogym_server.features.ray.host import Refused
 from surrogym_server.features.ray.store import LiveSessions, SessionHolder
 from surrogym_server.settings import Settings
 from surrogym_server.storage.sql import Storage
-from surrogym_server.testing import LAWS_OF_ENGINES, EngineCase
 from surrogym_shared.wire import OpenSession
 
 ray = pytest.importorskip("ray")

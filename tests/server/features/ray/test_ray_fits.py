@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 
+from support.compute_laws import LAWS_OF_COMPUTE, ComputeCase
 from support.real_steps import columns
 from surrogym_sampler.original import classic
 from surrogym_server.convert import stored_definition
@@ -21,7 +22,6 @@ from surrogym_server.engine.design_job import DesignJob, DesignResult
 from surrogym_server.environment.samples import Samples
 from surrogym_server.errors import PluginFailed, Unavailable
 from surrogym_server.settings import Settings
-from surrogym_server.testing import LAWS_OF_COMPUTE, ComputeCase
 
 ray = pytest.importorskip("ray")
 

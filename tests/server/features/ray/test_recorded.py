@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from support.engine_laws import LAWS_OF_ENGINES, EngineCase
 from surrogym_sampler.original import classic
 from surrogym_server.convert import stored_definition
 from surrogym_server.engine.local import Limits
@@ -23,7 +24,6 @@ from surrogym_server.features.ray.leases import Pace
 from surrogym_server.features.ray.recorded import RecordedEngine
 from surrogym_server.features.ray.store import LiveSessions, SessionLease
 from surrogym_server.storage.sql import Storage, open_storage
-from surrogym_server.testing import LAWS_OF_ENGINES, EngineCase
 
 NAME, LEASE = "pendulum", 60.0
 
