@@ -7,6 +7,7 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
+import sys
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
@@ -14,6 +15,7 @@ from pathlib import Path
 
 import pytest
 
+from support import compute_laws
 from support.compute_laws import LAWS_OF_COMPUTE, ComputeCase
 from support.real_steps import columns
 from surrogym_sampler.original import classic
@@ -34,6 +36,8 @@ pytestmark = [pytest.mark.timeout(600), pytest.mark.filterwarnings("ignore::Futu
 @pytest.fixture(scope="module", autouse=True)
 def cluster() -> Iterator[None]:
     os.environ |= {"RAY_USAGE_STATS_ENABLED": "0", "RAY_worker_niceness": "0"}
+    for module in (compute_laws, sys.modules[__name__]):  # the processes of tasks do not find ``support``
+        ray.cloudpickle.register_pickle_by_value(module)
     ray.init("local", num_cpus=2, num_gpus=1, namespace=pool.NAMESPACE, include_dashboard=False, log_to_driver=False)
     yield
     ray.shutdown()
