@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from support import wheel
-from support.rail import SPEC, HangsRight, Rail, RaisesRight
+from support.rail import SPEC, HangsRight, Rail, RaisesRight, Timed
 from surrogym_client.errors import InvalidInput
 from surrogym_sampler import original
 from surrogym_sampler.original.errors import UnknownEnvironment
@@ -116,6 +116,37 @@ def test_a_coordinate_that_wraps_is_said_with_its_jump_and_its_steps_are_learned
         for remark in remarks
     )
     assert sum(abs(s.next_coordinates[0] - s.coordinates[0]) > 1024 for s in api.samples(name)) >= 2
+    api.delete_surrogate(name)
+
+
+@pytest.mark.parametrize("machine", [True, False], ids=["machine", "simulator"])
+def test_a_step_that_comes_late_is_said_of_a_machine_but_not_of_a_simulator(api, machine):
+    told, name, environment = [], f"timed-{uuid.uuid4().hex[:8]}", Timed(machine, late=0.5)
+    api.create_surrogate(name, environment.spec())
+    api.add_queries(name, rollouts=[[LEFT] * 12])
+    settings = SamplerSettings(name="worker", until_done=True, time_limit=60.0)
+    Sampler(api, name, environment, settings, lambda query, *said: told.append((query.purpose, *said))).run()
+    (remark,) = (remark for purpose, _, remark in told if purpose == "manual")
+    seconds = [sample.seconds for sample in api.samples(name) if sample.purpose == "manual"]
+    assert seconds[0] is None
+    assert len(seconds) == 12, "nothing is lost"
+    assert max(seconds[1:]) == seconds[6] >= 0.5
+    if machine:
+        assert re.fullmatch(
+            rf"\d+ of 11 intervals between steps are off by half of the sampling period or more, such as "
+            rf"{seconds[6]:.3g} s, where the specification declares 0.02 s",
+            remark,
+        )
+    else:
+        assert remark == ""
+    api.delete_surrogate(name)
+
+
+def test_a_known_simulator_is_not_timed(api):
+    environment, name = original.make("Pendulum-v1", access="reset", budget=4, initial=4), f"p-{uuid.uuid4().hex[:8]}"
+    api.create_surrogate(name, environment.spec())
+    Sampler(api, name, environment, SamplerSettings(max_queries=1, wait_seconds=5.0, time_limit=60.0)).run()
+    assert all(sample.seconds is None for sample in api.samples(name))
     api.delete_surrogate(name)
 
 

@@ -59,6 +59,28 @@ class Rail:
         pass
 
 
+class Timed(Rail):
+    """Declares a sampling period, and waits for it in each step if it is a machine; its seventh step may come late."""
+
+    period = 0.02
+
+    def __init__(self, machine: bool, late: float = 0.0):
+        super().__init__()
+        self.machine, self.late, self.steps = machine, late, 0
+
+    def spec(self):
+        return SPEC.model_copy(update={"sampling_period": self.period})
+
+    def reset(self, *, seed=None):
+        self.steps = 0
+        return super().reset(seed=seed)
+
+    def step(self, action):
+        self.steps += 1
+        time.sleep(self.period * self.machine + self.late * (self.steps == 7))
+        return super().step(action)
+
+
 class RaisesRight(Rail):
     """Raises when it is pushed to the right."""
 

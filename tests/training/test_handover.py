@@ -373,6 +373,23 @@ def test_a_policy_in_whose_audit_an_undeclared_encoder_wraps_is_not_trusted(
         assert re.match(rf"x jumps by 2048 in [1-9] of {count} steps, as", handover.audit.faults[0])
 
 
+@pytest.mark.parametrize("whole", [False, True], ids=["queries", "episodes"])
+def test_a_policy_whose_audit_has_a_late_step_is_not_trusted(server_process: ServerProcess, whole: bool) -> None:
+    environment = rail.Timed(machine=True)
+    with placed(server_process.url, environment.spec(), environment) as place:
+        environment.late = 0.5
+        if whole:
+            make = partial(open_episode, "rail", None, lambda: environment)
+            result = evaluate(place.subject().predict, make, EvaluationSettings(3))
+            handover = judge_episodes(place.subject(), result)
+        else:
+            handover = hand_over(place.subject(), AUDIT)
+        assert handover.audit is not None
+        assert not handover.trusted
+        count = 57 if whole else 19
+        assert re.match(rf"\d+ of {count} intervals between steps are off .* such as 0\.5", handover.audit.faults[0])
+
+
 class Growing(Line):
     """x doubles in each step, and is paid by its square. In 20 steps that is 1e10; a model of [-1, 1] imagines 30."""
 

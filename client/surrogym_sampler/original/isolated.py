@@ -24,7 +24,7 @@ from surrogym_sampler.original.errors import (
     UnknownEnvironment,
     sentence,
 )
-from surrogym_sampler.original.protocol import Array, Environment, Factory, RealStep
+from surrogym_sampler.original.protocol import Array, Environment, Factory, RealStep, runs_in_parallel
 from surrogym_sampler.original.rollouts import answering, keeping_limits
 from surrogym_shared.spec import EnvironmentSpec
 
@@ -59,6 +59,7 @@ class IsolatedEnvironment:
         self._number = 0  # number of the last request
         # Additional seconds for closing, in which the fallback controller brings the machine to rest.
         self._rest_seconds = 0.0
+        self.parallel = False  # whether several instances may be open at once; known once the process has started
         self._fallback_steps = self._earlier_steps = 0  # fallback's steps in the running process, and in earlier ones
         self._process: BaseProcess | None = None
         self._pipe: Connection | None = None
@@ -175,7 +176,7 @@ class IsolatedEnvironment:
         if not ok:
             self._kill()
             raise UnknownEnvironment(value)
-        self._rest_seconds = value
+        self._rest_seconds, self.parallel = value
 
     def _kill(self) -> int | None:
         process, self._process = self._process, None
@@ -249,7 +250,7 @@ def _serve(pipe: Connection, factory: Factory, step_limit: float, fallback: str 
     closed, rest_seconds = False, getattr(environment, "rest_seconds", 0.0)
     working.seconds += rest_seconds
     try:
-        pipe.send((True, rest_seconds))
+        pipe.send((True, (rest_seconds, runs_in_parallel(environment))))
         while not closed:
             closed = _serve_one(pipe, environment, working) == "close"
     except (EOFError, OSError):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from math import isclose
 
 from surrogym_sampler.original.errors import UnknownEnvironment
+from surrogym_sampler.original.protocol import runs_in_parallel
 from surrogym_shared.spec import EnvironmentSpec
 
 NAMES = ("sampling_period", "dt")  # names of attributes, and of entries of `metadata`, that give the sampling period
@@ -19,6 +20,12 @@ def period_of(environment: object) -> float | None:
     found = [value for name in NAMES for value in (getattr(environment, name, None), noted.get(name))]
     numbers = (float(value) for value in found if isinstance(value, int | float) and not isinstance(value, bool))
     return next((number for number in numbers if number > 0), None)
+
+
+def is_timed(environment: object, spec: EnvironmentSpec) -> bool:
+    """Return whether the seconds between the steps of an environment are measured, to be compared with the declared
+    sampling period: it can only be reset, and is no simulator of which several instances may be open at once."""
+    return spec.sampling_period is not None and spec.access == "reset" and not runs_in_parallel(environment)
 
 
 def is_other(one: float | None, other: float | None) -> bool:

@@ -18,6 +18,7 @@ from surrogym_client.surrogates.waiting import ENDED
 from surrogym_client.transport.api import Api
 from surrogym_client.transport.connection import AWAY, ONE_ATTEMPT, Retries
 from surrogym_sampler.original.errors import QueryRefused, SnapshotGone, StepFailed, StepRefused, message_of
+from surrogym_sampler.original.periods import is_timed
 from surrogym_sampler.original.protocol import (
     Environment,
     OriginalEnvironment,
@@ -32,6 +33,7 @@ from surrogym_sampler.queries.query_limits import check_action, check_environmen
 from surrogym_sampler.queries.returning import Returning, snapshots_of
 from surrogym_sampler.queries.sample_conversion import reset_seed, sample_of
 from surrogym_sampler.queries.settings import Outcome, SamplerReport, SamplerSettings
+from surrogym_shared.periods import irregular
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.starts import not_declared
 from surrogym_shared.wire import ClaimedQueries, NewSample, Phase, Query, RolloutQuery, StepQuery
@@ -136,6 +138,7 @@ class Sampler:
         self._begun: Query | None = None  # query whose real steps began last
         self._returning: Returning | None = None  # the environment's snapshots; None if it has none
         self._phase: Phase | None = None
+        self._timed = False  # whether the seconds between steps are measured
         self._spec: EnvironmentSpec
         self._own: EnvironmentSpec
         self._violations: Violations
@@ -210,6 +213,7 @@ class Sampler:
         self._spec, self._own = self._api.surrogate(self._surrogate).spec, self._environment.spec()
         check_environment(self._surrogate, self._spec, self._own)
         self._violations = Violations(self._own)
+        self._timed = is_timed(self._environment, self._own)
 
     def _wait_seconds(self) -> float:
         """Return the seconds that the next claim waits for queries."""
@@ -291,11 +295,12 @@ class Sampler:
             self._hand_in(taken)
             self._steps += len(taken)
             raise
-        turns = ""
+        remarks = [self._remark, self._returning.remarks() if self._returning else ""]
         if query.kind == "rollout":
             self._latest.extend(taken)
-            turns = undeclared_turns(self._own, list(self._latest), len(taken))
-        remark = "; ".join(filter(None, (self._remark, turns, self._returning.remarks() if self._returning else "")))
+            remarks.append(undeclared_turns(self._own, list(self._latest), len(taken)))
+            remarks.append(irregular(self._own, [[s.seconds for s in taken if s.seconds is not None]]))
+        remark = "; ".join(filter(None, remarks))
         return _Answer(query, taken, outcome, error, remark, for_good)
 
     def _deliver(self, answer: _Answer) -> _Answer:
@@ -346,6 +351,7 @@ class Sampler:
             assert self._returning is not None  # check_query has refused snapshots if the environment has none
             self._returning.begin(query.snapshot)
             state = np.empty(0)  # only in queries that begin at a reset, actions depend on the state
+        ended: float | None = None  # when the step before ended
         for number, expected in enumerate(query.actions):
             if self._stopped():
                 return
@@ -356,7 +362,10 @@ class Sampler:
             check_action(self._own, action)
             step = environment.act(np.array(action))
             state = np.asarray(step.next_coordinates, dtype=np.float64)
+            before, ended = ended, time.monotonic()
             taken.append(sample_of(query, step, size, number))
+            if self._timed and before is not None:
+                taken[-1] = taken[-1].model_copy(update={"seconds": ended - before})
             if step.terminated or step.truncated:
                 return
             if self._returning is not None:

@@ -3,6 +3,7 @@ episodes kept the limits of their specification."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
@@ -17,6 +18,7 @@ from surrogym_sampler.original.episode import Episode, Moment
 from surrogym_sampler.original.episodes import draw
 from surrogym_sampler.original.errors import RAISED, EvaluationFailed, PolicyMisfit
 from surrogym_sampler.original.fitting import check_policy
+from surrogym_sampler.original.periods import is_timed
 from surrogym_sampler.original.protocol import LONGEST_EPISODE
 from surrogym_shared.limits import left_too_often, limits_of, must_stop, past, room
 from surrogym_shared.logs.rewards import declared_reward
@@ -89,6 +91,7 @@ class Trace:
     action: Array  # (T, F) action of each step
     reward: Array  # (T,) reward of each step
     terminated: bool = False  # whether the last step terminated the episode
+    seconds: tuple[float, ...] = ()  # (T - 1,) from the end of one step to that of the next; () if not measured
 
 
 @dataclass(frozen=True)
@@ -281,12 +284,15 @@ class _Tally:
     held: int = 0  # number of last steps in a row that met the success criterion
     fallbacks: int = 0  # number of steps in which the fallback acted in the place of the policy
     limit: int = field(init=False)
+    timed: bool = field(init=False)  # whether the times of steps are measured
     path: list[Array] = field(default_factory=list)
     actions: list[Array] = field(default_factory=list)
     rewards: list[float] = field(default_factory=list)
+    times: list[float] = field(default_factory=list)  # when each step ended
 
     def __post_init__(self) -> None:
         self.limit = self.episode.spec.time_limit or LONGEST_EPISODE
+        self.timed = is_timed(self.episode, self.episode.spec)
         self.path.append(self.moment.coordinates)
 
     @property
@@ -297,11 +303,14 @@ class _Tally:
     def trace(self) -> Trace:
         """The episode so far, which must have at least one step."""
         ended = self.moment.terminated
-        return Trace(np.stack(self.path), np.stack(self.actions), np.array(self.rewards), ended)
+        seconds = tuple(np.diff(self.times).tolist())
+        return Trace(np.stack(self.path), np.stack(self.actions), np.array(self.rewards), ended, seconds)
 
     def step(self, action: Array) -> None:
         """Take one real step, and add it to the sums."""
         self.moment = moment = self.episode.step(action)
+        if self.timed:
+            self.times.append(time.monotonic())
         self.total += moment.reward
         self.length += 1
         self.held = self.held + 1 if _holds(self.episode.spec, moment.coordinates) else 0

@@ -16,6 +16,7 @@ from surrogym_client.transport.api import Api
 from surrogym_sampler.original.actions import decode_actions
 from surrogym_sampler.original.protocol import LONGEST_EPISODE
 from surrogym_shared.network import Network
+from surrogym_shared.periods import irregular
 from surrogym_shared.port import SurrogatePort
 from surrogym_shared.spec import LONGEST_ROLLOUT, EnvironmentSpec
 from surrogym_shared.starts import not_declared
@@ -202,18 +203,41 @@ def take(
     firsts = {sample.query_id: sample.coordinates for sample in sorted(answers, key=lambda sample: -sample.id)}
     audit = judge(beside, before, subject.promise(), subject.floor, found).model_copy(update=about)
     others = [s for s in api.samples(name) if s.trajectory is not None and s.query_id not in wanted]
-    return _with_machine(audit, spec, list(firsts.values()), others, answers)
+    seconds: dict[int | None, list[float]] = {sample.trajectory: [] for sample in answers}
+    for sample in answers:
+        if sample.seconds is not None:
+            seconds[sample.trajectory].append(sample.seconds)
+    return _with_machine(audit, spec, _Machine(list(firsts.values()), others, answers, list(seconds.values())))
 
 
-def _with_machine(
-    audit: Audit, spec: EnvironmentSpec, starts: Sequence[ArrayLike], before: Sequence[Step], steps: Sequence[Step]
-) -> Audit:
-    """Add faults to an audit if resets led to ``starts``, each (C,), that are not declared, because the promise is one
-    for the declared starts; or if a coordinate wraps in its steps without being an angle, as those before them show.
+@dataclass(frozen=True)
+class _Machine:
+    """What an audit saw of the machine itself.
+
+    Attributes:
+        starts: the states (C,) to which its resets led.
+        before: earlier steps of rollouts.
+        steps: its own steps.
+        seconds: of each of its rollouts the seconds from one step to the next, as far as they were measured.
+    """
+
+    starts: Sequence[ArrayLike]
+    before: Sequence[Step]
+    steps: Sequence[Step]
+    seconds: Sequence[Sequence[float]]
+
+
+def _with_machine(audit: Audit, spec: EnvironmentSpec, seen: _Machine) -> Audit:
+    """Add faults to an audit if the machine is not as declared, because the promise is one for the declared machine: if
+    a reset led to another start, a coordinate that is no angle wraps, or an interval is not the sampling period.
     Environments that can be set to states, or return to saved ones, are not judged by this."""
-    if spec.query != "rollout" or spec.snapshots:
+    if spec.access != "reset":
         return audit
-    faults = (not_declared(spec, starts), undeclared_turns(spec, [*before, *steps], len(steps)))
+    faults = (
+        not_declared(spec, seen.starts),
+        undeclared_turns(spec, [*seen.before, *seen.steps], len(seen.steps)),
+        irregular(spec, seen.seconds),
+    )
     if not any(faults):
         return audit
     return audit.model_copy(update={"passed": False, "faults": (*filter(None, faults), *audit.faults)})
@@ -241,7 +265,8 @@ def judge_episodes(subject: Subject, result: Evaluation) -> Handover:
     about = {"steps": result.steps, "episodes": len(result.returns), "range_left": range_left(spec, q)}
     starts = [trace.coordinates[0] for trace in result.traces]
     others = [sample for sample in api.samples(subject.name) if sample.trajectory is not None]
-    audit = _with_machine(audit.model_copy(update=about), spec, starts, others, steps)
+    seen = _Machine(starts, others, steps, [trace.seconds for trace in result.traces])
+    audit = _with_machine(audit.model_copy(update=about), spec, seen)
     trusted, reason = _verdict(audit, subject.floor)
     return Handover(audit.after, audit, trusted, reason)
 

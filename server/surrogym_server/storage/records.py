@@ -180,6 +180,7 @@ class Sample(RealStep):
     next_observation: Vector | None = None
     query_id: int | None = None
     step: int = 0  # index of this step in the answer to a rollout; 0 for a single step
+    seconds: float | None = None  # since the end of the step before in the same rollout; None if not measured
 
 
 @dataclass(frozen=True)

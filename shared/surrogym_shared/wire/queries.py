@@ -252,6 +252,11 @@ class NewSample(Request):
         description="name under which the sampler saved the state after the step (snapshot), where queries may begin; "
         "null if it saved none",
     )
+    seconds: Annotated[Measured, Field(ge=0)] | None = Field(
+        default=None,
+        description="seconds since the end of the step before in the same rollout, by the sampler's clock; null for a "
+        "first step, and if they were not measured",
+    )
 
 
 class AddSamples(Request):
@@ -349,6 +354,10 @@ class SampleView(Reply):
     reward: float = Field(description="reward of the step")
     terminated: bool = Field(description="whether the step ended the episode in a terminal state")
     truncated: bool = Field(description="whether the step ended the episode for another reason")
+    seconds: float | None = Field(
+        default=None,
+        description="seconds since the end of the step before in the same rollout; null if they were not measured",
+    )
     created_at: float = Field(description="when the sample was stored, in seconds since 1970, by the server's clock")
 
 

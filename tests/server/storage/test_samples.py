@@ -54,6 +54,17 @@ def test_answering_a_query_again_returns_the_same_sample_id(
     assert storage.samples.count(name) == 2
 
 
+def test_the_seconds_of_a_step_are_stored_and_make_no_other_sample_of_it(
+    storage: Storage, make: Callable[..., str], answer: Callable[..., NewSample]
+) -> None:
+    name = make(queries=1)
+    [leased] = storage.queries.claim(name, "a", 1, LONG)
+    storage.samples.add(name, "a", [answer(leased, seconds=0.05)])
+    assert storage.samples.add(name, "a", [answer(leased)]).duplicates == 1
+    [sample] = storage.samples.page(name, 0, 10)
+    assert sample.seconds == 0.05
+
+
 def test_another_answer_under_the_same_lease_is_refused(
     storage: Storage, make: Callable[..., str], answer: Callable[..., NewSample]
 ) -> None:

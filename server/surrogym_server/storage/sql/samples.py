@@ -94,7 +94,7 @@ class Samples:
             InvalidInput: a logged sample names a query, or an answer lacks a step or has more steps than the query.
             IdempotencyConflict: the same lease token or idempotency key came with other samples.
         """
-        body = fingerprint(sampler, [asdict(sample) for sample in samples] if key else [])
+        body = fingerprint(sampler, [_content(sample) for sample in samples] if key else [])
         with self._database.write() as connection:
             surrogate = hold(connection, name)
             if log is not None:  # logged samples are identified by their position in the log, not by a key
@@ -191,6 +191,11 @@ def _store(
     return AddedSamples(tuple(ids[identity] for identity in identities), len(batch) - len(new))
 
 
+def _content(sample: NewSample) -> dict[str, Any]:
+    """Return what makes two samples equal: all but the seconds, which samples that were stored earlier don't have."""
+    return {name: value for name, value in asdict(sample).items() if name != "seconds"}
+
+
 def _identity(place: int, sample: NewSample, lease: Answered | None) -> Identity:
     """Return the identity of a sample in its batch: its lease and step, or its index if it has no lease."""
     return (lease.lease_id, sample.step) if lease else (None, place)
@@ -244,7 +249,8 @@ def row_of(
         "truncated": sample.truncated,
         "observation": sample.observation,
         "next_observation": sample.next_observation,
-        "fingerprint": fingerprint(asdict(sample)),
+        "seconds": sample.seconds,
+        "fingerprint": fingerprint(_content(sample)),
         "created_at": surrogate.now,
     }
 

@@ -260,6 +260,7 @@ samples = sa.Table(
     sa.Column("truncated", sa.Boolean, nullable=False),
     sa.Column("observation", Floats),
     sa.Column("next_observation", Floats),
+    sa.Column("seconds", sa.Double),  # since the end of the step before in the same rollout
     sa.Column("fingerprint", sa.Text, nullable=False),
     sa.Column("created_at", sa.Double, nullable=False),
     sa.UniqueConstraint("lease_id", "step"),

@@ -1,0 +1,39 @@
+"""Comparison of the intervals between real steps with the declared sampling period."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from statistics import median
+
+from surrogym_shared.spec import EnvironmentSpec
+
+FEWEST = 5  # in a rollout with fewer intervals, the clock of the original environment is not known
+REAL_TIME = 0.8  # an original environment whose median interval is a smaller share of the period is a simulator
+OFF = 0.5  # an interval that differs from the period by at least this share of it is named
+
+
+def irregular(spec: EnvironmentSpec, rollouts: Sequence[Sequence[float]]) -> str:
+    """Say how many steps had an interval that is off by half of the sampling period or more, and name the interval that
+    is farthest off. Returns "" if there is none, if no period is declared, or if the steps are those of a simulator,
+    which is faster than the clock.
+
+    Args:
+        spec: the specification.
+        rollouts: of each rollout the seconds from one step to the next.
+
+    Examples:
+        "2 of 40 intervals between steps are off by half of the sampling period or more, such as 0.11 s, where the
+        specification declares 0.05 s"
+    """
+    period = spec.sampling_period
+    if period is None:
+        return ""
+    timed = [seconds for seconds in rollouts if len(seconds) >= FEWEST and median(seconds) >= REAL_TIME * period]
+    off = [one for seconds in timed for one in seconds if abs(one - period) >= OFF * period]
+    if not off:
+        return ""
+    farthest = max(off, key=lambda one: abs(one - period))
+    return (
+        f"{len(off)} of {sum(map(len, timed))} intervals between steps are off by half of the sampling period or more, "
+        f"such as {farthest:.3g} s, where the specification declares {period:g} s"
+    )
