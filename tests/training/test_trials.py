@@ -152,6 +152,14 @@ def test_a_number_of_rounds_and_of_steps_raises_the_budget(
     assert result.virtual_steps == sum(one.virtual_steps for one in trials.trained)
 
 
+@pytest.mark.parametrize(("phase", "tries"), [("ready", False), ("unsure", True), ("over_budget", True)])
+def test_rounds_of_a_ready_design_take_no_trial(tmp_path: Path, phase: str, tries: bool) -> None:
+    api, port = SimpleNamespace(surrogate=lambda _: SimpleNamespace(phase=phase)), SimpleNamespace(spec=Late().spec)
+    rounds = LoopSettings(queries=EPISODE)
+    training = AuditedTraining(api, "late", port, tmp_path / "p.zip", SETTINGS, rounds)  # type: ignore[arg-type]
+    assert training._may_try(rounds) is tries
+
+
 def test_an_audit_sends_no_policy_that_sees_integrals_to_a_sampler(trials_server: ServerProcess, waiting: str) -> None:
     with Api(trials_server.url) as api, HttpSurrogate(trials_server.url, waiting) as own:
         port = IntegralPort(own, Integrals(np.array([0]), np.array([1.0]), np.array([0.0])), ("level",))

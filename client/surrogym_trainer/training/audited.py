@@ -103,7 +103,7 @@ class AuditedTraining:
     def _first(self) -> TrainResult:
         rounds, inputs = self.rounds, (self.api, self.name, self.port, self.out, self.settings)
         tries = rounds is not None and allows_trials(self.port.spec(), self.settings)
-        if rounds and tries and (rounds.queries or is_waiting_for_trials(self.api, self.name)):
+        if rounds and tries and self._may_try(rounds):
             return Trials(*inputs, rounds, self.progress, self.waiting, self.candidates).train()
         if rounds is None or not rounds.queries:
             return train(self.port, self.out, self._chosen, self.progress)
@@ -111,6 +111,12 @@ class AuditedTraining:
         result = loop.train()
         self._unspent = loop.unspent
         return self._best(result)
+
+    def _may_try(self, rounds: LoopSettings) -> bool:
+        """Whether policies try episodes: with a number of real steps, the rounds of a ready design take none."""
+        if rounds.queries:
+            return self.api.surrogate(self.name).phase != "ready"
+        return is_waiting_for_trials(self.api, self.name)
 
     def _best(self, result: TrainResult) -> TrainResult:
         """Return the result whose policy earns most in the latest model: that of the last training, or of an earlier
