@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import gymnasium
 import numpy as np
 
 from surrogym_sampler.original.episode import Episode, Moment
@@ -35,8 +36,6 @@ class GymnasiumEpisode(Episode):
     parallel = True
 
     def __init__(self, spec: EnvironmentSpec) -> None:
-        import gymnasium
-
         super().__init__(spec)
         self._task = task_for(spec.environment, "default")
         self._env: Any = gymnasium.make(spec.environment).unwrapped

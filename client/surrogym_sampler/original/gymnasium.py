@@ -6,6 +6,7 @@ import io
 from collections.abc import Mapping
 from typing import Any
 
+import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
@@ -47,8 +48,6 @@ class GymnasiumEnvironment:
     parallel = True
 
     def __init__(self, spec: EnvironmentSpec) -> None:
-        import gymnasium
-
         self._spec = spec
         self._task = task_for(spec.environment, spec.design.preset)
         self._env: Any = gymnasium.make(spec.environment).unwrapped

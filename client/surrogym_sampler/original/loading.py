@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
+import gymnasium
 from pydantic import ValidationError
 
 from surrogym_sampler.original.actions import require_same_action
@@ -121,8 +122,6 @@ def is_own(name: str) -> bool:
 def is_known(name: str) -> bool:
     """Return whether a name that came from a server may be opened without consent: an adapter knows it, and it runs no
     user's code."""
-    import gymnasium
-
     entry = gymnasium.registry.get(name)
     its_own = entry is not None and str(entry.entry_point).startswith("gymnasium.envs.mujoco.")
     return name in TASKS or its_own or is_trusted(name)
@@ -182,8 +181,6 @@ def fits(noted: str, name: str) -> bool:
 def own_time_limit(name: str) -> int:
     """Return the time limit in steps with which Gymnasium registers a known environment; ``LONGEST_EPISODE`` if there
     is none."""
-    import gymnasium
-
     if name in gymnasium.registry:
         return gymnasium.spec(name).max_episode_steps or LONGEST_EPISODE
     simulator = open_simulator(name)

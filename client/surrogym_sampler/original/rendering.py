@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from typing import Any, Protocol, runtime_checkable
 
+import gymnasium
 import numpy as np
 
 from surrogym_client.environments.pictures import NotRenderable, Picture, Renderer
@@ -82,8 +83,6 @@ class _Native:
     """A Gymnasium environment that is set to states and rendered, but never stepped."""
 
     def __init__(self, name: str, spec: EnvironmentSpec) -> None:
-        import gymnasium
-
         self._name, self._spec = name, spec
         try:
             self._env: Native = gymnasium.make(name, render_mode="rgb_array").unwrapped

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from gymnasium import spaces
 from numpy.typing import NDArray
 
 from surrogym_sampler.original.actions import decode_actions
@@ -133,7 +134,6 @@ def _of_learner(policy: Path, algorithm: str, *, trust: bool) -> Decision:
     Raises:
         NotDeployable: the policy has parts that are not layers, a clip or a scale.
     """
-    from gymnasium import spaces
 
     from surrogym_trainer.policies.files import Normalisation, is_normalised, read_learner, statistics_path
 
@@ -167,7 +167,6 @@ def _choices(acted: Any) -> tuple[int, ...]:
     Raises:
         NotDeployable: the space is neither continuous nor discrete from 0.
     """
-    from gymnasium import spaces
 
     match acted:
         case spaces.Box(shape=(_,)):

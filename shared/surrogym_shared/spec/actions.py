@@ -35,17 +35,11 @@ class BoxAction(Frozen):
         )
         for i, (low, high) in enumerate(zip(self.low, self.high, strict=True)):
             require_range(f"action {i}", low, high)
-        if self.bins is not None:
+        for name, entries in (("bins", self.bins), ("rate", self.rate)):
             require(
-                len(self.bins) == len(self.low),
-                f"action: expected {len(self.low)} entries in bins, one for each entry of the action, got "
-                f"{len(self.bins)}",
-            )
-        if self.rate is not None:
-            require(
-                len(self.rate) == len(self.low),
-                f"action: expected {len(self.low)} entries in rate, one for each entry of the action, got "
-                f"{len(self.rate)}",
+                entries is None or len(entries) == len(self.low),
+                f"action: expected {len(self.low)} entries in {name}, one for each entry of the action, got "
+                f"{len(entries or ())}",
             )
         return self
 

@@ -11,6 +11,7 @@ import os
 import sys
 from typing import Any
 
+import gymnasium
 import numpy as np
 
 from surrogym_sampler.original.adapters.parts import OfParts, action_of, flat
@@ -70,8 +71,6 @@ def make(name: str) -> Any:
     Raises:
         UnknownEnvironment: the environment can't be made.
     """
-    import gymnasium
-
     package, colon, _ = name.partition(":")
     if colon and package != ROBOTICS and os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())
@@ -84,8 +83,6 @@ def make(name: str) -> Any:
 
 
 def _way_out(name: str) -> str:
-    import gymnasium
-
     package = name.partition(":")[0]
     if package == ROBOTICS:
         return "(pip install 'surrogym[robotics]')"
