@@ -205,7 +205,6 @@ def plans(url: str, names: list[str]) -> list[str]:
         storage.surrogates.summaries(limit=100)
         storage.surrogates.summary(names[0])
         storage.samples.page(names[0], 0, 1_000)
-        storage.queries.counts(names[0])
         storage.queries.list(names[0], ("pending",))
         storage.queries.claim(names[1], "planned", 4, 60.0)
     finally:

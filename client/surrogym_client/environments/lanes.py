@@ -93,7 +93,8 @@ class Lanes:
         self.view = port.open(request)
         self._request = request
         self._deviations = deviations
-        self._rolls = request.autoreset_mode == "same_step" and isinstance(port, PolicyPort)
+        # Whether ``rollout`` can be used.
+        self.rolls_policies = request.autoreset_mode == "same_step" and isinstance(port, PolicyPort)
         self._seed = self.view.seed
         self._losses = 0
         self._reason = ""
@@ -139,32 +140,22 @@ class Lanes:
         self._cut, self._held = self._cut & ~chosen, self._held & ~chosen
         return LaneReset(self._observation.copy(), self._version.copy(), lost)
 
-    def step(self, action: NDArray[Any], mask: Bools | None = None) -> LaneStep:
-        """Step all lanes with actions (N, F) or (N,). With autoreset disabled, a mask (N,) selects the lanes."""
-        chosen = np.ones(self.num_envs, dtype=bool) if mask is None else mask
+    def step(self, action: NDArray[Any]) -> LaneStep:
+        """Step all lanes with actions (N, F) or (N,)."""
         try:
-            result = self._advance(action, chosen)
+            result = self._advance(action)
         except SessionLost as error:
             self._reopen(error)
             result = self._standing()
         began = _none(self.num_envs) if self.mode == "same_step" else ~self._running
-        cut, self._cut, self._held = self._cut & chosen, self._cut & ~chosen, _none(self.num_envs)
+        cut, self._cut, self._held = self._cut, _none(self.num_envs), _none(self.num_envs)
         if cut.any():
             result = self._ended(result, cut)
-        if not chosen.all():
-            result = replace(result, observation=np.where(chosen[:, None], result.observation, self._observation))
         step = LaneStep(result, began, self._version, cut, self._reason if cut.any() else None)
         self._version = result.model_version
         self._observation = result.observation
-        over = result.terminated | result.truncated
-        self._running = np.where(chosen, ~over | (self.mode == "same_step"), self._running)
+        self._running = ~(result.terminated | result.truncated) | (self.mode == "same_step")
         return step
-
-    @property
-    def rolls_policies(self) -> bool:
-        """Whether ``rollout`` can be used: the interface of the surrogate (port) supports it, and the autoreset mode is
-        ``same_step``."""
-        return self._rolls
 
     def rollout(
         self, policy: ActingPolicy, steps: int, noise: NoiseKey | None = None, until: Bools | None = None
@@ -211,8 +202,8 @@ class Lanes:
             result = self.port.reset(self.view.id, seed=numbers, mask=None if seeded.all() else seeded)
         return result
 
-    def _advance(self, action: NDArray[Any], chosen: Bools) -> StepResult:
-        idle = self._cut | self._held | ~chosen
+    def _advance(self, action: NDArray[Any]) -> StepResult:
+        idle = self._cut | self._held
         if idle.all():
             return self._standing()
         mask = ~idle if idle.any() else None

@@ -268,13 +268,6 @@ class Api:
     ) -> None:
         self.connection = Connection(url, token, timeouts, retries)
 
-    @classmethod
-    def over(cls, connection: Connection) -> Self:
-        """Make a client that uses an existing connection."""
-        api = cls.__new__(cls)
-        api.connection = connection
-        return api
-
     @property
     def url(self) -> str:
         """Address of the server."""

@@ -373,10 +373,10 @@ def test_a_surrogate_without_budget_gets_initial_queries_once_it_has_one(answere
     spec = pendulum.spec()
     answered.surrogates.create(NewSurrogate("late", spec, 0, 0.999))
     fit_all(designer)
-    assert answered.queries.counts("late").pending == 0
+    assert answered.surrogates.summary("late").queries.pending == 0
     answered.designs.improve("late", 3, raise_budget=True)
     fit_all(designer)
-    assert answered.queries.counts("late").pending == 3
+    assert answered.surrogates.summary("late").queries.pending == 3
 
 
 @pytest.mark.parametrize("error", [CancelledError(), RuntimeError("line 1\n  line 2")])

@@ -37,7 +37,7 @@ def test_audit_queries_beyond_their_total_limit_are_refused(storage: Storage, ma
     assert storage.queries.enqueue(name, many, purpose="audit", key="k") == ids, "the same again asks for nothing"
     with pytest.raises(BeyondBudget, match="at most 0 more real steps of audits, got 4"):
         storage.queries.enqueue(name, FOUR, purpose="audit")
-    assert storage.queries.counts(name).pending == LEAST_AUDITED
+    assert storage.surrogates.summary(name).queries.pending == LEAST_AUDITED
     storage.queries.enqueue(name, FOUR)
 
 

@@ -123,4 +123,4 @@ def test_a_sample_is_stored_as_late_if_the_clock_was_set_forward(
     assert storage.queries.sweep_expired() == 1
     storage.samples.add(name, "alive", [answer(leased)])
     assert [sample.late for sample in storage.samples.page(name, 0, 10)] == [True]
-    assert storage.queries.counts(name).answered == 1
+    assert storage.surrogates.summary(name).queries.answered == 1

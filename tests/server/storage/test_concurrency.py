@@ -45,7 +45,7 @@ def test_samplers_that_fetch_queries_concurrently_never_get_the_same_one(
 
     ids = [id for mine in at_once(work) for id in mine]
     assert len(ids) == len(set(ids)) == 60
-    assert storage.queries.counts(name) == QueryCounts(answered=60)
+    assert storage.surrogates.summary(name).queries == QueryCounts(answered=60)
     assert storage.samples.count(name) == 60
 
 

@@ -26,7 +26,6 @@ READS: dict[str, Callable[[Storage], Any]] = {
     "surrogates": lambda storage: storage.surrogates.summaries(),
     "due": lambda storage: storage.designs.due(),
     "queries": lambda storage: storage.queries.list(NAME),
-    "counts": lambda storage: storage.queries.counts(NAME),
     "samples": lambda storage: storage.samples.page(NAME, 0, 1_000),
     "arrays": lambda storage: storage.samples.arrays(NAME),
     "ledger": lambda storage: storage.ledger.read(NAME),
@@ -134,7 +133,7 @@ def test_the_error_for_a_table_dropped_at_run_time_names_the_table(url: str, ful
 BROKEN_ROWS = [
     ("UPDATE surrogates SET spec = '{\"a'", "surrogates", r"JSON in surrogates\.spec, got '{\"a'"),
     ("UPDATE surrogates SET phase = 'reaxy'", "surrogates", r"surrogates\.phase, got 'reaxy'"),
-    ("UPDATE queries SET status = ''", "counts", r"queries\.status"),
+    ("UPDATE queries SET status = ''", "queries", r"queries\.status"),
     ("UPDATE models SET fidelity = ''", "surrogates", "the confidence index of a model can't be read"),
     ("UPDATE models SET fidelity = ''", "models", r"JSON in models\.fidelity"),
     ("UPDATE events SET body = 'x'", "events", r"JSON in events\.body"),

@@ -159,5 +159,5 @@ def test_withdrawing_queries_leaves_leased_failed_and_answered_ones(
     storage.samples.add(name, "a", [answer(answered)])
     storage.queries.fail(name, failed.id, failed.token, "it broke")
     assert storage.queries.withdraw(name, ids) == 2
-    assert storage.queries.counts(name) == QueryCounts(pending=1, answered=1)
+    assert storage.surrogates.summary(name).queries == QueryCounts(pending=1, answered=1)
     assert storage.queries.withdraw(name, ids) == 0

@@ -26,7 +26,7 @@ def test_each_query_is_handed_out_once_and_the_oldest_first(storage: Storage, ma
     assert len(set(ids)) == 3
     assert storage.queries.claim(name, "c", 2, LONG) == []
     assert {query.attempt for query in first + second} == {1}
-    assert storage.queries.counts(name) == QueryCounts(leased=3)
+    assert storage.surrogates.summary(name).queries == QueryCounts(leased=3)
 
 
 def test_a_leased_query_names_its_sampler(storage: Storage, make: Callable[..., str]) -> None:
@@ -82,10 +82,10 @@ def test_a_query_with_an_expired_lease_counts_as_an_unresolved_real_step_at_once
     name = make(queries=1)
     storage.queries.claim(name, "dead", 1, SHORT)
     until(lambda: storage.ledger.read(name).unresolved == 1)
-    assert storage.queries.counts(name).leased == 1
+    assert storage.surrogates.summary(name).queries.leased == 1
     assert storage.queries.sweep_expired() == 1
     assert storage.queries.sweep_expired() == 0
-    assert storage.queries.counts(name).pending == 1
+    assert storage.surrogates.summary(name).queries.pending == 1
     assert storage.ledger.read(name).unresolved == 1
 
 
@@ -127,7 +127,7 @@ def test_a_query_whose_leases_expire_repeatedly_is_set_aside(
 
     def gone() -> bool:
         storage.queries.claim(name, "hangs", 1, SHORT)
-        return storage.queries.counts(name).set_aside == 1
+        return storage.surrogates.summary(name).queries.set_aside == 1
 
     until(gone)
     [query] = storage.queries.list(name, ["set_aside"])
@@ -151,7 +151,7 @@ def test_resuming_a_surrogate_requeues_queries_that_were_set_aside(storage: Stor
         assert (resumed.phase, resumed.error) == ("collecting", None)
         assert storage.designs.hopeless() == []
         assert fail(begun=False) == "pending"
-    assert storage.queries.counts(name).pending == 1
+    assert storage.surrogates.summary(name).queries.pending == 1
     told = [event.body for event in storage.events.list(name) if "asked_again" in event.body]
     assert [body["asked_again"] for body in told] == [1, 1]
 
@@ -199,12 +199,12 @@ def test_a_query_refused_by_the_environment_costs_no_attempt_and_no_budget(
     assert again == query, "a repeat"
     assert storage.queries.claim(name, "a", 1, LONG) == []
     assert storage.ledger.read(name) == LedgerRecord()
-    assert storage.queries.counts(name) == QueryCounts(refused=1)
+    assert storage.surrogates.summary(name).queries == QueryCounts(refused=1)
     assert storage.surrogates.summary(name).queries == QueryCounts(refused=1)
     assert storage.designs.left(name) == left + 1
     assert storage.designs.hopeless() == [name], "none is left to ask"
     storage.surrogates.change(name, paused=False)
-    assert storage.queries.counts(name) == QueryCounts(pending=1)
+    assert storage.surrogates.summary(name).queries == QueryCounts(pending=1)
 
 
 def test_a_failure_reported_twice_under_one_lease_counts_once(storage: Storage, make: Callable[..., str]) -> None:

@@ -64,7 +64,7 @@ def test_every_step_of_a_rollout_is_a_sample_of_one_trajectory(
     assert len({s.trajectory for s in samples}) == 1
     assert samples[0].trajectory is not None
     assert samples[0].requested_coordinates is None
-    assert storage.queries.counts(name) == QueryCounts(pending=1, answered=1)
+    assert storage.surrogates.summary(name).queries == QueryCounts(pending=1, answered=1)
     assert storage.ledger.read(name) == LedgerRecord(initial=3, resets=1)
 
 

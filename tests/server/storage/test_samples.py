@@ -29,7 +29,7 @@ def test_a_sample_answers_its_query_and_gets_its_purpose(
     assert (sample.purpose, sample.query_id, sample.attempt, sample.late) == ("initial", leased.id, 1, False)
     assert (sample.coordinates, sample.requested_coordinates) == (achieved, leased.coordinates)
     assert (sample.observation, sample.next_observation) == ((1.0, 0.0, 2.0), None)
-    assert storage.queries.counts(name) == QueryCounts(answered=1)
+    assert storage.surrogates.summary(name).queries == QueryCounts(answered=1)
     assert storage.ledger.read(name) == LedgerRecord(initial=1)
 
 
@@ -153,7 +153,7 @@ def test_a_late_sample_is_stored_once_and_answers_the_pending_query(
     assert storage.samples.add(name, "slow", [answer(leased)]).ids == late.ids
     [sample] = storage.samples.page(name, 0, 10)
     assert (sample.late, sample.purpose) == (True, "initial")
-    assert storage.queries.counts(name) == QueryCounts(answered=1)
+    assert storage.surrogates.summary(name).queries == QueryCounts(answered=1)
     assert storage.queries.claim(name, "b", 1, LONG) == []
     assert storage.ledger.read(name) == LedgerRecord(initial=1), "it is resolved now"
 
@@ -167,7 +167,7 @@ def test_a_sample_after_lease_expiry_is_late_even_before_the_lease_is_swept(
     storage.samples.add(name, "slow", [answer(leased)])
     assert storage.samples.page(name, 0, 1)[0].late
     assert storage.queries.sweep_expired() == 0
-    assert storage.queries.counts(name) == QueryCounts(answered=1)
+    assert storage.surrogates.summary(name).queries == QueryCounts(answered=1)
 
 
 def test_a_late_sample_does_not_end_the_lease_of_the_next_sampler(
@@ -178,9 +178,9 @@ def test_a_late_sample_does_not_end_the_lease_of_the_next_sampler(
     until(lambda: storage.queries.sweep_expired() == 1)
     [quick] = storage.queries.claim(name, "quick", 1, LONG)
     storage.samples.add(name, "slow", [answer(slow, reward=1.0)])
-    assert storage.queries.counts(name) == QueryCounts(leased=1)
+    assert storage.surrogates.summary(name).queries == QueryCounts(leased=1)
     storage.samples.add(name, "quick", [answer(quick, reward=2.0)])
-    assert storage.queries.counts(name) == QueryCounts(answered=1)
+    assert storage.surrogates.summary(name).queries == QueryCounts(answered=1)
     samples = storage.samples.page(name, 0, 10)
     assert [(s.sampler, s.attempt, s.late, s.reward) for s in samples] == [
         ("slow", 1, True, 1.0),
@@ -198,7 +198,7 @@ def test_the_sweep_of_expired_leases_does_not_requeue_a_query_answered_late(
     until(lambda: storage.ledger.read(name).unresolved == 2)
     storage.samples.add(name, "slow", [answer(slow)])
     assert storage.queries.sweep_expired() == 1
-    assert storage.queries.counts(name) == QueryCounts(answered=1)
+    assert storage.surrogates.summary(name).queries == QueryCounts(answered=1)
     assert storage.ledger.read(name).unresolved == 1
 
 
@@ -212,7 +212,7 @@ def test_a_late_sample_for_an_answered_query_is_stored(
     storage.samples.add(name, "quick", [answer(quick)])
     storage.samples.add(name, "slow", [answer(slow)])
     assert [sample.late for sample in storage.samples.page(name, 0, 10)] == [False, True]
-    assert storage.queries.counts(name) == QueryCounts(answered=1)
+    assert storage.surrogates.summary(name).queries == QueryCounts(answered=1)
 
 
 def test_a_sample_after_a_reported_failure_is_stored_as_late(

@@ -71,7 +71,7 @@ def test_dropping_a_snapshot_withdraws_its_queries_and_makes_a_fit_due(
     assert storage.designs.due() == []
     assert storage.snapshots.drop(name, ["one", "never"]) == 1
     assert list(storage.snapshots.all(name)) == ["two"]
-    assert storage.queries.counts(name) == QueryCounts(answered=1)
+    assert storage.surrogates.summary(name).queries == QueryCounts(answered=1)
     assert storage.designs.due() == [name]
     assert storage.snapshots.drop(name, ["one"]) == 0, "a repeat is harmless"
 
@@ -89,7 +89,7 @@ def test_a_leased_query_whose_snapshot_was_dropped_is_not_handed_out_again(
 ) -> None:
     first, second, third = storage.queries.claim(name, "a", 3, LONG)
     storage.snapshots.drop(name, ["one"])
-    assert storage.queries.counts(name).leased == 3, "its sampler may have returned to it before"
+    assert storage.surrogates.summary(name).queries.leased == 3, "its sampler may have returned to it before"
     for query in (first, second, third):
         storage.queries.fail(name, query.id, query.token, "gone", begun=False)
     left = storage.queries.claim(name, "b", 3, LONG)

@@ -72,7 +72,7 @@ def test_the_listed_summary_of_a_surrogate_equals_its_full_record(storage: Stora
         assert (summary.budget, summary.target) == (record.budget, record.target)
         assert summary.ledger == storage.ledger.read(summary.name)
         assert summary.ledger.total == storage.samples.count(summary.name)
-        assert summary.queries == storage.queries.counts(summary.name)
+        assert summary.queries == storage.surrogates.summary(summary.name).queries
     done, left, untouched = summaries
     assert (done.model_version, done.confidence_index, left.model_version) == (3, 0.95, None)
     assert (done.ledger.evaluation, done.ledger.failed, done.ledger.unresolved) == (7, 1, 1)
@@ -135,7 +135,7 @@ def test_a_design_without_samples_is_listed_as_failed_once_all_queries_failed(
     assert storage.designs.hopeless() == [hopeless]
     storage.surrogates.change(hopeless, paused=True)
     assert storage.designs.hopeless() == []
-    assert storage.queries.counts(waiting).pending == 1
+    assert storage.surrogates.summary(waiting).queries.pending == 1
 
 
 def test_a_design_with_a_budget_and_no_query_or_sample_is_listed_as_not_started(
@@ -150,7 +150,7 @@ def test_a_design_with_a_budget_and_no_query_or_sample_is_listed_as_not_started(
     for name in (late, late, sampled):  # the second time changes nothing
         storage.designs.ask_first(name, steps(np.zeros((2, 2)), np.zeros((2, 1))))
     assert storage.designs.unbegun() == []
-    assert [storage.queries.counts(name).pending for name in (late, sampled)] == [2, 0]
+    assert [storage.surrogates.summary(name).queries.pending for name in (late, sampled)] == [2, 0]
 
 
 def test_a_second_surrogate_list_shows_every_change_since_the_first(
@@ -162,7 +162,7 @@ def test_a_second_surrogate_list_shows_every_change_since_the_first(
     def require_fresh() -> None:
         [summary] = storage.surrogates.summaries()
         assert summary.ledger == storage.ledger.read(name)
-        assert summary.queries == storage.queries.counts(name)
+        assert summary.queries == storage.surrogates.summary(name).queries
 
     require_fresh()
     first, second, third = storage.queries.claim(name, "a", 3, LONG)

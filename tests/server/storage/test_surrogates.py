@@ -39,7 +39,7 @@ def test_creating_a_surrogate_again_with_the_same_specification_changes_nothing(
     assert created
     repeat = NewSurrogate("a", {"y": None, "x": [1, 2.5]}, 99, 0.5, steps(np.ones((4, 2)), np.ones((4, 1))))
     assert storage.surrogates.create(repeat) == (first, False)
-    assert storage.queries.counts("a").pending == 0
+    assert storage.surrogates.summary("a").queries.pending == 0
 
 
 def test_creating_a_surrogate_under_an_existing_name_keeps_its_specification(storage: Storage) -> None:
@@ -134,7 +134,7 @@ def test_every_storage_operation_refuses_an_unknown_surrogate(storage: Storage, 
         lambda: storage.queries.fail("no", 1, "t", "e"),
         lambda: storage.queries.get("no", 1),
         lambda: storage.queries.list("no"),
-        lambda: storage.queries.counts("no"),
+        lambda: storage.surrogates.summary("no").queries,
         lambda: storage.samples.add("no", "w", [by_hand()]),  # type: ignore[list-item]
         lambda: storage.samples.arrays("no"),
         lambda: storage.samples.page("no", 0, 1),
@@ -168,7 +168,7 @@ def test_many_initial_queries_are_stored_in_limited_transactions_even_after_a_cr
         crash_at(patched, queries, "insert_queries", call=3)
         with pytest.raises(ZeroDivisionError):
             make(queries=35)
-    assert storage.queries.counts(NAME).pending == 20
+    assert storage.surrogates.summary(NAME).queries.pending == 20
     answer_all(NAME)
     assert storage.designs.due() == []
     assert storage.designs.unbegun() == [NAME]

@@ -32,14 +32,12 @@ from surrogym_server.errors import (
 from surrogym_server.storage.records import (
     LeasedQuery,
     NewSample,
-    QueryCounts,
     QueryRecord,
     fingerprint,
 )
 from surrogym_server.storage.sql.database import BATCH, NOW, Database, conflict_insert, constant
 from surrogym_server.storage.sql.rows import (
     NAMED,
-    Span,
     append_event,
     find,
     has_ended,
@@ -49,7 +47,6 @@ from surrogym_server.storage.sql.rows import (
     sweep_table,
     touch,
     unknown_surrogate,
-    within,
 )
 from surrogym_server.storage.sql.tables import leases, queries, requests, samples, snapshots, surrogates
 from surrogym_shared.nouns import Query, Vector
@@ -206,11 +203,6 @@ class Queries:
             rows = connection.execute(statement.order_by(queries.c.id).limit(limit))
             return [_record(row) for row in rows]
 
-    def counts(self, name: str) -> QueryCounts:
-        with self._database.read() as connection:
-            id = find(connection, name)
-            return query_counts(connection, (id, id)).get(id, QueryCounts())
-
     def sweep_expired(self) -> int:
         """End the expired leases of all surrogates, and return their number.
 
@@ -233,17 +225,6 @@ def _require_room(connection: Connection, surrogate: Row[Any], steps: int) -> No
             f"together may take {limit}, the larger of the budget and {LEAST_AUDITED}; raise the budget with surrogym "
             "change --budget"
         )
-
-
-def query_counts(connection: Connection, span: Span) -> dict[int, QueryCounts]:
-    """Return the numbers of queries by status of the surrogates in a range of ids, by id. Surrogates without queries
-    are left out."""
-    of_surrogates: defaultdict[int, dict[str, int]] = defaultdict(dict)
-    statement = sa.select(queries.c.surrogate_id, queries.c.status, sa.func.count()).where(within(queries, span))
-    rows = connection.execute(statement.group_by(queries.c.surrogate_id, queries.c.status)).all()
-    for surrogate, status, count in rows:
-        of_surrogates[surrogate][status] = count
-    return {surrogate: QueryCounts(**counts) for surrogate, counts in of_surrogates.items()}
 
 
 def _lease_expired(query_id: int) -> LeaseExpired:
