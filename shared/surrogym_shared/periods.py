@@ -8,14 +8,15 @@ from statistics import median
 from surrogym_shared.spec import EnvironmentSpec
 
 FEWEST = 5  # in a rollout with fewer intervals, the clock of the original environment is not known
-REAL_TIME = 0.8  # an original environment whose median interval is a smaller share of the period is a simulator
+# An original environment whose median interval differs from the period by more than this share of it is a simulator,
+# which is faster or slower than the clock.
+REAL_TIME = 0.2
 OFF = 0.5  # an interval that differs from the period by at least this share of it is named
 
 
 def irregular(spec: EnvironmentSpec, rollouts: Sequence[Sequence[float]]) -> str:
     """Say how many steps had an interval that is off by half of the sampling period or more, and name the interval that
-    is farthest off. Returns "" if there is none, if no period is declared, or if the steps are those of a simulator,
-    which is faster than the clock.
+    is farthest off. Returns "" if there is none, if no period is declared, or if the steps are those of a simulator.
 
     Args:
         spec: the specification.
@@ -28,7 +29,11 @@ def irregular(spec: EnvironmentSpec, rollouts: Sequence[Sequence[float]]) -> str
     period = spec.sampling_period
     if period is None:
         return ""
-    timed = [seconds for seconds in rollouts if len(seconds) >= FEWEST and median(seconds) >= REAL_TIME * period]
+    timed = [
+        seconds
+        for seconds in rollouts
+        if len(seconds) >= FEWEST and abs(median(seconds) - period) <= REAL_TIME * period
+    ]
     off = [one for seconds in timed for one in seconds if abs(one - period) >= OFF * period]
     if not off:
         return ""

@@ -134,7 +134,7 @@ def test_a_step_that_comes_late_is_said_of_a_machine_but_not_of_a_simulator(api,
     if machine:
         assert re.fullmatch(
             rf"\d+ of 11 intervals between steps are off by half of the sampling period or more, such as "
-            rf"{seconds[6]:.3g} s, where the specification declares 0.02 s",
+            rf"{seconds[6]:.3g} s, where the specification declares 0.1 s",
             remark,
         )
     else:

@@ -62,7 +62,7 @@ class Rail:
 class Timed(Rail):
     """Declares a sampling period, and waits for it in each step if it is a machine; its seventh step may come late."""
 
-    period = 0.02
+    period = 0.1  # long beside what a busy machine adds to a step
 
     def __init__(self, machine: bool, late: float = 0.0):
         super().__init__()
