@@ -208,8 +208,9 @@ class Watchdog:
         if self._fallen:
             raise StepFailed(self._fallen)
 
-    def reset(self) -> None:
-        """Note that the machine is at the start of an episode, at rest until its first action."""
+    def begin(self, coordinates: Array) -> None:
+        """Note that an episode starts at coordinates (C,), where the machine rests until its first action."""
+        self._guard.begin(coordinates)
         self._fallen, self._due = "", None
 
     def running(self) -> None:
@@ -222,9 +223,13 @@ class Watchdog:
             self._thread = threading.Thread(target=self._watch, name="limits", daemon=True)
             self._thread.start()
 
-    def over(self) -> None:
-        """Stop waiting for an action, because no episode runs."""
-        self._due = None
+    def reached(self, coordinates: Array, *, ended: bool) -> None:
+        """Note that a step led to coordinates (C,), and whether it ended the episode."""
+        self._guard.reached(coordinates)
+        if ended:
+            self._due = None
+        else:
+            self.running()
 
     def close(self, reason: str) -> None:
         """Apply the fallback until the machine rests, if an episode runs, and end the watchdog."""
@@ -358,7 +363,10 @@ class GuardedRollouts:
         with self._watchdog:
             self._watchdog.check()
             self._watchdog.running()
-            return self._acted(self._guard.choose(action)[0])
+            step: RealStep = self._environment.act(self._guard.choose(action)[0])
+            at, ended = np.asarray(step.next_coordinates, dtype=np.float64), step.terminated or step.truncated
+            self._watchdog.reached(at, ended=ended)
+            return step
 
     def save(self) -> bytes:
         with self._watchdog:
@@ -378,18 +386,8 @@ class GuardedRollouts:
 
     def _started(self, coordinates: Any) -> Array:
         start = np.asarray(coordinates, dtype=np.float64)
-        self._guard.begin(start)
-        self._watchdog.reset()
+        self._watchdog.begin(start)
         return start
-
-    def _acted(self, action: Array) -> RealStep:
-        step: RealStep = self._environment.act(action)
-        self._guard.reached(np.asarray(step.next_coordinates, dtype=np.float64))
-        if step.terminated or step.truncated:
-            self._watchdog.over()
-        else:
-            self._watchdog.running()
-        return step
 
     def _fall(self, action: Array) -> bool:
         """Apply the fallback controller's action (F,), and return whether the episode continues."""
@@ -431,11 +429,7 @@ class GuardedEpisode(Episode):
             self._watchdog.running()
             chosen, fallen = self._guard.choose(action)
             moment = self._episode.step(chosen)
-            self._guard.reached(moment.coordinates)
-            if moment.terminated or moment.truncated:
-                self._watchdog.over()
-            else:
-                self._watchdog.running()
+            self._watchdog.reached(moment.coordinates, ended=moment.terminated or moment.truncated)
             applied = chosen if moment.applied is None else moment.applied
             return replace(moment, applied=applied, fell_back=True) if fallen else moment
 
@@ -449,8 +443,7 @@ class GuardedEpisode(Episode):
             self._episode.close()
 
     def _started(self, moment: Moment) -> Moment:
-        self._guard.begin(moment.coordinates)
-        self._watchdog.reset()
+        self._watchdog.begin(moment.coordinates)
         return moment
 
     def _fall(self, action: Array) -> bool:
