@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from surrogym_shared.distributions import Bounded, Choices, Sampled, middle_and_reach
+from surrogym_shared.distributions import Bounded, Choices, middle_and_reach
 from surrogym_shared.kinds import Activation
 from surrogym_shared.network import Layer, Network, forward, most_probable
 from surrogym_shared.policy_sizes import MAX_LAYERS, MAX_PARAMETERS, MAX_ROLLOUT, MAX_UNITS
@@ -231,7 +231,7 @@ class Actor:
         return KeyedGenerator()
 
     @cached_property
-    def _distribution(self) -> Sampled:
+    def _distribution(self) -> Bounded | Choices:
         if self.counts:
             return Choices(self.counts)
         return Bounded(*middle_and_reach(self.low, self.high, self.policy.dtype))

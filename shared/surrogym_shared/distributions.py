@@ -1,5 +1,7 @@
 """Action distributions: how the outputs of an actor become a bounded normal distribution, or a choice for each entry.
 
+The methods of both are those that ``Bounded`` explains.
+
 Shapes: B rows (observations), A outputs of the actor network, F action entries, K further parameters, which do not
 depend on the state.
 """
@@ -7,7 +9,7 @@ depend on the state.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,30 +17,6 @@ from numpy.typing import NDArray
 HALF_LOG_TAU = 0.5 * float(np.log(2 * np.pi))
 
 Array = NDArray[np.floating[Any]]  # array of floats of any precision; a training uses float32
-
-
-class Sampled(Protocol):
-    """Distribution of actions of F entries for B observations, (B, F), given A outputs of an actor for each, (B, A),
-    and K further parameters (K,), such as logarithms of standard deviations, which do not depend on the state."""
-
-    @property
-    def outputs(self) -> int:
-        """Number of outputs of an actor, A."""
-        ...
-
-    def sample(self, outputs: Array, further: Array, rng: np.random.Generator) -> tuple[Array, Array]:
-        """Draw an action for each row of ``outputs`` (B, A), given the distribution's parameters ``further`` (K,).
-        Return the actions (B, F), not clipped to bounds, and their log probabilities (B,)."""
-        ...
-
-    def sent(self, actions: Array) -> NDArray[Any]:
-        """Convert B sampled actions (B, F) to actions that a surrogate takes: clipped to bounds, or integer choices."""
-        ...
-
-    def log_probability(self, outputs: Array, further: Array, actions: Array) -> Array:
-        """Return the log probabilities (B,) of B actions (B, F), given the actor's outputs (B, A) and the
-        distribution's parameters ``further`` (K,)."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -51,18 +29,24 @@ class Bounded:
 
     @property
     def outputs(self) -> int:
+        """Number of outputs of an actor, A."""
         return len(self.reach)
 
     def sample(self, outputs: Array, further: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+        """Draw an action for each row of ``outputs`` (B, A), given the distribution's parameters ``further`` (K,).
+        Return the actions (B, F), not clipped to bounds, and their log probabilities (B,)."""
         z = rng.standard_normal(outputs.shape, dtype=_kind(outputs))
         actions = self.centre + self.reach * np.tanh(outputs) + np.exp(further) * z
         return actions, (-0.5 * z * z - further - HALF_LOG_TAU).sum(1)
 
     def sent(self, actions: Array) -> NDArray[Any]:
+        """Convert B sampled actions (B, F) to actions that a surrogate takes: clipped to bounds, or integer choices."""
         low, high = self.centre - self.reach, self.centre + self.reach
         return np.clip(actions, low, high)
 
     def log_probability(self, outputs: Array, further: Array, actions: Array) -> Array:
+        """Return the log probabilities (B,) of B actions (B, F), given the actor's outputs (B, A) and the
+        distribution's parameters ``further`` (K,)."""
         z = (actions - self.centre - self.reach * np.tanh(outputs)) * np.exp(-further)
         log: Array = (-0.5 * z * z - further - HALF_LOG_TAU).sum(1)
         return log

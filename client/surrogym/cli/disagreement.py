@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from surrogym.cli.errors import CommandError, sentence
+from surrogym.cli.learning import learning_of
 from surrogym.cli.options import await_model, connect
 from surrogym_shared.terminal import say
 
@@ -88,8 +89,6 @@ class Differences:
     def learning(self, surrogate: str | None, server: str | None, token: str | None) -> Learning | None:
         """Return the surrogate that will learn from the real steps, after a check on the server; None without --learn
         and --learn-all. Raises the errors of ``learning_of``."""
-        from surrogym.cli.learning import learning_of
-
         if not self.learns:
             return None
         return learning_of("--learn-all" if self.learn_all else "--learn", surrogate, server, token)

@@ -337,7 +337,6 @@ def push_or_say(
     An unreachable server must not spoil a training or an evaluation. So an error of the server is only printed, with
     the command that stores the policy later, and the result is None.
     """
-    from surrogym.cli.options import connect
     from surrogym_client.errors import SurrogymClientError
     from surrogym_trainer.policies.pushing import push
 

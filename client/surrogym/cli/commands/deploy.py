@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from importlib.metadata import entry_points
 from math import isfinite
 from pathlib import Path
+from shlex import quote
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -247,7 +249,6 @@ def command(
 
     Example: surrogym deploy pendulum --target fmu --period 0.05 --out twin
     """
-    from surrogym.cli.commands.deploy import in_words, is_surrogate, write_twin
     from surrogym_trainer.deployment.reading import controller_of
     from surrogym_trainer.deployment.targets import deploy, target_of
     from surrogym_trainer.policies.controller_check import write_check
@@ -300,8 +301,6 @@ def _local(
     Raises:
         CommandError: the policy was trained for another specification than the surrogate's, and --spec is missing.
     """
-    from tempfile import TemporaryDirectory
-
     from surrogym.cli.commands.policy import parsed, stored_card
     from surrogym_trainer.policies.card import write_card
     from surrogym_trainer.policies.files import card_of_policy
@@ -328,8 +327,6 @@ def _local(
 def _warning(policy: str, card: PolicyCard) -> str:
     """Return a warning that a policy's promised return is not trusted, with the commands that test it. The test is an
     audit, which needs the policy's file, so the commands download a stored policy first."""
-    from shlex import quote
-
     stored = "@" in policy and not Path(policy).is_file()
     file = quote("policy.zip" if stored else policy)
     get = f"surrogym policy get {quote(policy)} --out {file}, then " if stored else ""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import asdict
 from functools import partial
 from typing import TYPE_CHECKING, Annotated
 
@@ -54,8 +55,6 @@ def command(
 
     Example: surrogym doctor --env Pendulum-v1
     """
-    from dataclasses import asdict
-
     from surrogym_sampler.diagnosis.doctor import installation
     from surrogym_sampler.diagnosis.doctor import service as findings_of
 

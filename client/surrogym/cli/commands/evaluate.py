@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
+from uuid import uuid4
 
 import typer
 
@@ -360,8 +361,6 @@ def _keep(
 
     Episodes that the server can't store, such as those with an infinite return, are left out, and a remark says so.
     """
-    from uuid import uuid4
-
     from pydantic import ValidationError
 
     from surrogym_trainer.evaluation.reporting import as_reported, paired_start

@@ -10,6 +10,7 @@ from surrogym.cli.columns import columns
 from surrogym.cli.errors import CommandError
 from surrogym.cli.groups import Output, Service
 from surrogym.cli.options import Surrogate
+from surrogym_trainer.work.words import words_of_task
 
 if TYPE_CHECKING:
     from surrogym_shared.wire import JobDetail, JobList, JobView
@@ -57,8 +58,6 @@ def _table(surrogate: str, found: JobList) -> str:
 
 
 def _row(job: JobView) -> tuple[str | int, ...]:
-    from surrogym_trainer.work.words import words_of_task
-
     return (
         job.id,
         "cancelling" if job.cancelling and job.status == "running" else job.status,

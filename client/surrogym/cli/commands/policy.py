@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -205,8 +206,6 @@ def _card(name: str, found: PolicyDetail, spec: EnvironmentSpec | None) -> Polic
 
 
 def _converted(policy: Path, form: str, algorithm: str) -> bytes:
-    from tempfile import TemporaryDirectory
-
     from surrogym_trainer.policies.export import export_policy
 
     with TemporaryDirectory() as folder:
@@ -216,8 +215,6 @@ def _converted(policy: Path, form: str, algorithm: str) -> bytes:
 
 
 def _from_zip(content: bytes, form: str, algorithm: str) -> bytes:
-    from tempfile import TemporaryDirectory
-
     with TemporaryDirectory() as folder:
         policy = Path(folder) / "policy.zip"
         policy.write_bytes(content)

@@ -13,6 +13,7 @@ from surrogym.cli.errors import CommandError
 from surrogym.cli.groups import Output, Service
 from surrogym.cli.options import NAMES, Surrogate
 from surrogym.cli.printing import prints_aside
+from surrogym_shared.states import COMPLETED
 from surrogym_shared.terminal import on_interrupt, progress
 
 if TYPE_CHECKING:
@@ -194,8 +195,6 @@ def _file_of(api: Api, source: str) -> bytes | None:
 
 def _has_ended(view: SurrogateView, fitted: int) -> bool:
     """Whether a design has ended, has no open queries, and has fitted a model after the round number ``fitted``."""
-    from surrogym_shared.states import COMPLETED
-
     return view.phase in COMPLETED and view.round > fitted and not _asked(view)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any
@@ -280,8 +280,6 @@ class _Renewal:
             update: shows the progress.
             check: raises an error if the sampler has failed.
         """
-        from dataclasses import asdict, replace
-
         from surrogym_client.surrogates.waiting import share_of_design, wait_for_design, words_of_design
         from surrogym_client.transport import HttpSurrogate
         from surrogym_trainer.policies.card import write_card

@@ -26,7 +26,7 @@ from surrogym.cli.options import (
     awaited_surrogate,
     read_spec,
 )
-from surrogym.cli.sampling_on_ray import RayOptions
+from surrogym.cli.sampling_on_ray import RayOptions, run_samplers, samplers_on_ray
 from surrogym_client.runtime.lifetime import exit_with_parent as watch_parent
 from surrogym_client.runtime.lifetime import terminations, terminations_as_interrupts
 from surrogym_shared.environments import is_name
@@ -258,8 +258,6 @@ def _require_shared(asked: EnvironmentSpec, settings: SamplerSettings) -> None:
 
 
 def _sample_on_ray(api: Api, plan: SamplerPlan, cluster: RayOptions, output: Output) -> None:
-    from surrogym.cli.sampling_on_ray import run_samplers, samplers_on_ray
-
     time_limit, endless = plan.settings.time_limit, replace(plan.settings, time_limit=None)
     samplers = samplers_on_ray(cluster, replace(plan, settings=endless))
     with (

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from surrogym.cli.beside import reference_of, spec_of_reference
 from surrogym.cli.errors import CommandError
-from surrogym.cli.groups import Output, Service
+from surrogym.cli.groups import Output, PolicyReading, Service
 from surrogym.cli.opening import opener_of
 from surrogym.cli.options import (
     NAMES,
@@ -135,8 +136,6 @@ def _with_reference(environment: Environment | None, reference: str | None) -> E
     Raises:
         CommandError, OriginalError, UnusablePolicy: there is no such controller, or no environment for it.
     """
-    from surrogym.cli.beside import reference_of, spec_of_reference
-    from surrogym.cli.groups import PolicyReading
     from surrogym_sampler.original.fitting import check_policy
 
     if reference is None:

@@ -19,7 +19,7 @@ from dataclasses import astuple, dataclass, fields
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +28,7 @@ from surrogym_shared import distributions
 from surrogym_shared.acting import ActingPolicy, layers_of
 from surrogym_shared.archives import Header, read_arrays, read_entries
 from surrogym_shared.compiled import available
-from surrogym_shared.distributions import Sampled, log_softmax, middle_and_reach
+from surrogym_shared.distributions import log_softmax, middle_and_reach
 from surrogym_shared.kinds import Activation
 from surrogym_shared.network import MAX_BYTES, Layer, Network, bounds_of
 from surrogym_shared.spec import EnvironmentSpec
@@ -122,22 +122,22 @@ def orthogonal(rng: np.random.Generator, inputs: int, outputs: int, gain: float)
     return (gain * (q if inputs >= outputs else q.T)).astype(np.float32)
 
 
-class Distribution(Sampled, Protocol):
-    """A distribution of actions (B, F) with the derivatives that a learner needs."""
+@dataclass(frozen=True)
+class Bounded(distributions.Bounded):
+    """Continuous actions within bounds; their standard deviations do not depend on the state. Its methods give the
+    derivatives that a learner needs; those of ``Choices`` are the same."""
 
-    @property
-    def activation(self) -> Activation:
-        """The activation of the hidden layers of actor and critic."""
-        ...
+    activation: Activation = "tanh"  # activation of the hidden layers of actor and critic
 
     def further(self) -> Array:
-        """Return the initial values (K,) of the distribution's parameters that are not outputs of the network."""
-        ...
+        """Return the initial logarithms of the standard deviations (F,)."""
+        logarithms: Array = np.log(EXPLORATION * self.reach).astype(np.float32)
+        return logarithms
 
     def arrays(self) -> tuple[tuple[int, ...], Array, Array]:
         """Return, for compiled code, the numbers of choices of discrete actions, and the centre (F,) and the reach
         (F,), half the width, of the bounds of continuous actions. Parts that do not apply are empty."""
-        ...
+        return (), self.centre, self.reach
 
     def slopes(self, outputs: Array, further: Array, actions: Array, by: Array) -> tuple[Array, Array]:
         """Return the derivatives of a loss with respect to the outputs (B, A) and to the further parameters (K,).
@@ -148,24 +148,6 @@ class Distribution(Sampled, Protocol):
             actions: the actions taken (B, F).
             by: the derivatives of the loss with respect to the log probabilities (B,).
         """
-        ...
-
-
-@dataclass(frozen=True)
-class Bounded(distributions.Bounded):
-    """Continuous actions within bounds; their standard deviations do not depend on the state."""
-
-    activation: Activation = "tanh"
-
-    def further(self) -> Array:
-        """Return the initial logarithms of the standard deviations (F,)."""
-        logarithms: Array = np.log(EXPLORATION * self.reach).astype(np.float32)
-        return logarithms
-
-    def arrays(self) -> tuple[tuple[int, ...], Array, Array]:
-        return (), self.centre, self.reach
-
-    def slopes(self, outputs: Array, further: Array, actions: Array, by: Array) -> tuple[Array, Array]:
         bent = np.tanh(outputs)
         z = (actions - self.centre - self.reach * bent) * np.exp(-further)
         by_mean = by[:, None] * z * np.exp(-further)
@@ -193,7 +175,7 @@ class Choices(distributions.Choices):
         return np.concatenate(slopes, 1), np.zeros_like(further)
 
 
-def distribution_of(counts: tuple[int, ...], low: NDArray[np.float64], high: NDArray[np.float64]) -> Distribution:
+def distribution_of(counts: tuple[int, ...], low: NDArray[np.float64], high: NDArray[np.float64]) -> Bounded | Choices:
     """Return the distribution of discrete actions with these numbers of choices, or of continuous actions within bounds
     (F,)."""
     if counts:
