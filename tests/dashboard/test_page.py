@@ -13,6 +13,15 @@ from support.dirty import learned
 from support.server import ServerProcess
 from surrogym_client.transport import Api
 from surrogym_sampler.original.classic import pendulum
+from surrogym_shared.spec import (
+    BoxAction,
+    Coordinate,
+    EnvironmentSpec,
+    ObservationEntry,
+    Term,
+    Uniform,
+)
+from surrogym_shared.wire import NewSample
 
 Open = Callable[..., Page]
 PARTS = (
@@ -74,6 +83,39 @@ def test_the_dashboard_names_the_dirt_of_a_machine(url: str, open_page: Open, co
         (first, *_) = api.dirt("furuta-with-dirt")
     page = open_page(f"{url}/#/s/furuta-with-dirt")
     expect(page.locator(".facts")).to_contain_text(f"{first.name}: {first.said}")
+    assert complaints == []
+
+
+def test_the_dashboard_shows_where_a_model_of_twelve_coordinates_is_unsure(
+    url: str, open_page: Open, complaints: list[str]
+):
+    names = [f"mass{i}" for i in range(12)]
+    ranges = {name: Uniform(low=-1 / 3, high=1 / 3) for name in names}
+    spec = EnvironmentSpec(
+        environment="masses",
+        coordinates=tuple(Coordinate(name=name, sampling=ranges[name]) for name in names),
+        observation=tuple(ObservationEntry(name=name, term=Term.linear(**{name: 1})) for name in names),
+        action=BoxAction(low=(-1,), high=(1,)),
+        start=ranges,
+        time_limit=10,
+        design={"initial": 14, "budget": 14},
+    )
+    with Api(url) as api:
+        api.create_surrogate("masses", spec)
+        for query in api.claim("masses", "worker", max_queries=14).queries:
+            q, (u,) = query.coordinates, query.action
+            after = [0.9 * one + 0.1 * u for one in q]
+            answer = {
+                "coordinates": q,
+                "action": [u],
+                "next_coordinates": after,
+                "reward": -(after[0] ** 2),
+                "terminated": False,
+            }
+            api.add_samples("masses", "worker", [NewSample(query_id=query.id, lease_token=query.lease_token, **answer)])
+    page = open_page(f"{url}/#/s/masses")
+    expect(page.locator(".facts")).to_contain_text("of 768 points")
+    expect(page.locator(".facts")).to_contain_text("Least certain near")
     assert complaints == []
 
 

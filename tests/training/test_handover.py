@@ -387,7 +387,9 @@ def test_a_policy_whose_audit_has_a_late_step_is_not_trusted(server_process: Ser
         assert handover.audit is not None
         assert not handover.trusted
         count = 57 if whole else 19
-        assert re.match(rf"\d+ of {count} intervals between steps are off .* such as 0\.[6-9]", handover.audit.faults[0])
+        assert re.match(
+            rf"\d+ of {count} intervals between steps are off .* such as 0\.[6-9]", handover.audit.faults[0]
+        )
 
 
 class Growing(Line):

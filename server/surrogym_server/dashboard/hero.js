@@ -7,6 +7,7 @@ import { confidenceMeter, costBar } from "/page/parts.js";
 import { told } from "/page/point.js";
 
 const LOOKS = 768;
+const NUMBERS = 2_500; // in a request, whose body may have 64 KiB
 
 const card = (title, ...children) => h("div", { class: "card fact" }, h("h2", {}, title), children);
 
@@ -29,7 +30,14 @@ function points(entries) {
 export async function leastSure(name, fidelity, { ranges, entries }) {
   const rows = points([...ranges, ...entries]);
   const [coordinates, action] = [rows.map((row) => row.slice(0, ranges.length)), rows.map((row) => row.slice(ranges.length))];
-  const said = await call("POST", `${surrogate(name)}/query_uncertainty`, { coordinates, action });
+  const each = Math.max(Math.floor(NUMBERS / rows[0].length), 1);
+  const said = { deviation: [] };
+  for (let at = 0; at < rows.length; at += each) {
+    const part = { coordinates: coordinates.slice(at, at + each), action: action.slice(at, at + each) };
+    const { outputs, deviation } = await call("POST", `${surrogate(name)}/query_uncertainty`, part);
+    said.outputs = outputs;
+    said.deviation.push(...deviation);
+  }
   const worst = said.deviation.map((row) => row.map((value, at) => value / fidelity.outputs[at].tolerance));
   let [at, output] = [0, 0];
   worst.forEach((row, index) => row.forEach((value, which) => { if (value > worst[at][output]) [at, output] = [index, which]; }));
