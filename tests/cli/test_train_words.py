@@ -137,3 +137,12 @@ def test_a_training_says_why_its_policies_try_no_episodes():
     )
     seeing = TrainSettings(algorithm="FASTPPO", integral=("x",))
     assert "policies that see integrals, so no trials" in train._words_without_trials(view, seeing)
+
+
+@pytest.mark.parametrize(("needs", "policy", "told"), [(True, False, True), (True, True, False), (False, False, False)])
+def test_a_training_before_the_end_of_the_design_says_that_it_takes_no_trials(needs: bool, policy: bool, told: bool):
+    spec = SimpleNamespace(needs_trials=needs)
+    view = SimpleNamespace(name="rail", phase="fitting", budget_left=70, samplers=1, spec=spec)
+    queries = [SimpleNamespace(purpose="adaptive", policy=policy)]
+    api = SimpleNamespace(surrogate=lambda _: view, queries=lambda _: queries)
+    assert ("takes no trials" in train._words_of_too_early(api, view)) is told

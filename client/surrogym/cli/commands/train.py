@@ -34,6 +34,7 @@ from surrogym_shared.terminal import progress, say
 from surrogym_shared.words import counted
 
 if TYPE_CHECKING:
+    from surrogym_client.transport import Api
     from surrogym_shared.spec import EnvironmentSpec
     from surrogym_shared.terminal import Update
     from surrogym_shared.wire import CurvePoint, SurrogateView
@@ -222,7 +223,9 @@ def _trainable(
                 say(words, quiet=quiet)
         if view.phase not in COMPLETED and not view.paused:
             typer.echo(
-                f"the design of {surrogate!r} continues; training starts with model {view.model_version}", err=True
+                f"the design of {surrogate!r} continues; training starts with model {view.model_version}"
+                f"{_words_of_too_early(api, view)}",
+                err=True,
             )
         return view.spec, api.url
 
@@ -242,6 +245,16 @@ def _words_without_trials(view: SurrogateView, settings: TrainSettings) -> str:
         return ""
     start = sample_command(view.name, view.environment)
     return f"no sampler is running, {none}: for trials, start {start} in another terminal first"
+
+
+def _words_of_too_early(api: Api, view: SurrogateView) -> str:
+    """Return a hint that a training before the end of the design takes no trials, where only trials learn what good
+    policies need; empty for other environments, and while the design only waits for a trial."""
+    from surrogym_trainer.training.trials import is_waiting_for_trials
+
+    if not view.spec.needs_trials or is_waiting_for_trials(api, view.name):
+        return ""
+    return " and takes no trials, which begin after the design: --wait 600 waits for its end"
 
 
 def _words_without_model(view: SurrogateView) -> str:
