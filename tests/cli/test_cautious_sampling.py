@@ -14,9 +14,11 @@ import typer
 from support.controllers import network
 from support.limited import DIARY, SPEC, NamedCart
 from support.programs import FALLS_BACK, KEEPS_LIMITS, program
+from support.rail import SPEC as RAIL
 from support.rated import CHANGE
 from surrogym.cli.commands import sample
 from surrogym_client.transport import Api
+from surrogym_shared.spec import with_history
 from surrogym_shared.wire import Query
 
 CART = ("--env", "support.limited:PatientCart")
@@ -48,6 +50,15 @@ def test_the_suggested_sampling_command_has_the_file_that_declares_the_limits(
     assert suggested[-2:] == ["--spec", str(file)]
     assert on_server(*suggested[:-2], "--max-queries", "1").code != 0
     assert on_server(*suggested, "--max-queries", "1").code == 0
+
+
+def test_the_suggested_sampling_command_has_the_file_that_declares_the_lags(
+    on_server: Any, name: str, tmp_path: Path
+) -> None:
+    file = tmp_path / "lags.json"
+    file.write_text(with_history(RAIL, actions=1).model_dump_json())
+    said = on_server("register", name, "--env", "support.rail:Rail", "--spec", str(file)).out.strip()
+    assert shlex.split(said)[-2:] == ["--spec", str(file)]
 
 
 def test_sampling_keeps_the_rate_of_an_action_and_stores_the_applied_actions(

@@ -14,9 +14,10 @@ from support.moody import Line
 from support.rail import SPEC as RAIL
 from surrogym_sampler.original.classic import pendulum
 from surrogym_sampler.original.episodes import open_episode
-from surrogym_sampler.original.errors import PolicyMisfit
+from surrogym_sampler.original.errors import PolicyMisfit, UnknownEnvironment
 from surrogym_sampler.original.fitting import check_policy
-from surrogym_shared.spec import BoxAction, DiscreteAction, EnvironmentSpec, ObservationEntry, Term
+from surrogym_sampler.queries.query_limits import check_environment
+from surrogym_shared.spec import BoxAction, DiscreteAction, EnvironmentSpec, ObservationEntry, Term, with_history
 from surrogym_trainer.evaluation.evaluator import EvaluationSettings, evaluate
 
 
@@ -98,3 +99,14 @@ def test_the_error_for_a_policy_that_does_not_fit_does_not_show_the_command_of_i
     with pytest.raises(PolicyMisfit) as refused:
         check_policy(pendulum().model_copy(update={"environment": "exec:rm -rf /"}), LINE)
     assert "rm" not in str(refused.value)
+
+
+def test_an_environment_without_the_declared_lags_is_refused_with_the_advice_to_give_them() -> None:
+    lagging = with_history(RAIL, actions=1)
+    advice = r"got coordinates \(x\).*give the specification that declares the lags with --spec FILE$"
+    with pytest.raises(PolicyMisfit, match=advice):
+        check_policy(lagging, RAIL)
+    with pytest.raises(UnknownEnvironment, match=advice):
+        check_environment("rail", lagging, RAIL)
+    with pytest.raises(UnknownEnvironment, match=r"register the environment under another name$"):
+        check_environment("rail", RAIL, lagging)

@@ -28,7 +28,7 @@ def check_shape(trained: EnvironmentSpec, own: EnvironmentSpec, called: str) -> 
     """
     expected, got = shape_in_words(trained), shape_in_words(own)
     if expected != got:
-        raise PolicyMisfit(f"{_misfit(trained, called)}: expected {expected}, got {got}")
+        raise PolicyMisfit(f"{_misfit(trained, called)}: expected {expected}, got {got}{advice_on_lags(trained, own)}")
 
 
 def check_policy(trained: EnvironmentSpec, own: EnvironmentSpec) -> None:
@@ -90,6 +90,15 @@ def shape_in_words(spec: EnvironmentSpec) -> str:
     bins = _bins(spec)
     of = "" if bins is None else f" in {', '.join(map(str, bins))} bins"
     return f"coordinates ({', '.join(spec.coordinate_names)}) and a {spec.action.kind} action of {spec.action.size}{of}"
+
+
+def advice_on_lags(expected: EnvironmentSpec, own: EnvironmentSpec) -> str:
+    """Return the advice to give the specification that declares the lags, if ``own`` is the expected one without them;
+    otherwise ""."""
+    read = tuple(c.name for c in expected.coordinates if c.lag is None)
+    if read == expected.coordinate_names or read != own.coordinate_names:
+        return ""
+    return "; give the specification that declares the lags with --spec FILE"
 
 
 def meant_in_words(spec: EnvironmentSpec) -> str:

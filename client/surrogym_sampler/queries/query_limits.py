@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from surrogym_sampler.original.errors import QueryRefused, UnknownEnvironment
-from surrogym_sampler.original.fitting import Range, is_within, range_in_words
+from surrogym_sampler.original.fitting import Range, advice_on_lags, is_within, range_in_words
 from surrogym_sampler.original.periods import is_other
 from surrogym_shared.spec import MAX_ROLLOUT_QUERY, Access, BoxAction, EnvironmentSpec
 from surrogym_shared.spec import limits as sampled
@@ -28,9 +28,9 @@ def check_environment(surrogate: str, asked: EnvironmentSpec, own: EnvironmentSp
     """
     expected, got = _shape(asked), _shape(own)
     if expected != got:
+        advice = advice_on_lags(asked, own) or "; register the environment under another name"
         raise UnknownEnvironment(
-            f"the environment does not fit surrogate {surrogate!r}: expected {expected}, got {got}; "
-            "register the environment under another name"
+            f"the environment does not fit surrogate {surrogate!r}: expected {expected}, got {got}{advice}"
         )
     if is_other(asked.sampling_period, own.sampling_period):
         raise UnknownEnvironment(

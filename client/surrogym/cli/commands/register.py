@@ -293,7 +293,8 @@ def _words(view: SurrogateView, environment: str, file: Path | None) -> str:
     start = sample_command(view.name, view.environment)
     if environment:  # the suggested command repeats the name that the user gave, if a sampler needs it
         start = f"surrogym sample {view.name}" + ("" if is_known(environment) else f" --env {shlex.quote(environment)}")
-    # a sampler runs only with a specification of its own that declares the same limits
-    if file is not None and view.spec.limits is not None:
+    # a sampler runs only with a specification of its own that declares the same limits and lags
+    lagging = any(coordinate.lag is not None for coordinate in view.spec.coordinates)
+    if file is not None and (lagging or view.spec.limits is not None):
         start += f" --spec {shlex.quote(str(file))}"
     return f"{registered}, budget of {view.budget} real steps, target {view.target:g}; next: {start}"
