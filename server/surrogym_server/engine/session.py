@@ -203,30 +203,16 @@ def _join(parts: Sequence[tuple[NDArray[np.intp], LaneTransition]]) -> LaneTrans
     """Join the results of a step of several sets of lanes to one result for all lanes. Each part consists of the
     indices of its lanes and their results, and each lane is in exactly one part."""
     order = np.argsort(np.concatenate([index for index, _ in parts]))
-
-    def lanewise(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
-        rows: NDArray[Any] = np.concatenate(arrays)[order]
-        return rows
-
-    transitions = [transition for _, transition in parts]
     final_lanes = np.concatenate([index[t.final_lanes] for index, t in parts])
     final_order = np.argsort(final_lanes)
-    stds = [t.std for t in transitions if t.std is not None]
-    untrusted = [t.untrusted for t in transitions if t.untrusted is not None]
-    left = [t.left for t in transitions if t.left is not None]
-    return LaneTransition(
-        observation=lanewise([t.observation for t in transitions]),
-        reward=lanewise([t.reward for t in transitions]),
-        terminated=lanewise([t.terminated for t in transitions]),
-        truncated=lanewise([t.truncated for t in transitions]),
-        final_lanes=final_lanes[final_order],
-        final_observation=np.concatenate([t.final_observation for t in transitions])[final_order],
-        reset_lanes=lanewise([t.reset_lanes for t in transitions]),
-        reward_mean=lanewise([t.reward_mean for t in transitions]),
-        std=lanewise(stds) if stds else None,
-        untrusted=lanewise(untrusted) if untrusted else None,
-        left=lanewise(left) if left else None,
-    )
+    joined: dict[str, Any] = {
+        "final_lanes": final_lanes[final_order],
+        "final_observation": np.concatenate([t.final_observation for _, t in parts])[final_order],
+    }
+    for name in vars(parts[0][1]).keys() - joined.keys():
+        arrays = [array for _, t in parts if (array := getattr(t, name)) is not None]
+        joined[name] = np.concatenate(arrays)[order] if arrays else None
+    return LaneTransition(**joined)
 
 
 def _result(transition: LaneTransition, versions: Versions) -> StepResult:
