@@ -142,6 +142,17 @@ def test_a_step_that_comes_late_is_said_of_a_machine_but_not_of_a_simulator(api,
     api.delete_surrogate(name)
 
 
+def test_a_step_that_comes_late_in_a_short_rollout_is_said_once_earlier_ones_show_the_clock(api):
+    told, name, environment = [], f"timed-{uuid.uuid4().hex[:8]}", Timed(True, late=0.5, at=3)
+    api.create_surrogate(name, environment.spec())
+    api.add_queries(name, rollouts=[[LEFT] * 4] * 3)
+    settings = SamplerSettings(name="worker", until_done=True, time_limit=60.0)
+    Sampler(api, name, environment, settings, lambda query, *said: told.append((query.purpose, *said))).run()
+    *_, last = (remark for purpose, _, remark in told if purpose == "manual")
+    assert re.match(r"[12] of 3 intervals between steps are off by half of the sampling period or more", last)
+    api.delete_surrogate(name)
+
+
 def test_a_known_simulator_is_not_timed(api):
     environment, name = original.make("Pendulum-v1", access="reset", budget=4, initial=4), f"p-{uuid.uuid4().hex[:8]}"
     api.create_surrogate(name, environment.spec())

@@ -60,13 +60,13 @@ class Rail:
 
 
 class Timed(Rail):
-    """Declares a sampling period, and waits for it in each step if it is a machine; its seventh step may come late."""
+    """Declares a sampling period, and waits for it in each step if it is a machine; one of its steps may come late."""
 
     period = 0.1  # long beside what a busy machine adds to a step
 
-    def __init__(self, machine: bool, late: float = 0.0):
+    def __init__(self, machine: bool, late: float = 0.0, at: int = 7):
         super().__init__()
-        self.machine, self.late, self.steps = machine, late, 0
+        self.machine, self.late, self.at, self.steps = machine, late, at, 0
 
     def spec(self):
         return SPEC.model_copy(update={"sampling_period": self.period})
@@ -77,7 +77,7 @@ class Timed(Rail):
 
     def step(self, action):
         self.steps += 1
-        time.sleep(self.period * self.machine + self.late * (self.steps == 7))
+        time.sleep(self.period * self.machine + self.late * (self.steps == self.at))
         return super().step(action)
 
 

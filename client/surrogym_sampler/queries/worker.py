@@ -299,7 +299,8 @@ class Sampler:
         if query.kind == "rollout":
             self._latest.extend(taken)
             remarks.append(undeclared_turns(self._own, list(self._latest), len(taken)))
-            remarks.append(irregular(self._own, [[s.seconds for s in taken if s.seconds is not None]]))
+            latest, now = ([s.seconds for s in of if s.seconds is not None] for of in (self._latest, taken))
+            remarks.append(irregular(self._own, latest, len(now)))
         remark = "; ".join(filter(None, remarks))
         return _Answer(query, taken, outcome, error, remark, for_good)
 

@@ -203,11 +203,8 @@ def take(
     firsts = {sample.query_id: sample.coordinates for sample in sorted(answers, key=lambda sample: -sample.id)}
     audit = judge(beside, before, subject.promise(), subject.floor, found).model_copy(update=about)
     others = [s for s in api.samples(name) if s.trajectory is not None and s.query_id not in wanted]
-    seconds: dict[int | None, list[float]] = {sample.trajectory: [] for sample in answers}
-    for sample in answers:
-        if sample.seconds is not None:
-            seconds[sample.trajectory].append(sample.seconds)
-    return _with_machine(audit, spec, _Machine(list(firsts.values()), others, answers, list(seconds.values())))
+    seconds = [sample.seconds for sample in answers if sample.seconds is not None]
+    return _with_machine(audit, spec, _Machine(list(firsts.values()), others, answers, seconds))
 
 
 @dataclass(frozen=True)
@@ -218,13 +215,13 @@ class _Machine:
         starts: the states (C,) to which its resets led.
         before: earlier steps of rollouts.
         steps: its own steps.
-        seconds: of each of its rollouts the seconds from one step to the next, as far as they were measured.
+        seconds: the seconds from one step of a rollout to the next, as far as they were measured.
     """
 
     starts: Sequence[ArrayLike]
     before: Sequence[Step]
     steps: Sequence[Step]
-    seconds: Sequence[Sequence[float]]
+    seconds: Sequence[float]
 
 
 def _with_machine(audit: Audit, spec: EnvironmentSpec, seen: _Machine) -> Audit:
@@ -236,7 +233,7 @@ def _with_machine(audit: Audit, spec: EnvironmentSpec, seen: _Machine) -> Audit:
     faults = (
         not_declared(spec, seen.starts),
         undeclared_turns(spec, [*seen.before, *seen.steps], len(seen.steps)),
-        irregular(spec, seen.seconds),
+        irregular(spec, seen.seconds, len(seen.seconds)),
     )
     if not any(faults):
         return audit
@@ -265,7 +262,7 @@ def judge_episodes(subject: Subject, result: Evaluation) -> Handover:
     about = {"steps": result.steps, "episodes": len(result.returns), "range_left": range_left(spec, q)}
     starts = [trace.coordinates[0] for trace in result.traces]
     others = [sample for sample in api.samples(subject.name) if sample.trajectory is not None]
-    seen = _Machine(starts, others, steps, [trace.seconds for trace in result.traces])
+    seen = _Machine(starts, others, steps, [one for trace in result.traces for one in trace.seconds])
     audit = _with_machine(audit.model_copy(update=about), spec, seen)
     trusted, reason = _verdict(audit, subject.floor)
     return Handover(audit.after, audit, trusted, reason)
