@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
@@ -107,6 +107,15 @@ def test_after_a_failed_audit_with_unchanged_promised_return_the_policy_is_untru
     monkeypatch, tmp_path: Path
 ) -> None:
     trainings, _, handover = run(monkeypatch, tmp_path, found(95.6, 94.0, passed=False))
+    assert trainings.made == 1
+    assert not handover.trusted
+
+
+def test_training_ends_if_the_audit_found_that_the_machine_is_not_as_declared(monkeypatch, tmp_path: Path) -> None:
+    """The next audit may have begun at a declared start, and the promise would have been trusted."""
+    failed = found(95.6, -21.6, passed=False)
+    undeclared = replace(failed, audit=failed.audit.model_copy(update={"undeclared": True}))
+    trainings, _, handover = run(monkeypatch, tmp_path, undeclared, found(97.4, 97.5))
     assert trainings.made == 1
     assert not handover.trusted
 

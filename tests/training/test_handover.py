@@ -354,6 +354,7 @@ def test_a_policy_whose_audit_begins_at_no_declared_start_is_not_trusted(
         assert not handover.trusted
         count = 3 if whole else 1
         assert f"{count} of {count} resets led to no declared start, such as x = -0." in handover.audit.faults[0]
+        assert handover.audit.undeclared
 
 
 @pytest.mark.parametrize("whole", [False, True], ids=["queries", "episodes"])
@@ -371,6 +372,7 @@ def test_a_policy_in_whose_audit_an_undeclared_encoder_wraps_is_not_trusted(
         assert not handover.trusted
         count = 60 if whole else 20
         assert re.match(rf"x jumps by 2048 in [1-9] of {count} steps, as", handover.audit.faults[0])
+        assert handover.audit.undeclared
 
 
 @pytest.mark.parametrize("whole", [False, True], ids=["queries", "episodes"])
@@ -390,6 +392,7 @@ def test_a_policy_whose_audit_has_a_late_step_is_not_trusted(server_process: Ser
         assert re.match(
             rf"\d+ of {count} intervals between steps are off .* such as 0\.[6-9]", handover.audit.faults[0]
         )
+        assert handover.audit.undeclared
 
 
 class Growing(Line):

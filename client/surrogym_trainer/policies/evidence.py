@@ -91,6 +91,7 @@ class Audit(BaseModel):
             states, and the share of these states; None if they are few.
         passed: whether the promise is supported.
         faults: what was wrong, one sentence each; empty if the audit passed.
+        undeclared: whether a fault is that the machine is not as declared, which no further training changes.
         errors: root mean square of the prediction errors of each output, in the output's unit.
         expected: the errors that the model expected, in the same form.
         before: promise before the audit.
@@ -108,6 +109,7 @@ class Audit(BaseModel):
     untestable: tuple[str, float] | None = None
     passed: bool
     faults: tuple[str, ...] = ()
+    undeclared: bool = False
     errors: dict[str, float] = {}
     expected: dict[str, float] = {}
     before: Promise

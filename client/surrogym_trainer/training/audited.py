@@ -37,8 +37,9 @@ class AuditedTraining:
 
     After each audit, one of these things happens.
 
-    - If the audit failed, real steps are taken in states that the policy visits, as far as the budget or unused rounds
-      of the closed loop allow. Then the training continues, and the policy is audited again.
+    - If the audit found that the machine is not as declared, the policy is handed over: another audit might not notice.
+    - If the audit failed otherwise, real steps are taken in states that the policy visits, as far as the budget or
+      unused rounds of the closed loop allow. Then the training continues, and the policy is audited again.
     - The same happens after a passed audit if a round of the closed loop is unused, and either the promised interval is
       wide or the model, which has learned from the audit, is no longer certain in these states.
     - The training also continues if the promise after the audit is clearly lower than the one before it, or than the
@@ -134,7 +135,7 @@ class AuditedTraining:
         return Subject(self.api, self.name, self.port, predict, dict(session), result.untrained, settings.seed)
 
     def _to_be_trained_on(self, audit: Audit | None, result: TrainResult, taken: int, number: int) -> bool:
-        if audit is None:
+        if audit is None or audit.undeclared:
             return False
         needed = not audit.passed or (self._unspent > 0 and wider(audit.after, UNSURE, result.untrained))
         if (needed or self._unspent) and self._asked_more(result, taken, number, needed=needed):

@@ -237,7 +237,8 @@ def _with_machine(audit: Audit, spec: EnvironmentSpec, seen: _Machine) -> Audit:
     )
     if not any(faults):
         return audit
-    return audit.model_copy(update={"passed": False, "faults": (*filter(None, faults), *audit.faults)})
+    found = (*filter(None, faults), *audit.faults)
+    return audit.model_copy(update={"passed": False, "faults": found, "undeclared": True})
 
 
 def judge_episodes(subject: Subject, result: Evaluation) -> Handover:
