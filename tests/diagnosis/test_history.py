@@ -114,7 +114,7 @@ def test_the_numbers_of_lagged_actions_and_changes_in_a_specification_are_found(
 
 def test_the_doctor_command_recommends_the_history_to_declare():
     words, way_out = said(Joint)
-    assert "depends on 1 earlier changes and 2 earlier actions" in words
+    assert "depends on 1 earlier change and 2 earlier actions" in words
     assert "this took 60 real steps" in words
     assert way_out is not None
     assert 'declare with_history(spec, changes=1, actions=2, largest={"angle": ' in way_out

@@ -236,7 +236,7 @@ def test_trials_end_with_the_best_policy_if_the_machine_takes_no_first_step(
     result = trials.train()
     (failed,) = [query for query in trials.api.queries(waiting) if query.policy]
     assert (failed.status, len(trials.trained)) == ("set_aside", 1)
-    assert "; 1 round;" in words_of_result(result, closed_loop=True)
+    assert "; 1 round;" in words_of_result(result)
     load_network(result.path)
 
 

@@ -41,6 +41,7 @@ from surrogym_shared.dirt.words import declared, history_call, traits
 from surrogym_shared.plugins import Registry
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import PROTOCOL, StepQuery
+from surrogym_shared.words import counted
 
 ROUND_TRIPS = 20
 # If changes are predicted with an error above this share of their standard deviation, and noise does not explain it,
@@ -225,7 +226,10 @@ def _history_of(found: Dirt, has: tuple[int, int], call: str, took: str) -> Find
         return Finding("history", f"a regression does not show how far one has to look back; {took}")
     if changes <= has[0] and found.actions <= has[1]:
         return Finding("history", f"what is declared tells what happens next; {took}")
-    needed = f"the next change of a coordinate depends on {changes} earlier changes and {found.actions} earlier actions"
+    needed = (
+        f"the next change of a coordinate depends on {counted(changes, 'earlier change')} and "
+        f"{counted(found.actions, 'earlier action')}"
+    )
     if changes:
         without = float(found.plain.error.max())
         needed += (

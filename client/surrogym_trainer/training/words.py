@@ -34,10 +34,11 @@ def words_of_result(
     options = env_option + ("" if server is None else f" --server {shlex.quote(server)}")
     path, lost = shlex.quote(str(result.path)), result.lost_episodes
     cut = f"; {lost} episode{'s' * (lost > 1)} cut short, because the server lost its sessions" if lost else ""
+    rounds = _loop(result.visited_confidence) if closed_loop or result.visited_confidence else ""
     taken = f"{result.virtual_steps} virtual steps{_of_asked(result, asked)}"
     return (
         f"{result.path}: {taken if result.virtual_steps else 'made without training'} in {result.seconds:.1f} s"
-        f"{_imagined(result.imagined_return)}{cut}{_loop(result.visited_confidence) if closed_loop else ''}"
+        f"{_imagined(result.imagined_return)}{cut}{rounds}"
         f"{_given_up(result.networks - 1)}{_gaining(result)}; next: surrogym evaluate {path}{options}"
         f"{'' if handover is None else chr(10) + words_of_handover(handover)}"
     )

@@ -203,7 +203,7 @@ export function work(name, { role, refresh }) {
   }
 
   return {
-    element: section("work", "Train and evaluate", "A worker on any machine runs what you start here. A training takes a few real steps for its audit, and more of the budget if the audit fails. An evaluation takes real steps.",
+    element: section("work", "Train and evaluate", "A worker on any machine runs what you start here. A training takes a few real steps for its audit, and more of the budget if the audit fails or if policies try episodes. An evaluation takes real steps.",
       connected, forms, said, open, ended),
     show({ now, policies: stored }) {
       policies = stored ?? policies;
