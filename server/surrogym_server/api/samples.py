@@ -92,7 +92,8 @@ def samples(
 def dirt(name: str, use: Use) -> DirtList:
     """Find dead time, encoders, friction that sticks and noise in the first 60 real steps of an original environment
     that can only be reset. Nothing is found before, or unless the evidence is clear."""
-    return DirtList(findings=dirt_of(use.surrogates.spec(name), use.samples.page(name, 0, FIRST)))
+    record = use.storage.surrogates.get(name)
+    return DirtList(findings=dirt_of(record.spec, record.tolerances, use.samples.page(name, 0, FIRST)))
 
 
 @router.get(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 from itertools import groupby
 from typing import Any
@@ -19,12 +19,15 @@ FIRST = 1_000  # number of first samples in which rollouts are looked for: some 
 STEPS = 60  # number of steps of rollouts in which dirt is looked for; nothing is found in fewer
 
 
-def dirt_of(spec: dict[str, Any], samples: Sequence[SampleRecord]) -> list[DirtFinding]:
+def dirt_of(
+    spec: dict[str, Any], tolerances: Mapping[str, float], samples: Sequence[SampleRecord]
+) -> list[DirtFinding]:
     """Return the dirt in the first ``STEPS`` steps of rollouts; nothing if there are fewer, or if a query may begin
     elsewhere than at a reset.
 
     Args:
         spec: the stored specification.
+        tolerances: tolerances that were set after the registration, by output.
         samples: the first samples of the surrogate.
 
     Raises:
@@ -38,7 +41,8 @@ def dirt_of(spec: dict[str, Any], samples: Sequence[SampleRecord]) -> list[DirtF
         if steps := _consecutive(of_one)[:left]:
             rollouts.append(steps)
             left -= len(steps)
-    found = () if left else _found(json.dumps(spec), tuple(rollouts))
+    now = spec | {"tolerances": spec.get("tolerances", {}) | dict(tolerances)}
+    found = () if left else _found(json.dumps(now), tuple(rollouts))
     return [DirtFinding(name=name, said=said) for name, said in found]
 
 

@@ -40,13 +40,22 @@ def rolled(rollouts: int, steps: int = 10) -> list[SampleRecord]:
 
 
 def found(samples: list[SampleRecord], **changes: object) -> list[str]:
-    return [finding.name for finding in dirt_of(SPEC.model_dump(mode="json") | changes, samples)]
+    return [finding.name for finding in dirt_of(SPEC.model_dump(mode="json") | changes, {}, samples)]
 
 
 def test_an_encoder_is_found_in_the_first_steps_and_samples_may_come_in_any_order():
     samples = rolled(STEPS // 10)
     assert "encoder" in found(samples)
-    assert dirt_of(SPEC.model_dump(mode="json"), samples[::-1]) == dirt_of(SPEC.model_dump(mode="json"), samples)
+    assert dirt_of(SPEC.model_dump(mode="json"), {}, samples[::-1]) == dirt_of(
+        SPEC.model_dump(mode="json"), {}, samples
+    )
+
+
+def test_a_tolerance_below_the_width_of_an_encoder_is_advised_against_also_if_it_was_set_later():
+    samples, spec = rolled(STEPS // 10), SPEC.model_dump(mode="json")
+    small, large = (dirt_of(spec, {"x": WIDTH * share}, samples)[0].said for share in (0.9, 1.1))
+    assert "declare a tolerance of at least that" in small
+    assert "tolerance" not in large
 
 
 def test_steps_after_a_gap_do_not_count():
