@@ -36,6 +36,8 @@ from surrogym_trainer.training.settings import TrainResult, TrainSettings, chose
 VISITED = 0.5
 SHORTEST = 0.25  # smallest share of an episode that is worth a trial
 MOST_ROUNDS = 20  # largest number of trials, if no number is requested
+# If no trial was confirmed before the budget was spent, the last training takes this multiple of the usual steps.
+LONGER = 4
 NOTICEABLE = 0.02  # share of a policy's gain over an untrained one; a smaller change does not matter
 
 
@@ -72,6 +74,9 @@ class Trials(TrainingInRounds):
     when the original environment failed at each attempt to take a trial's first step, or the trial was refused or
     withdrawn. A trial succeeds by the criterion of the specification, if there is one. Without a number of steps in
     ``rounds``, a trial is a whole episode, and the trials take the rest of the budget.
+
+    If the budget is spent before, only the search can still improve the policy. So the last training is longer, unless
+    the user chose the number of virtual steps.
     """
 
     _tried: int = field(default=0, init=False)  # number of trials
@@ -79,8 +84,8 @@ class Trials(TrainingInRounds):
     def _run(self) -> None:
         tried: tuple[Network, NDArray[np.float64]] | None = None
         for number in range(self._most + 1):
-            self.best = best = self._learn(number)
             steps = self._steps_of_a_trial() if number < self._most else 0
+            self.best = best = self._learn(number, longer=number > 0 and not steps)
             if not steps:
                 break
             policy = load_network(best.path)
@@ -98,14 +103,16 @@ class Trials(TrainingInRounds):
     def _most(self) -> int:
         return self.rounds.rounds if self.rounds.queries else MOST_ROUNDS
 
-    def _learn(self, number: int) -> TrainResult:
+    def _learn(self, number: int, *, longer: bool) -> TrainResult:
         """Train a policy with a new network, and return the best one so far in the present model."""
         settings, done = self._chosen, self._steps
         lagging = any(coordinate.lag is not None for coordinate in self.port.spec().coordinates)
         usual = lagging and settings.start_box is None and settings.start_visited is None
         visited = VISITED if usual else settings.start_visited
         now = replace(settings, seed=settings.seed + number, start_visited=visited)
-        total = done + planned_steps(settings) * (1 + self._trials_left(number))
+        if longer and settings.total_steps is None:
+            now = replace(now, total_steps=LONGER * planned_steps(settings))
+        total = done + planned_steps(now) + planned_steps(settings) * self._trials_left(number)
         latest = self._train(now, shifted(self.progress, done, total, None))
         return self.candidates.best(self.port, latest, self._chosen)
 
