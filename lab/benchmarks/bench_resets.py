@@ -9,7 +9,8 @@ targets are those of the demo, without its second evaluation. Prints one line fo
     python lab/benchmarks/bench_resets.py --seeds 121 122 123 124 125 --tasks swingup --dirt encoder --budget 150
 
 ``--dirt`` gives the swing-up one kind of dirt, and sizes that each seed draws (``dirty_swingup.py``). A rod that is up
-is judged by its own angle then, not by what is read of it.
+is judged by its own angle then, not by what is read of it. ``--acting-with`` is the dirt of the machine on which the
+planner acts, if it is another one than the machine that was learned.
 """
 
 from __future__ import annotations
@@ -55,6 +56,7 @@ def main() -> None:
     made.add_argument("--episodes", type=int, default=100)
     made.add_argument("--budget", type=int, help="largest number of real steps, instead of the task's")
     made.add_argument("--dirt", default="", choices=("", *KINDS), help="kind of dirt of the swing-up")
+    made.add_argument("--acting-with", choices=KINDS, help="dirt of the swing-up on which the planner acts")
     made.add_argument("--rounds", action="store_true", help="returns after each round of a design")
     made.add_argument("--out", type=Path, default=OUT)
     options = made.parse_args()
@@ -76,7 +78,7 @@ def _run(task: str, seed: int, options: argparse.Namespace) -> list[dict[str, ob
 
     def row(count: int) -> dict[str, object]:
         taken = time.process_time() - begun
-        earned = _earned(task, dirt, design.surrogate(), seed, count)
+        earned = _earned(task, options.acting_with or dirt, design.surrogate(), seed, count)
         facts = {
             "task": f"{task} {dirt}".strip(),
             "seed": seed,
