@@ -29,7 +29,7 @@ class DesignFirstRun(SurrogateRun):
     """The whole budget is spent by the design, before the training."""
 
     def learn(self) -> Learned:
-        self._employ_sampler()
+        self._register()
         with self._timed("design"):
             self._design()
         with self._timed("train"):
