@@ -32,8 +32,9 @@ class DirtySwingUp(SwingUp):
         self.held = 0
 
     def spec(self) -> dict[str, Any]:
-        own = swing_up().model_copy(update={"query": "rollout", "environment": "swingup", "success": None})
-        return own.model_dump(mode="json")
+        own = swing_up().model_copy(update={"query": "rollout", "environment": "swingup"})
+        # with noise, what is read says little of whether the rod is up
+        return own.model_copy(update={"success": None} if self.dirt.noise else {}).model_dump(mode="json")
 
     def reset(self, seed: int | None = None) -> Any:
         self.held = 0
