@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from importlib.metadata import distribution
+from importlib.metadata import distribution, packages_distributions
 
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
@@ -20,3 +20,13 @@ def needed(requirement: str, found: dict[str, set[str]]) -> dict[str, set[str]]:
         if marker is None or any(marker.evaluate({"extra": extra}) for extra in {"", *extras}):
             needed(line, found)
     return found
+
+
+def absent(requirement: str) -> list[str]:
+    """The modules installed here that a requirement does not lead to."""
+    brought = needed(requirement, {}).keys()
+    return [
+        module
+        for module, names in packages_distributions().items()
+        if not brought & {canonicalize_name(name) for name in names}
+    ]

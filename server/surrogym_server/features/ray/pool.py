@@ -1,31 +1,24 @@
 """The pool of session hosts in a Ray cluster. The first server starts it, and further servers find it.
 
-``RayFits`` computes each round of a design as a task of the cluster, on any machine with a free CPU.
+Ray is imported when it is used: a server without a cluster needs no Ray.
 """
 
 from __future__ import annotations
 
-import asyncio
 import logging
-import platform
-from collections.abc import Awaitable, Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Sequence
 from dataclasses import fields
 from importlib.util import find_spec
-from typing import Any, cast
+from typing import Any
 
-import ray
 import sqlalchemy as sa
-from ray.exceptions import RayError, RayTaskError, TaskCancelledError
 
-from surrogym_server.engine.design_job import DesignJob, DesignResult, run_design_job
-from surrogym_server.engine.fits import Failure, Function, done, error_of
+from surrogym_server.engine.design_job import DesignJob, DesignResult
 from surrogym_server.engine.port import Compute, SessionEngine
-from surrogym_server.errors import InvalidInput, PluginFailed, Unavailable
+from surrogym_server.errors import InvalidInput, Unavailable
 from surrogym_server.feature import Cluster
 from surrogym_server.features.ray.host import HostInfo, HostSettings, SessionHost, versions
 from surrogym_server.features.ray.store import LiveSessions
-from surrogym_server.plugins import in_one_line
 from surrogym_server.settings import Settings
 from surrogym_server.storage.sql import Storage
 from surrogym_shared.ray_address import no_cluster, require_cluster, send_token
@@ -88,7 +81,7 @@ def fits_of(settings: Settings, function: Callable[[DesignJob], DesignResult]) -
     GPUs for fits."""
     import ray
 
-    from surrogym_server.features.ray.pool import RayFits
+    from surrogym_server.features.ray.fits import RayFits
 
     untyped: Any = ray
     resources: dict[str, float] = untyped.cluster_resources()
@@ -215,71 +208,3 @@ def _require_same(wanted: HostSettings, found: Sequence[HostInfo]) -> None:
 
 
 CLUSTER = Cluster(check, connect, fits_of)
-
-
-RETRIES = 1  # how often the fit of a design is tried again if its process or machine died
-
-
-class RayFits(Compute):
-    """Computes each job as a task of Ray. When this process ends, for any reason, Ray ends its tasks.
-
-    Args:
-        function: computes a job.
-        gpus: number of the cluster's GPUs for each job, for example 0.5. The job's process sees no other GPUs.
-    """
-
-    def __init__(self, function: Function = run_design_job, gpus: float = 0.0) -> None:
-        self._function = function
-        self._running: set[Any] = set()
-        self._task: Any = ray.remote(num_cpus=1, num_gpus=gpus, max_retries=RETRIES)(_done_there)
-
-    def start(self) -> None:
-        """Do nothing, because Ray starts the processes of tasks itself."""
-
-    async def run(self, job: DesignJob) -> DesignResult:
-        asked = self._task.remote(self._function, job, versions())
-        self._running.add(asked)
-        try:
-            outcome = await cast(Awaitable[Any], asked)
-        except RayTaskError as error:  # the fit's result, which a plug-in may have made, can't be pickled
-            raise PluginFailed(in_one_line(error.cause or error)) from error
-        except TaskCancelledError as error:
-            raise Unavailable(
-                "the fit was ended, because this server stops: it is repeated after the next start"
-            ) from error
-        except RayError as error:
-            raise Unavailable(
-                f"the process or machine of a fit died: {in_one_line(error)}; the fit is tried again"
-            ) from error
-        except asyncio.CancelledError:
-            await asyncio.to_thread(_end, asked)
-            raise
-        finally:
-            self._running.discard(asked)
-        if isinstance(outcome, Failure):
-            raise error_of(outcome)
-        return cast(DesignResult, outcome)
-
-    def close(self) -> None:
-        for asked in list(self._running):
-            _end(asked)
-        self._running.clear()
-
-
-def _end(asked: Any) -> None:
-    """Kill the process of a Ray task."""
-    with suppress(RayError, ValueError):
-        ray.cancel(asked, force=True)
-
-
-def _done_there(function: Function, job: DesignJob, expected: Mapping[str, str]) -> DesignResult | Failure:
-    """Compute a job in a process of the cluster. Return a ``Failure`` if this process has other versions of Python or
-    of packages than those in ``expected``."""
-    for name, here in versions().items():
-        if here != expected[name]:
-            wrong = (
-                f"expected {name} {expected[name]} on every machine of the cluster, got {here} on {platform.node()}: "
-                "install the same version there"
-            )
-            return Failure(PluginFailed, wrong, "")
-    return done(function, job)

@@ -27,7 +27,7 @@ from surrogym_server.settings import Settings
 
 ray = pytest.importorskip("ray")
 
-from surrogym_server.features.ray import pool  # noqa: E402
+from surrogym_server.features.ray import fits, pool  # noqa: E402
 from surrogym_server.features.ray.host import HostSettings  # noqa: E402
 
 pytestmark = [pytest.mark.timeout(600), pytest.mark.filterwarnings("ignore::FutureWarning:ray")]
@@ -52,7 +52,7 @@ def job(pendulum_samples: Samples) -> DesignJob:
 
 @pytest.mark.parametrize("law", LAWS_OF_COMPUTE, ids=lambda law: law.__name__)
 def test_ray_fitting_tasks_pass_the_compute_interface_tests(law, job: DesignJob, tmp_path: Path):
-    asyncio.run(law(ComputeCase(pool.RayFits, job, tmp_path)))
+    asyncio.run(law(ComputeCase(fits.RayFits, job, tmp_path)))
 
 
 def die(job: DesignJob) -> DesignResult:
@@ -66,11 +66,11 @@ def die(job: DesignJob) -> DesignResult:
 def test_a_ray_fit_job_whose_process_dies_is_retried_and_then_fails(job: DesignJob, tmp_path: Path):
     notes = tmp_path / "notes"
     with pytest.raises(Unavailable, match="the process or machine of a fit died"):
-        asyncio.run(pool.RayFits(die).run(replace(job, state={"notes": str(notes)})))
-    assert len(set(notes.read_text().split())) == 1 + pool.RETRIES
+        asyncio.run(fits.RayFits(die).run(replace(job, state={"notes": str(notes)})))
+    assert len(set(notes.read_text().split())) == 1 + fits.RETRIES
 
 
-@pytest.mark.parametrize(("hosts", "expected"), [(1, pool.RayFits), (2, type(None))])
+@pytest.mark.parametrize(("hosts", "expected"), [(1, fits.RayFits), (2, type(None))])
 def test_fits_run_as_ray_tasks_only_if_session_hosts_leave_a_free_cpu(hosts: int, expected: type):
     """A task that waits for a CPU that never comes free would wait for ever."""
     assert type(pool.fits_of(Settings(engine="ray", ray_hosts=hosts), die)) is expected
@@ -80,10 +80,10 @@ def test_a_fit_on_a_cluster_machine_with_other_package_versions_fails_with_them(
     job: DesignJob, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(
-        pool, "versions", lambda: {"Python": "2.7", "surrogym": "0", "torch": "0", "numpy": "0", "ray": "0"}
+        fits, "versions", lambda: {"Python": "2.7", "surrogym": "0", "torch": "0", "numpy": "0", "ray": "0"}
     )
     with pytest.raises(PluginFailed, match=r"expected Python 2\.7 on every machine of the cluster, got 3\."):
-        asyncio.run(pool.RayFits(die).run(job))
+        asyncio.run(fits.RayFits(die).run(job))
 
 
 def note_gpus(job: DesignJob) -> DesignResult:
