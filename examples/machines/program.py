@@ -109,7 +109,12 @@ def main(kind):
     parser.add_argument("--seed", type=int, default=0, help="draws the parameters of the machine")
     parser.add_argument("--clean", action="store_true", help="without dead time, friction, limits, noise and encoders")
     options = parser.parse_args()
-    program = Program(kind(options.seed, options.clean))
+    serve(kind(options.seed, options.clean))
+
+
+def serve(machine):
+    """Answer the requests of standard input for a machine."""
+    program = Program(machine)
     for line in sys.stdin:
         answer, last = program.answer(line)
         print(json.dumps(answer), flush=True)

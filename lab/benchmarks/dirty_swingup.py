@@ -9,13 +9,11 @@ change what is read, not what is earned.
 from __future__ import annotations
 
 import argparse
-import json
 import math
-import sys
 from typing import Any
 
 from bench_dirt import KINDS, SwingUp, dirt_of  # also makes examples/machines importable
-from program import Program
+from program import serve
 
 from surrogym_sampler.original.swingup import WIDTH, swing_up
 from surrogym_shared.spec import EnvironmentSpec
@@ -94,12 +92,7 @@ def main() -> None:
     parser.add_argument("--kind", choices=KINDS, default="clean")
     parser.add_argument("--seed", type=int, default=0, help="draws the parameters of the machine")
     options = parser.parse_args()
-    program = Program(DirtySwingUp(options.kind, options.seed))
-    for line in sys.stdin:
-        answer, last = program.answer(line)
-        print(json.dumps(answer), flush=True)
-        if last:
-            break
+    serve(DirtySwingUp(options.kind, options.seed))
 
 
 if __name__ == "__main__":

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from surrogym_sampler.original.errors import OriginalError, UnknownEnvironment
 from surrogym_sampler.original.protocol import Array, is_number
+from surrogym_sampler.priors.discrepancy import LEAST_SHARE, SMALLEST, posterior
 from surrogym_shared.spec import EnvironmentSpec
 
 # the default range of a parameter goes from its own value divided by this factor to its own value times this factor
@@ -154,13 +155,11 @@ FEWEST = 2  # smallest number of real steps for a calibration
 STARTS = 5  # largest number of starting points of the fit; the first one is the simulator's own values
 EXPECTED = 1e-3  # if the error is below this share of the coordinates' changes, no further starting point is tried
 EDGE = 0.01  # the first starting point is at least this share of a parameter's range away from the ends of the range
-SMALLEST = 1e-9  # an error below this share of the coordinates' changes counts as rounding
 FAR = 1e3  # error that counts for a step which the simulator can't take, in standard deviations of the changes
 CONFIDENCE = 0.9  # probability that a parameter is in the interval that a calibration states
 WITHIN = 0.29  # standard deviation of a uniform distribution as a share of its range: the prior of a parameter
 ROUNDED = 1e-12  # numbers that differ by less than this share are equal but for rounding
 FIT: dict[str, Any] = {"bounds": (0.0, 1.0), "x_scale": 0.3, "ftol": 1e-12, "xtol": 1e-12, "gtol": 1e-12}
-LEAST_SHARE = 1e-3  # coordinates whose errors are below this share of the largest error all get the same weight
 
 # Function that takes a step of a simulator: it gets parameters (P,), coordinates (C,) and an action (F,), and returns
 # the next coordinates (C,).
@@ -375,8 +374,6 @@ def _with_intervals(
 
     The posterior's own most probable values are nearer to the true ones, but leave larger errors to be learned.
     """
-    from surrogym_sampler.priors.discrepancy import posterior
-
     present = np.clip(scaling.numbers(own), EDGE, 1 - EDGE)
     found = posterior(lambda at: errors(scaling.values(at)), errors.inputs, present, WITHIN, x)
     low, high = found.interval(CONFIDENCE)
