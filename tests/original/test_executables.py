@@ -235,6 +235,19 @@ def test_the_fallback_of_a_program_with_limits_acts_longer_than_a_step_after_its
     assert (tmp_path / "rests").exists()
 
 
+@pytest.mark.parametrize("fault", ["time.sleep(1.0)", "print('warm', flush=True)"])
+def test_a_program_with_limits_falls_back_before_it_is_ended_for_a_late_or_wrong_reply(tmp_path, fault):
+    late = ("    [u] = ", f"    request['action'] == [1.0] and {fault}; [u] = ")
+    notes = ('print(json.dumps({"fallback": steps}), flush=True)', "open(os.path.dirname(__file__) + '/rests', 'x')")
+    plant = original.make(f"exec:{program(tmp_path, KEEPS_LIMITS, FALLS_BACK, late, notes)}", step_limit=0.5)
+    try:
+        with pytest.raises(StepFailed):
+            plant.step_from(np.array([0.2]), np.ones(1))
+        assert (tmp_path / "rests").exists()
+    finally:
+        plant.close()
+
+
 def test_an_environment_program_that_hangs_ends_if_the_process_that_started_it_is_killed(tmp_path):
     """It reads nothing, so the end of its input says nothing to it, and SIGTERM does not end it."""
     hangs = (HANGS[0], "    open(os.path.dirname(__file__) + '/hangs', 'x')\n" + HANGS[1])

@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from support.limited import DIARY, RAIL, SPEC, Cart, FreeCart, NamedCart, PatientCart, SlowCart, with_limits
+from support.limited import DIARY, RAIL, SPEC, Cart, FreeCart, LateCart, NamedCart, PatientCart, SlowCart, with_limits
 from support.noting import until
 from surrogym_sampler.original.episodes import open_episode
-from surrogym_sampler.original.errors import StepFailed, StepRefused, UnknownEnvironment
+from surrogym_sampler.original.errors import StepFailed, StepRefused, StepTimedOut, UnknownEnvironment
 from surrogym_sampler.original.isolated import IsolatedEnvironment
 from surrogym_sampler.original.limits import Guard, GuardedRollouts, GuardedSteps
 from surrogym_sampler.original.protocol import RealStep
@@ -282,6 +282,18 @@ def test_an_environment_that_ends_slowly_is_not_killed_before_the_safety_fallbac
                 assert until(partial(more_than, diary, taken + 1))
     assert until(lambda: diary.read_text().endswith("close\n"), 20)
     assert at_rest(diary)
+
+
+def test_after_a_step_that_took_too_long_the_safety_fallback_stops_the_machine(diary: Path) -> None:
+    with IsolatedEnvironment(LateCart, step_limit=0.6) as environment:
+        environment.begin(0)
+        for _ in range(2):
+            environment.act(RIGHT)
+        with pytest.raises(StepTimedOut):
+            environment.act(RIGHT)
+        assert at_rest(diary)
+        assert diary.read_text().endswith("close\n")
+        assert environment.fallback_steps == len(states(diary)) - 3
 
 
 def test_an_isolated_environment_keeps_its_declared_limits() -> None:

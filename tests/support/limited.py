@@ -98,6 +98,19 @@ class SlowCart(Cart):
         return super().step(action)
 
 
+class LateCart(SlowCart):
+    """The same, whose third step takes a second longer."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._steps = 0
+
+    def step(self, action):
+        self._steps += 1
+        time.sleep(1.0 if self._steps == 3 else 0.0)
+        return super().step(action)
+
+
 class LeavingCart(PatientCart):
     """A strong cart whose limit most steps leave."""
 

@@ -128,15 +128,14 @@ class IsolatedEnvironment:
                 f"the environment's process ended with exit code {code} during {method}: see what it printed"
             ) from error
         if answer is None:
+            self._let_fall_back()
             self._kill()
             raise StepTimedOut(f"the environment's {method} took longer than {limit:g} s and was killed; {MORE_TIME}")
         ok, value, self._fallback_steps = answer
         if isinstance(value, StepRefused):
             raise value
         if ok is None:
-            assert self._process is not None
-            # Wait, because the child closes its environment before it exits.
-            self._process.join(self._step_limit + self._rest_seconds + CLOSE_LIMIT)
+            self._await_end()
             self._kill()
             raise EnvironmentDied(
                 f"the environment ended its process during {method}: {value}; let it raise an exception"
@@ -144,6 +143,23 @@ class IsolatedEnvironment:
         if not ok:
             raise StepFailed(value)
         return value
+
+    def _let_fall_back(self) -> None:
+        """If the specification has a fallback controller, give the step that takes too long its time once more. If it
+        ends within this time, the controller brings the machine to rest, and the child process ends by itself."""
+        if self._rest_seconds and self._process is not None:
+            self._process.terminate()
+            self._await_end()
+
+    def _await_end(self) -> None:
+        """Wait until the child process has closed its environment, and count the last steps of its fallback
+        controller."""
+        assert self._process is not None
+        assert self._pipe is not None
+        self._process.join(self._step_limit + self._rest_seconds + CLOSE_LIMIT)
+        with suppress(EOFError, OSError):
+            while self._pipe.poll():
+                *_, self._fallback_steps = self._pipe.recv()
 
     def _start(self) -> Connection:
         if self._pipe is not None and self._process is not None and self._process.is_alive():
@@ -259,6 +275,8 @@ def _serve(pipe: Connection, factory: Factory, step_limit: float, fallback: str 
         if not closed:
             with working:  # so that a second SIGTERM does not interrupt the fallback controller
                 environment.close()
+                with suppress(OSError):  # the parent may have ended
+                    pipe.send((0, True, None, getattr(environment, "fallback_steps", 0)))
 
 
 def _serve_one(pipe: Connection, environment: Environment, working: _Ending) -> str:

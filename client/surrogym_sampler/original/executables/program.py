@@ -121,8 +121,9 @@ class Program:
     """A program that is started without a shell, in a session of its own, so that Ctrl-C does not reach it.
 
     Its standard error is passed on to that of this process. After a time-out, or a line that is not an answer, the
-    program is killed; ``start`` starts it again. If this process is killed, the program sees the end of its standard
-    input, and is killed some time later.
+    program is killed; ``start`` starts it again. A program with a fallback controller first sees the end of its
+    standard input, and has time to bring its machine to rest. If this process is killed, the program sees the end of
+    its standard input, and is killed some time later.
 
     Args:
         command: the program and its arguments, quoted as for a shell.
@@ -135,6 +136,7 @@ class Program:
 
     def __init__(self, command: str, called: str = "the program", grace: float = GRACE_SECONDS) -> None:
         self._called, self._grace = called, grace
+        self._falls_back = False
         try:
             self._words = shlex.split(command)
         except ValueError as error:
@@ -165,6 +167,7 @@ class Program:
         """Let the program run these seconds longer after this process was killed, so that its fallback controller can
         act. This also holds after the program is started again."""
         self._grace += seconds
+        self._falls_back = True
         if self._guard is not None and self._process is not None:
             self._guard.dismiss()
             self._guard = Guard(self._process.pid, self._grace)
@@ -216,7 +219,7 @@ class Program:
         except (RequestRefused, StepRefused):
             raise
         except StepFailed:
-            self.end()
+            self._end_after_fault()
             raise
 
     def exchange(self, line: bytes, what: str, deadline: float) -> bytes:
@@ -234,8 +237,15 @@ class Program:
             self._write(line, what, deadline)
             return self._read(what, deadline)
         except StepFailed:
-            self.end()
+            self._end_after_fault()
             raise
+
+    def _end_after_fault(self) -> None:
+        """End the program. One with a fallback controller may first finish its step and bring its machine to rest."""
+        if self._falls_back:
+            self.end_input()
+            self.wait(self._grace)
+        self.end()
 
     def surplus(self, seconds: float) -> bytes:
         """Wait up to ``seconds``, and return what the program printed after its last answer."""
