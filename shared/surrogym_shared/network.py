@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, Field, PositiveInt, ValidationError
 
+from surrogym_shared.integrals import Error
 from surrogym_shared.kinds import Activation
 from surrogym_shared.policy_sizes import MAX_LAYERS
 from surrogym_shared.spec import Action, BoxAction, EnvironmentSpec
@@ -49,6 +50,7 @@ class _Head(BaseModel):
     counts: tuple[PositiveInt, ...]
     activation: Activation = "tanh"
     layers: Annotated[int, Field(ge=1, le=MAX_LAYERS)] = 2
+    integrals: tuple[Error, ...] = ()
 
     @property
     def names(self) -> list[tuple[str, str]]:
@@ -75,6 +77,8 @@ class Network:
     high: Array
     counts: tuple[int, ...] = ()
     activation: Activation = "tanh"  # activation function of the hidden layers
+    # errors whose integrals follow the environment's own entries in an observation, if the sampler computes them
+    integrals: tuple[Error, ...] = ()
 
     @classmethod
     def of(
@@ -120,7 +124,13 @@ class Network:
 
     def to_bytes(self) -> bytes:
         """Return the content of the file that ``save`` writes."""
-        head = _Head(version=2, counts=self.counts, activation=self.activation, layers=len(self.layers))
+        head = _Head(
+            version=2,
+            counts=self.counts,
+            activation=self.activation,
+            layers=len(self.layers),
+            integrals=self.integrals,
+        )
         arrays = {name: getattr(self, name) for name in OUTSIDE}
         for names, layer in zip(head.names, self.layers, strict=True):
             arrays |= dict(zip(names, layer, strict=True))
@@ -153,12 +163,12 @@ class Network:
             ) from error
         layers = tuple(Layer(*(arrays[name] for name in names)) for names in head.names)
         outside = {name: arrays[name] for name in OUTSIDE}
-        return cls(**outside, layers=layers, counts=head.counts, activation=head.activation)
+        return cls(**outside, layers=layers, counts=head.counts, activation=head.activation, integrals=head.integrals)
 
     def require_fit(self, entries: int, action: Action) -> None:
-        """Raise ``ValueError`` if the policy does not read observations of ``entries`` entries, or has other actions
-        than ``action``."""
-        wanted = _form(entries, action.policy_counts or action.size)
+        """Raise ``ValueError`` if the policy does not read observations of ``entries`` entries and its integrals, or
+        has other actions than ``action``."""
+        wanted = _form(entries + len(self.integrals), action.policy_counts or action.size)
         got = _form(len(self.mean), self.counts or len(self.low))
         if got != wanted:
             raise ValueError(f"expected a policy of {wanted}, got one of {got}")

@@ -13,6 +13,7 @@ from support.real_steps import random_steps
 from surrogym_sampler.original.classic import pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.local import LocalSurrogate
+from surrogym_shared.integrals import UNIT, Integrals, errors_of
 from surrogym_shared.network import Network
 from surrogym_shared.spec import DeclaredReward, Quantity, RewardTerm, Term
 from surrogym_shared.wire import OpenSession
@@ -20,7 +21,7 @@ from surrogym_trainer.deployment.reading import controller_of
 from surrogym_trainer.evaluation import imagined_returns
 from surrogym_trainer.policies import load_policy
 from surrogym_trainer.policies.card import read_card
-from surrogym_trainer.policies.integrals import UNIT, Integrals, acting_with_integrals, with_integrals
+from surrogym_trainer.policies.integrals import acting_with_integrals, with_integrals
 from surrogym_trainer.policies.predict import PerEpisode
 from surrogym_trainer.training import TrainSettings, train
 
@@ -120,7 +121,7 @@ def test_an_integral_needs_a_declared_reward_and_an_observation_of_the_coordinat
     with pytest.raises(
         ValueError, match="one set point in a declared reward, which this reward does not have, got 'x'"
     ):
-        Integrals.of(SPEC, ("x",), {})
+        errors_of(SPEC, ("x",), {})
     hidden = DECLARED.observation[0].model_copy(update={"term": Term.sin(x=1)})
     with pytest.raises(ValueError, match="expected a coordinate that an observation entry shows, got 'x'"):
-        Integrals.of(DECLARED.model_copy(update={"observation": (hidden,)}), ("x",), {})
+        Integrals.of(DECLARED.model_copy(update={"observation": (hidden,)}), errors_of(DECLARED, ("x",), {}))

@@ -19,6 +19,7 @@ from surrogym_client.transport import Api, HttpSurrogate
 from surrogym_sampler.original.classic import pendulum
 from surrogym_sampler.original.rollouts import answering
 from surrogym_sampler.queries import Sampler, SamplerSettings
+from surrogym_shared.integrals import Error
 from surrogym_shared.network import Network
 from surrogym_shared.spec import (
     BoxAction,
@@ -30,9 +31,10 @@ from surrogym_shared.spec import (
     Uniform,
     with_history,
 )
+from surrogym_shared.terms import observe
 from surrogym_shared.wire import Trial
 from surrogym_trainer.policies.files import load_network
-from surrogym_trainer.policies.integrals import IntegralPort, Integrals
+from surrogym_trainer.policies.integrals import IntegralPort
 from surrogym_trainer.training import TrainSettings
 from surrogym_trainer.training.audited import AuditedTraining
 from surrogym_trainer.training.closed_loop import LoopSettings
@@ -160,16 +162,25 @@ def test_rounds_of_a_ready_design_take_no_trial(tmp_path: Path, phase: str, trie
     assert training._may_try(rounds) is tries
 
 
-def test_an_audit_sends_no_policy_that_sees_integrals_to_a_sampler(trials_server: ServerProcess, waiting: str) -> None:
+def test_a_policy_that_sees_an_integral_acts_in_audits(trials_server: ServerProcess, waiting: str) -> None:
     with Api(trials_server.url) as api, HttpSurrogate(trials_server.url, waiting) as own:
-        port = IntegralPort(own, Integrals(np.array([0]), np.array([1.0]), np.array([0.0])), ("level",))
+        port = IntegralPort(own, (Error("level", 0.0, 2.0),))
         size = len(port.spec().observation)
-        vector = np.zeros(Network.size(port.spec(), 4))
-        policy = Network.of(port.spec(), np.zeros(size), np.ones(size), 4, vector)
+        weights = np.random.default_rng(0).normal(size=Network.size(port.spec(), 4))
+        policy = Network.of(port.spec(), np.zeros(size), np.ones(size), 4, weights)
         handover = hand_over(Subject(api, waiting, port, policy), AuditSettings())
         assert handover.audit is not None
         assert handover.audit.steps >= 8
-        assert not [query for query in api.queries(waiting) if query.policy]
+        (query,) = [query for query in api.queries(waiting) if query.policy]
+        samples = [sample for sample in api.samples(waiting) if sample.query_id == query.id]
+    states = np.array([sample.coordinates for sample in samples])
+    levels = states[:, :1]
+    sums = np.zeros_like(levels)
+    for now in range(1, len(sums)):
+        sums[now] = np.clip(sums[now - 1] + levels[now] / 2.0, -1, 1)
+    assert np.ptp(sums) > 0.1
+    chosen = policy(np.concatenate([observe(Late().spec(), states), sums], axis=1))
+    assert [sample.action for sample in samples] == [pytest.approx(action, abs=1e-6) for action in chosen.tolist()]
 
 
 @pytest.mark.parametrize(
@@ -178,7 +189,7 @@ def test_an_audit_sends_no_policy_that_sees_integrals_to_a_sampler(trials_server
         (SETTINGS, True),
         (TrainSettings(algorithm="CMAES"), True),
         (TrainSettings(algorithm="SAC"), False),
-        (replace(SETTINGS, integral=("level",)), False),
+        (replace(SETTINGS, integral=("level",)), True),
     ],
 )
 def test_trials_need_a_search_whose_policies_are_networks_of_arrays(settings: TrainSettings, allowed: bool) -> None:
@@ -261,7 +272,7 @@ def test_a_training_waits_for_trials_while_the_machine_takes_that_of_another_tra
     step = Late.step
     monkeypatch.setattr(Late, "step", lambda *arguments: going.wait(60) and step(*arguments))
     try:
-        trials.api.improve(waiting, trial=Trial(policy=encoded(idle()), actions=[[0.0]] * 3))
+        trials.api.improve(waiting, trial=Trial(policy=encoded(idle(), trials.port), actions=[[0.0]] * 3))
         assert trials.api.surrogate(waiting).phase == "sampling"
         assert is_waiting_for_trials(trials.api, waiting)
     finally:
@@ -272,7 +283,7 @@ def test_a_training_judges_its_own_trial_beside_that_of_another_training(
     trials: Trials, waiting: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def beside(*_: object) -> list[list[float]]:
-        trials.api.improve(waiting, trial=Trial(policy=encoded(idle()), actions=[[0.5]]))
+        trials.api.improve(waiting, trial=Trial(policy=encoded(idle(), trials.port), actions=[[0.5]]))
         return [[0.25]] * EPISODE
 
     judged: list[int] = []

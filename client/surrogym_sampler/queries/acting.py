@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from surrogym_client.environments.file_factories import planner_of
 from surrogym_client.transport.api import Api
+from surrogym_shared.integrals import Floats, Integrals, joined
 from surrogym_shared.network import Network, bounds_of
 from surrogym_shared.port import HORIZON
 from surrogym_shared.spec import EnvironmentSpec
@@ -36,17 +37,23 @@ def replanning(api: Api, surrogate: str, spec: EnvironmentSpec) -> Acting:
 def following(policy: bytes, spec: EnvironmentSpec) -> Acting:
     """Return a function from a state (C,) to the action (F,) of a policy, given the content of its file.
 
-    The file contains arrays; nothing is unpickled.
+    The states are those of one episode, in their order: integrals of errors that the policy sees begin at 0. The file
+    contains arrays; nothing is unpickled.
 
     Raises:
         ValueError: the file is not a network of arrays, or not one for this environment.
     """
     network = Network.load(policy)
     network.require_fit(len(spec.observation), spec.action)
-    low, high = bounds_of(spec)
+    integrals, (low, high) = Integrals.of(spec, network.integrals), bounds_of(spec)
+    sums: Floats | None = None
 
     def act(state: NDArray[np.float64]) -> Sequence[float]:
-        action = np.reshape(network(observe(spec, np.asarray(state, dtype=np.float64)[None])), -1).astype(np.float64)
+        nonlocal sums
+        shown = observe(spec, np.asarray(state, dtype=np.float64)[None])
+        now = np.zeros((1, len(network.integrals))) if sums is None else integrals.after(sums, shown)
+        sums = now
+        action = np.reshape(network(joined(shown, now)), -1).astype(np.float64)
         chosen: list[float] = (action if network.counts else np.clip(action, low, high)).tolist()
         return chosen
 

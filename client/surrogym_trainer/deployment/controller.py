@@ -15,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surrogym_client.errors import SurrogymClientError
+from surrogym_shared.integrals import Error
 from surrogym_shared.kinds import Function, LagKind
 from surrogym_shared.rates import Rate, rates
 from surrogym_shared.spec import BoxAction, Coordinate, EnvironmentSpec, Lag, Term, limits
 from surrogym_shared.spec.actions import Action
 from surrogym_shared.spec.safety import NamedFallback
-from surrogym_trainer.policies.integrals import Error
 
 Array = NDArray[np.float64]
 Activation = Literal["none", "tanh", "relu"]

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from surrogym_sampler.original.actions import decode_actions
 from surrogym_sampler.original.fitting import check_policy
+from surrogym_shared.integrals import errors_of
 from surrogym_shared.network import Network
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_trainer.deployment.controller import (
@@ -31,7 +32,6 @@ from surrogym_trainer.deployment.controller import (
 from surrogym_trainer.deployment.reference import act, scores
 from surrogym_trainer.policies.card import UnusablePolicy, read_card
 from surrogym_trainer.policies.files import ONNX, load_network, load_policy, require_policy
-from surrogym_trainer.policies.integrals import errors_of
 from surrogym_trainer.policies.planner_files import PlannerFile
 from surrogym_trainer.policies.predict import Predict
 

@@ -1,8 +1,4 @@
-"""Integrals of errors as observations: a policy also sees how far a coordinate was from its set point so far.
-
-The sum of the errors since the reset is clipped to [-1, 1], so it remembers the last steps alone while the coordinate
-is far from its set point. A policy that sees it can hold the set point with a weaker pump, or with an offset in the
-action.
+"""Policies that observe integrals of errors, in virtual episodes and at the machine (``surrogym_shared.integrals``).
 
 Shapes: N lanes or episodes, D observation entries, K integrals.
 """
@@ -11,99 +7,36 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from surrogym_shared.integrals import Error, Integrals, errors_of, joined
 from surrogym_shared.port import Bools, Floats, Ints, ResetResult, StepResult, SurrogatePort
-from surrogym_shared.set_points import line_of, set_points_of, with_set_points
-from surrogym_shared.spec import EnvironmentSpec, ObservationEntry, Term, limits
+from surrogym_shared.spec import EnvironmentSpec, ObservationEntry, Term
 from surrogym_shared.wire import OpenSession, SessionView, SubmittedOccupancy
 from surrogym_trainer.policies.predict import Acting, PerEpisode, Predict
-
-UNIT = 0.05  # error, as a share of the coordinate's sampling range, that moves an integral from 0 to an end in one step
-
-
-@dataclass(frozen=True)
-class Error:
-    """The error of a coordinate ``name`` from its ``set_point``; an error of ``unit`` moves the integral by 1."""
-
-    name: str
-    set_point: float
-    unit: float
-
-
-def errors_of(spec: EnvironmentSpec, names: Sequence[str], set_points: Mapping[str, float]) -> tuple[Error, ...]:
-    """Return the errors of coordinates. Arguments are those of ``Integrals.of``.
-
-    Raises:
-        ValueError: the reward does not have a set point of a coordinate.
-    """
-    known, errors = set_points_of(with_set_points(spec, set_points)), []
-    for name in names:
-        if len(known.get(name, ())) != 1:
-            raise ValueError(
-                f"integral: expected a coordinate with one set point in a declared reward, "
-                f"{' or '.join(map(repr, known)) or 'which this reward does not have'}, got {name!r}"
-            )
-        low, high = limits(spec.coordinates[spec.coordinate_names.index(name)].sampling)
-        errors.append(Error(name, known[name][0], UNIT * (high - low)))
-    return tuple(errors)
-
-
-@dataclass(frozen=True)
-class Integrals:
-    """Running sums of the errors of K coordinates, computed from observations."""
-
-    columns: Ints  # (K,) observation entry that shows each coordinate
-    slopes: Floats  # (K,) factor of this entry in the error
-    constants: Floats  # (K,) constant in the error
-
-    @classmethod
-    def of(cls, spec: EnvironmentSpec, names: Sequence[str], set_points: Mapping[str, float]) -> Self:
-        """Return the integrals of the errors of coordinates.
-
-        Args:
-            spec: specification with a declared reward.
-            names: names of the K coordinates.
-            set_points: set points that replace those of the reward, by coordinate.
-
-        Raises:
-            ValueError: the reward does not have a set point of a coordinate, or the observation does not show it.
-        """
-        shown, rows = [(i, line_of(one.term)) for i, one in enumerate(spec.observation)], []
-        for error in errors_of(spec, names, set_points):
-            lines = [(i, *line[1:]) for i, line in shown if line is not None and line[0] == error.name]
-            if not lines:
-                raise ValueError(f"integral: expected a coordinate that an observation entry shows, got {error.name!r}")
-            column, slope, constant = lines[0]
-            rows.append((column, 1 / (slope * error.unit), -(constant / slope + error.set_point) / error.unit))
-        columns, slopes, constants = zip(*rows, strict=True)
-        return cls(np.array(columns), np.array(slopes), np.array(constants))
-
-    def after(self, sums: Floats, observation: Floats) -> Floats:
-        """Return the sums (N, K) after a step that led to observations (N, D)."""
-        added: Floats = np.clip(sums + observation[:, self.columns] * self.slopes + self.constants, -1.0, 1.0)
-        return added
 
 
 def with_integrals(port: SurrogatePort, names: Sequence[str], set_points: Mapping[str, float]) -> SurrogatePort:
     """Return a surrogate whose observations also have integrals of errors. Arguments and errors are those of
-    ``Integrals.of``. Without names, ``port`` itself is returned, and so is a surrogate that has them already."""
+    ``errors_of`` and ``Integrals.of``. Without names, ``port`` itself is returned, and so is a surrogate that has them
+    already."""
     if not names or isinstance(port, IntegralPort):
         return port
-    return IntegralPort(port, Integrals.of(port.spec(), names, set_points), tuple(names))
+    return IntegralPort(port, errors_of(port.spec(), names, set_points))
 
 
 def acting_with_integrals(
     predict: Predict, spec: EnvironmentSpec | None, names: Sequence[str], set_points: Mapping[str, float]
 ) -> Acting:
     """Return a policy that sees integrals of errors as a controller of an environment whose observations lack them.
-    Arguments and errors are those of ``Integrals.of``. Without names, the policy itself is returned."""
+    Arguments and errors are those of ``errors_of`` and ``Integrals.of``. Without names, the policy itself is
+    returned."""
     if not names or spec is None:
         return predict
-    return _Integrating(predict, Integrals.of(spec, names, set_points))
+    return _Integrating(predict, Integrals.of(spec, errors_of(spec, names, set_points)))
 
 
 @dataclass
@@ -118,7 +51,7 @@ class _Integrating(PerEpisode):
                 self._sums[episode] = np.zeros(len(self.integrals.columns))
             else:
                 self._sums[episode] = self.integrals.after(sums[None], observation[None])[0]
-        return self.predict(_joined(observations, np.stack([self._sums[episode] for episode in episodes])))
+        return self.predict(joined(observations, np.stack([self._sums[episode] for episode in episodes])))
 
 
 @dataclass
@@ -134,9 +67,11 @@ class IntegralPort(SurrogatePort):
     """A surrogate whose observations also have integrals of errors, which are computed here."""
 
     port: SurrogatePort
-    integrals: Integrals
-    names: tuple[str, ...]
+    errors: tuple[Error, ...]
     _sessions: dict[str, _Sums] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.integrals = Integrals.of(self.port.spec(), self.errors)
 
     def acting(self, predict: Predict) -> Acting:
         """Return a policy of this surrogate as a controller of the original environment."""
@@ -145,11 +80,14 @@ class IntegralPort(SurrogatePort):
     def spec(self) -> EnvironmentSpec:
         spec = self.port.spec()
         # The entries only count the numbers of an observation: an integral is no function of the state.
-        more = (ObservationEntry(name=f"integral of {n}", term=Term.constant(0.0), low=-1, high=1) for n in self.names)
+        more = (
+            ObservationEntry(name=f"integral of {error.name}", term=Term.constant(0.0), low=-1, high=1)
+            for error in self.errors
+        )
         return spec.model_copy(update={"observation": (*spec.observation, *more)})
 
     def open(self, request: OpenSession) -> SessionView:
-        view, size = self.port.open(request), len(self.names)
+        view, size = self.port.open(request), len(self.errors)
         self._sessions[view.id] = _Sums(np.zeros((view.num_envs, size)), np.zeros(view.num_envs, dtype=bool))
         space = view.observation_space
         ends = {"low": [*space.low, *[-1.0] * size], "high": [*space.high, *[1.0] * size]}
@@ -158,7 +96,7 @@ class IntegralPort(SurrogatePort):
     def reset(self, session: str, *, seed: int | Sequence[int] | None = None, mask: Bools | None = None) -> ResetResult:
         result, sums = self.port.reset(session, seed=seed, mask=mask), self._sessions[session]
         self._begin(sums, slice(None) if mask is None else mask)
-        return replace(result, observation=_joined(result.observation, sums.now))
+        return replace(result, observation=joined(result.observation, sums.now))
 
     def step(
         self, session: str, action: Floats | Ints, *, mask: Bools | None = None, deviations: bool = False
@@ -183,18 +121,13 @@ class IntegralPort(SurrogatePort):
         arrived[final] = result.final_observation
         began = stepped & sums.ended  # this step reset lanes whose episode had ended before
         sums.now = np.where((stepped & ~began)[:, None], self.integrals.after(sums.now, arrived), sums.now)
-        last = _joined(result.final_observation, sums.now[final])
+        last = joined(result.final_observation, sums.now[final])
         self._begin(sums, began)
         self._begin(sums, final)
         sums.ended = sums.ended | (stepped & (result.terminated | result.truncated))
         sums.ended[final] = False
-        return replace(result, observation=_joined(result.observation, sums.now), final_observation=last)
+        return replace(result, observation=joined(result.observation, sums.now), final_observation=last)
 
     @staticmethod
     def _begin(sums: _Sums, lanes: Any) -> None:
         sums.now[lanes], sums.ended[lanes] = 0.0, False
-
-
-def _joined(observation: Floats, sums: Floats) -> Floats:
-    joined: Floats = np.concatenate([observation, sums.astype(observation.dtype)], axis=1)
-    return joined

@@ -47,7 +47,6 @@ from surrogym_trainer.evaluation.out_of_distribution import Outside, outside_of,
 from surrogym_trainer.evaluation.promise import UNNOTICED, promise_of
 from surrogym_trainer.evaluation.systematic import Inputs
 from surrogym_trainer.policies.evidence import Audit, Promise
-from surrogym_trainer.policies.integrals import IntegralPort
 from surrogym_trainer.policies.predict import Predict
 from surrogym_trainer.training.trials import encoded
 
@@ -333,8 +332,8 @@ def _asked(subject: Subject, settings: AuditSettings, q: Array, u: Array, *, cla
     """
     spec, rng = subject.port.spec(), np.random.default_rng(settings.seed)
     if spec.query == "rollout":
-        policy, tries = subject.predict, spec.needs_trials and not isinstance(subject.port, IntegralPort)
-        acting = encoded(policy) if tries and isinstance(policy, Network) else None
+        policy = subject.predict
+        acting = encoded(policy, subject.port) if spec.needs_trials and isinstance(policy, Network) else None
         view = subject.api.surrogate(subject.name)
         steps = length_of_rollout(view, settings.steps, LONGEST_EPISODE if acting else LONGEST_ROLLOUT)
         _, actions = way_of(subject, 1, steps)

@@ -28,6 +28,7 @@ from surrogym_shared.wire import QueryView, Trial
 from surrogym_trainer.evaluation.evaluator import succeeded
 from surrogym_trainer.evaluation.imagined import imagined_returns
 from surrogym_trainer.policies.files import load_network
+from surrogym_trainer.policies.integrals import IntegralPort
 from surrogym_trainer.training.closed_loop import CLEARLY, EPISODES, TrainingInRounds, shifted
 from surrogym_trainer.training.search import planned_steps, search_for, with_algorithm
 from surrogym_trainer.training.settings import TrainResult, TrainSettings, chosen_for
@@ -42,14 +43,16 @@ NOTICEABLE = 0.02  # share of a policy's gain over an untrained one; a smaller c
 
 
 def allows_trials(spec: EnvironmentSpec, settings: TrainSettings) -> bool:
-    """Whether policies of a search try an environment: only they can steer it, and they are networks of arrays that see
-    no integrals of errors, which a sampler does not compute."""
-    return spec.needs_trials and not settings.integral and search_for(with_algorithm(settings, spec)).saves_network
+    """Whether policies of a search try an environment: only they can steer it, and they are networks of
+    arrays."""
+    return spec.needs_trials and search_for(with_algorithm(settings, spec)).saves_network
 
 
-def encoded(policy: Network) -> str:
-    """Return the content of a policy's file in base64."""
-    return b64encode(policy.to_bytes()).decode()
+def encoded(policy: Network, port: SurrogatePort) -> str:
+    """Return the content of a policy's file in base64, for a sampler, which computes the integrals that the policy sees
+    in ``port``."""
+    errors = port.errors if isinstance(port, IntegralPort) else ()
+    return b64encode(replace(policy, integrals=errors).to_bytes()).decode()
 
 
 def is_waiting_for_trials(api: Api, name: str) -> bool:
@@ -134,7 +137,7 @@ class Trials(TrainingInRounds):
         error or a stopped sampler cut off has not. Return None if no step could be taken."""
         view, earlier = self.api.surrogate(self.name), {query.id for query in self.api.queries(self.name)}
         actions = expected_actions(self.port, policy, steps, self.settings.seed + number)
-        self.api.improve(self.name, trial=Trial(policy=encoded(policy), actions=actions))
+        self.api.improve(self.name, trial=Trial(policy=encoded(policy, self.port), actions=actions))
         self._tried += 1
         asked = self._asked(actions, earlier)
         try:

@@ -192,16 +192,15 @@ def _trainable(
         words_of_design,
         words_of_uncertainty,
     )
+    from surrogym_shared.integrals import Integrals, errors_of
     from surrogym_shared.set_points import with_set_points
-    from surrogym_trainer.policies.integrals import Integrals
     from surrogym_trainer.training.search import SEARCHES, name_of
 
     with connect(server, token, wait, quiet=quiet) as api:
         view = awaited_surrogate(api, surrogate, wait, quiet=quiet)
         try:
             with_set_points(view.spec, settings.set_points)
-            if settings.integral:
-                Integrals.of(view.spec, settings.integral, settings.set_points)
+            Integrals.of(view.spec, errors_of(view.spec, settings.integral, settings.set_points))
         except ValueError as error:
             raise CommandError(str(error)) from error
         if wait > 0:
@@ -239,8 +238,7 @@ def _words_without_trials(view: SurrogateView, settings: TrainSettings) -> str:
 
     none = f"so no trials take the other {view.budget_left} real steps of the budget"
     if not allows_trials(view.spec, settings):
-        sees = "that see integrals" if settings.integral else f"of {name_of(settings)}"
-        return f"samplers can't run policies {sees}, {none}: for trials, train without --algorithm and --integral"
+        return f"samplers can't run policies of {name_of(settings)}, {none}: for trials, train without --algorithm"
     if view.samplers:
         return ""
     start = sample_command(view.name, view.environment)
