@@ -7,7 +7,7 @@ import threading
 
 import pytest
 
-from support.hinge import Real, hinge_spec
+from support.hinge import PERIOD, Real, hinge_spec, sent
 from support.noting import until
 from surrogym_client.transport import Api
 from surrogym_client.transport.priors import PriorCalls
@@ -56,6 +56,43 @@ def test_a_simulator_that_prints_and_fails_in_some_states_can_be_used_as_prior(o
         beside.join()
     assert said.code == 0
     assert json.loads(said.out)["prior"]["about"]["source"] == "support.hinge:Partial"
+
+
+@pytest.fixture
+def sampled(server_process, name):
+    """A surrogate with eight real steps, whose design takes no more."""
+    with Api(server_process.url) as api:
+        api.create_surrogate(name, hinge_spec(design={"budget": 0}, sampling_period=PERIOD))
+        sent(api, name, 8)
+        yield name
+        api.delete_surrogate(name)
+
+
+def test_the_status_shows_the_calibration_and_the_outputs_that_use_the_prior(on_server, sampled):
+    said = on_server("prior", sampled, "support.hinge:Textbook", *PARAMETERS, "--steps", "60")
+    assert said.code == 0
+    assert "outputs that use it: angle, speed" in said.out
+    assert said.out in on_server("status", sampled).out
+
+
+def test_a_prior_in_other_units_is_said_to_have_too_large_errors_and_the_design_goes_without_it(on_server, sampled):
+    said = on_server("prior", sampled, "support.hinge:Degrees", "-p", "mass", "--steps", "60")
+    assert said.code == 0
+    assert "larger than the changes themselves: check the units" in said.out
+    assert "outputs that use it: none" in said.out
+
+
+def test_a_prior_with_another_sampling_period_is_refused(on_server, sampled):
+    said = on_server("prior", sampled, "support.hinge:Faster")
+    assert said.code != 0
+    assert "a step every 0.1 s" in said.err
+
+
+def test_a_prior_that_fails_at_most_real_steps_says_how_the_design_continues(on_server, sampled):
+    said = on_server("prior", sampled, "support.hinge:Elsewhere")
+    assert said.code != 0
+    assert "the solver diverged" in said.err
+    assert f"surrogym prior {sampled} --drop" in said.err
 
 
 def test_invalid_uses_of_the_prior_command_are_refused_and_change_nothing(on_server, server_process, hinge):

@@ -10,8 +10,12 @@ import pytest
 from playwright.sync_api import Page, expect
 
 from support.dirty import learned
+from support.hinge import hinge_spec, sent
 from support.server import ServerProcess
+from surrogym_client.surrogates.transfer import export_surrogate
+from surrogym_client.surrogates.waiting import wait_for_model
 from surrogym_client.transport import Api
+from surrogym_client.transport.priors import PriorCalls
 from surrogym_sampler.original.classic import pendulum
 from surrogym_shared.spec import (
     BoxAction,
@@ -116,6 +120,21 @@ def test_the_dashboard_shows_where_a_model_of_twelve_coordinates_is_unsure(
     page = open_page(f"{url}/#/s/masses")
     expect(page.locator(".facts")).to_contain_text("of 768 points")
     expect(page.locator(".facts")).to_contain_text("Least certain near")
+    assert complaints == []
+
+
+def test_the_dashboard_shows_a_prior_and_the_outputs_that_use_it(url: str, open_page: Open, complaints: list[str]):
+    with Api(url) as api:
+        for name in ("hinge", "hinge-of-last-year"):
+            api.create_surrogate(name, hinge_spec(design={"budget": 0}))
+            sent(api, name, 12)
+            wait_for_model(api, name, 60)
+        page = open_page(f"{url}/#/s/hinge")
+        expect(page.locator(".facts")).to_contain_text("What it cost")
+        expect(page.locator(".facts")).not_to_contain_text("What was known")
+        PriorCalls(api.connection).put("hinge", export_surrogate(api, "hinge-of-last-year").to_bytes())
+    expect(page.locator(".facts")).to_contain_text("Prior: hinge-of-last-year")
+    expect(page.locator(".facts")).to_contain_text("Outputs that use it: angle")
     assert complaints == []
 
 

@@ -6,7 +6,9 @@ import math
 
 import numpy as np
 
+from surrogym_client.transport import Api
 from surrogym_sampler.original.protocol import Array, RealStep
+from surrogym_shared import wire
 from surrogym_shared.spec import BoxAction, Coordinate, EnvironmentSpec, ObservationEntry, Term, Uniform
 
 PERIOD = 0.1
@@ -99,6 +101,21 @@ def steps_of(plant: Textbook, count: int, seed: int = 0) -> list[RealStep]:
     return [plant.step_from(q, u) for q, u in zip(starts, rng.uniform(-1, 1, (count, 1)), strict=True)]
 
 
+def sent(api: Api, name: str, count: int) -> None:
+    """Send real steps by hand to the surrogate of this name."""
+    samples = [
+        wire.NewSample(
+            coordinates=list(s.coordinates),
+            action=list(s.action),
+            next_coordinates=list(s.next_coordinates),
+            reward=s.reward,
+            terminated=False,
+        )
+        for s in steps_of(Real(), count)
+    ]
+    api.add_samples(name, "test", samples)
+
+
 class Renamed(Textbook):
     """A simulator whose coordinates have other names."""
 
@@ -113,6 +130,30 @@ class Weaker(Textbook):
 
     def spec(self) -> EnvironmentSpec:
         return hinge_spec(action=BoxAction(low=(-0.5,), high=(0.5,)).model_dump())
+
+
+class Degrees(Textbook):
+    """A simulator that computes in degrees, and says rad."""
+
+    def step_from(self, coordinates: Array, action: Array) -> RealStep:
+        step = super().step_from(np.radians(coordinates), action)
+        return RealStep(tuple(coordinates), step.action, tuple(np.degrees(step.next_coordinates)), step.reward)
+
+
+class Faster(Textbook):
+    """A simulator whose step is half as long as that of a plant with a step every 0.1 s."""
+
+    def spec(self) -> EnvironmentSpec:
+        return hinge_spec(sampling_period=PERIOD / 2)
+
+
+class Elsewhere(Textbook):
+    """A simulator that works in a small part of its range alone."""
+
+    def step_from(self, coordinates: Array, action: Array) -> RealStep:
+        if abs(coordinates[0]) > 1:
+            raise FloatingPointError("the solver diverged")
+        return super().step_from(coordinates, action)
 
 
 class Partial(Textbook):

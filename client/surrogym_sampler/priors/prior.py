@@ -5,6 +5,7 @@ Shapes: n steps, C coordinates, F action entries.
 
 from __future__ import annotations
 
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -16,8 +17,16 @@ from surrogym_sampler.original.actions import middle_action
 from surrogym_sampler.original.episodes import draw
 from surrogym_sampler.original.errors import StepRefused, UnknownEnvironment
 from surrogym_sampler.original.loading import Respecified, is_own, make, with_choices
+from surrogym_sampler.original.periods import require_period
 from surrogym_sampler.original.protocol import Array, OriginalEnvironment, RealStep
-from surrogym_sampler.priors.calibration import Calibration, RealTransitions, adjustable, calibrate, read_parameters
+from surrogym_sampler.priors.calibration import (
+    Calibration,
+    RealTransitions,
+    Step,
+    adjustable,
+    calibrate,
+    read_parameters,
+)
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.surrogate_file import SurrogateFile
 from surrogym_shared.wire.priors import CalibratedParameter, PriorAbout
@@ -27,6 +36,8 @@ FEWEST, MOST = 100, 400  # smallest and largest default number of simulated step
 WORSE = 1.5  # if the error on the real steps so far exceeds this multiple of the calibration's error, calibrate again
 AGAIN = 2  # the parameters are calibrated again when there are this many times the steps of the last calibration
 TRIALS = 5  # number of steps that test whether a simulator works
+REPORT_SECONDS = 1.0  # time between two reports of a calibration's progress
+SLOW = 0.1  # seconds of a simulated step that counts as slow, if the seconds of a real step are not known
 RIGHT = 1e-3  # if the simulator's error is below this share of the coordinates' changes, its parameters are kept
 
 Progress = Callable[[float | None, str], None]
@@ -143,8 +154,10 @@ class SimulatorPrior(ABC):
             if is_right and len(real) < AGAIN * self._calibrated_on:
                 return False
         names = ", ".join(parameter.name for parameter in self.parameters)
-        progress(0.0, f"{'calibrating ' + names if names else 'comparing'} on {len(real)} real steps")
-        found = calibrate(self.spec, steps, self.parameters, self._own, self._step)
+        words = f"{'calibrating ' + names if names else 'comparing'} on {len(real)} real steps"
+        progress(0.0, words)
+        step = _Reported(self._step, self.spec.sampling_period or SLOW, lambda more: progress(0.0, f"{words}: {more}"))
+        found = calibrate(self.spec, steps, self.parameters, self._own, step)
         self._calibrated_on = len(real)
         if present is not None and present <= max(RIGHT, WORSE * found.error):
             return False
@@ -183,6 +196,34 @@ class SimulatorPrior(ABC):
         ).model_dump(mode="json")
 
 
+class _Reported:
+    """A function that takes a step of a simulator, and that reports how many steps it took and what each costs.
+
+    Args:
+        step: the function, as for ``calibrate``.
+        most: seconds of a step beyond which the report says how fewer steps are needed.
+        report: called about once in a second, with a few words.
+    """
+
+    def __init__(self, step: Step, most: float, report: Callable[[str], None]) -> None:
+        self._step, self._most, self._report = step, most, report
+        self._taken, self._began = 0, time.monotonic()
+        self._due = self._began + REPORT_SECONDS
+
+    def __call__(self, values: Array, coordinates: Array, action: Array) -> Array:
+        reached = self._step(values, coordinates, action)
+        self._taken += 1
+        if (now := time.monotonic()) > self._due:
+            self._due = now + REPORT_SECONDS
+            each = (now - self._began) / self._taken
+            slow = (
+                ", and a calibration takes hundreds of them: name fewer parameters, or learn a surrogate of the "
+                "simulator beforehand, and use surrogate:NAME"
+            )
+            self._report(f"{self._taken} steps of the simulator, {each:.2g} s each{slow if each > self._most else ''}")
+        return reached
+
+
 def _opened(simulator: str | OriginalEnvironment, spec: EnvironmentSpec) -> OriginalEnvironment:
     """Open a simulator, and test it with a few steps.
 
@@ -194,6 +235,7 @@ def _opened(simulator: str | OriginalEnvironment, spec: EnvironmentSpec) -> Orig
     try:
         if not isinstance(opened, str):
             _require_alike(spec, opened.spec())
+            require_period("the simulator", spec, opened.spec().sampling_period)
             if not callable(getattr(opened, "step_from", None)):
                 raise UnknownEnvironment(
                     "expected a simulator with a method step_from, which sets it to a state, got none: add the method"

@@ -72,6 +72,19 @@ export function machine(findings) {
   return findings.length > 0 && card("What the machine has", findings.map(({ name, said }) => h("p", { class: "note" }, `${name}: ${said}`)));
 }
 
+/** What a simulator or another surrogate told the model: its calibrated parameters, its error, and the outputs that use it. */
+export function prior({ awaited, about }, fidelity) {
+  if (awaited) return card("What was known", h("p", { class: "note" }, "The design waits for its prior."));
+  if (!about) return null;
+  const uses = (fidelity?.outputs ?? []).filter((output) => output.structure.startsWith("prior + ")).map((output) => output.name);
+  return card("What was known", [
+    `Prior: ${about.source}`,
+    ...about.parameters.map((one) => `${one.name}: ${number(one.value)}, ${one.determined ? `${number(one.low)} to ${number(one.high)}` : "not determined by these steps"}`),
+    ...(about.error === null ? [] : [`Error of the simulator: ${percent(about.error)} of the changes, on ${plural(about.real_steps, "real step")}`]),
+    ...(fidelity ? [`Outputs that use it: ${uses.join(", ") || "none"}`] : []),
+  ].map((line) => h("p", { class: "note" }, line)));
+}
+
 export function cost({ ledger, budget, queries }) {
   const open = queries.pending + queries.leased;
   return card("What it cost",

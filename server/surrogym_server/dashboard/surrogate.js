@@ -5,7 +5,7 @@ import { call, Problem, surrogate as path } from "/page/api.js";
 import { learningCurves } from "/page/charts.js";
 import { downloads } from "/page/downloads.js";
 import { h, shown } from "/page/dom.js";
-import { cost, leastSure, machine, sure, where } from "/page/hero.js";
+import { cost, leastSure, machine, prior, sure, where } from "/page/hero.js";
 import { logUpload } from "/page/logs.js";
 import { maps } from "/page/maps.js";
 import { alive, phaseBadge, section } from "/page/parts.js";
@@ -24,6 +24,7 @@ export function surrogateView(main, name, context) {
   let samples = [];
   let models = [];
   let dirt = [];
+  let known = null; // the prior
   let version = null;
   let closed = false;
   main.replaceChildren(h("h1", {}, name), h("div", { class: "card loading", "aria-busy": "true" }, "Asking the server…"));
@@ -52,10 +53,11 @@ export function surrogateView(main, name, context) {
     }
     const newSamples = samples.length !== now.samples && allSamples();
     const newDirt = newSamples && call("GET", `${url}/dirt`).then(({ findings }) => { dirt = findings; });
+    const newPrior = (newSamples || !known || known.awaited || version !== now.model_version) && call("GET", `${url}/prior`).then((reply) => { known = reply; });
     const newModels = version !== now.model_version && call("GET", `${url}/models`).then((reply) => { models = reply.models; });
-    const [queries, sessions, stored] = await Promise.all([call("GET", `${url}/queries`), call("GET", `${url}/sessions`), policiesNow(now, first), newSamples, newDirt, newModels]);
+    const [queries, sessions, stored] = await Promise.all([call("GET", `${url}/queries`), call("GET", `${url}/sessions`), policiesNow(now, first), newSamples, newDirt, newPrior, newModels]);
     if (closed) return;
-    parts.show({ now, samples, dirt, models: newModels && models, queries: queries.queries, sessions: sessions.sessions, policies: stored.policies });
+    parts.show({ now, samples, dirt, known, models: newModels && models, queries: queries.queries, sessions: sessions.sessions, policies: stored.policies });
     version = now.model_version;
   }
 
@@ -63,7 +65,7 @@ export function surrogateView(main, name, context) {
     const missing = error instanceof Problem && error.status === 404;
     parts?.close();
     parts = null;
-    [samples, models, dirt, version] = [[], [], [], null];
+    [samples, models, dirt, known, version] = [[], [], [], null, null];
     main.replaceChildren(h("h1", {}, name), h("div", { class: "card bad", role: "alert" },
       missing ? "There is no surrogate of this name, or it was deleted." : error.message, " ", h("a", { href: "#/" }, "All surrogates")));
   }
@@ -97,7 +99,7 @@ function build(main, name, spec, context) {
   };
   const render = {
     title: shown(title, (now) => [h("a", { class: "back", href: "#/" }, "All surrogates"), h("h1", {}, name), phaseBadge(now), h("span", { class: "note" }, `${now.environment} · ${alive(now)}`)]),
-    facts: shown(facts, ({ now, found, dirt }) => [sure(now), where(found, names, showPoint, now.model_version), cost(now), machine(dirt)].filter(Boolean)),
+    facts: shown(facts, ({ now, found, dirt, known }) => [sure(now), where(found, names, showPoint, now.model_version), cost(now), known && prior(known, now.fidelity), machine(dirt)].filter(Boolean)),
   };
   const jump = (id) => (event) => {
     event.preventDefault();
@@ -116,25 +118,25 @@ function build(main, name, spec, context) {
     queue.element, sessions.element, h("div", { class: "two" }, ledger.element, steer.element), versions.element, log.element, files.element);
 
   let found = null;
-  let known = []; // dirt of the machine
+  let about = { dirt: [], known: null }; // dirt of the machine, and its prior
   let looked = null;
   async function look(now) {
     if (!now.fidelity || looked === now.model_version) return;
     looked = now.model_version;
     try {
       found = await leastSure(name, now.fidelity, controls);
-      render.facts({ now, found, dirt: known });
+      render.facts({ now, found, ...about });
     } catch {
       looked = null; // the next look asks again
     }
   }
 
   return {
-    show({ now, samples, dirt, models, queries, sessions: open, policies }) {
+    show({ now, samples, dirt, known, models, queries, sessions: open, policies }) {
       const { created_at, spec: _, ...rest } = now;
       render.title(rest);
-      if (dirt) known = dirt;
-      render.facts({ now: rest, found, dirt: known });
+      if (dirt) about = { dirt, known };
+      render.facts({ now: rest, found, ...about });
       main.classList.toggle("unmodelled", !now.fidelity);
       if (models && models.length) curves.show(models);
       if (policies) stored.show(policies);

@@ -30,6 +30,8 @@ OTHER = "surrogate:"  # an argument that begins with this prefix names another s
 LEAST = 2  # a prior is calibrated on at least this number of real steps
 # if a calibrated simulator's error exceeds this share of the changes of state, its calibrated values may be wrong
 LACKING = 0.01
+# if it exceeds this share, a model that predicts no change at all is better
+USELESS = 1.0
 
 
 def command(
@@ -105,7 +107,7 @@ def command(
             prints_aside(),
             _opened(api, view, simulator, parameter or [], steps) as prior,
             progress("prior", quiet=output.quiet) as update,
-            on_interrupt(lambda: _interrupted(surrogate, calls.get(surrogate))),
+            on_interrupt(lambda: _as_it_is(surrogate, calls.get(surrogate))),
         ):
             stored, view = target.follow(prior, update)
         _give(output, view, stored)
@@ -136,7 +138,7 @@ class _Target:
             is_new = view.samples > used and view.samples >= LEAST
             if is_new and (used or not _asked(view)):
                 real, used = self._real_steps(), view.samples
-                if prior.update(real, update) and prior.file is not None:
+                if self._updated(prior, real, update, present) and prior.file is not None:
                     stored, fitted = self.calls.put(name, prior.file.to_bytes()), view.round
                 continue
             if used and _has_ended(view, fitted):
@@ -154,6 +156,15 @@ class _Target:
             time.sleep(LOOK_SECONDS)
             view = self.api.surrogate(self.view.name)
         return view
+
+    def _updated(self, prior: ServerPrior, real: list[RealStep], update: Update, present: PriorView) -> bool:
+        """Call ``update`` of the prior. If it can't be calibrated, the error also says how the design can continue."""
+        from surrogym_sampler.priors.calibration import NotCalibrated
+
+        try:
+            return prior.update(real, update)
+        except NotCalibrated as error:
+            raise CommandError(f"{error}; {_as_it_is(self.view.name, present)}") from error
 
     def _real_steps(self) -> list[RealStep]:
         from surrogym_shared.nouns import RealStep
@@ -210,7 +221,7 @@ def _waiting(view: SurrogateView) -> str:
     return f"{view.samples} real steps; {_asked(view)} queries wait for {awaited}"
 
 
-def _interrupted(name: str, stored: PriorView) -> str:
+def _as_it_is(name: str, stored: PriorView) -> str:
     if stored.awaited:
         return f"the design of {name} waits for its prior: run the command again, or surrogym prior {name} --drop"
     return f"{name} keeps its prior; it is not calibrated again"
@@ -218,13 +229,20 @@ def _interrupted(name: str, stored: PriorView) -> str:
 
 def _give(output: Output, view: SurrogateView, stored: PriorView) -> None:
     result = {"surrogate": view.name, "phase": view.phase, "prior": stored.model_dump(mode="json")}
-    output.give(result, lambda: "\n".join([*(words_of_prior(stored.about) if stored.about else ()), *_uses(view)]))
+    output.give(
+        result, lambda: "\n".join([*(words_of_prior(stored.about) if stored.about else ()), *words_of_use(view)])
+    )
 
 
 def words_of_prior(about: PriorAbout) -> list[str]:
     """Return lines that describe what a prior was made from: its source, its parameters, and its error."""
     lines = [f"prior: {about.source}"]
-    if about.parameters and about.error is not None and about.error > LACKING:
+    if about.error is not None and about.error > USELESS:
+        lines.append(
+            "  its errors are larger than the changes themselves: check the units, order and signs of its coordinates "
+            "and actions, and the seconds of its step"
+        )
+    elif about.parameters and about.error is not None and about.error > LACKING:
         lines.append("  it lacks something, or the plant has noise: the values below may stand for what it lacks")
     for one in about.parameters:
         known = f"{one.low:.4g} to {one.high:.4g}" if one.determined else "not determined by these steps"
@@ -237,7 +255,7 @@ def words_of_prior(about: PriorAbout) -> list[str]:
     return lines
 
 
-def _uses(view: SurrogateView) -> list[str]:
+def words_of_use(view: SurrogateView) -> list[str]:
     """Return a line that lists the outputs whose model uses the prior; empty if there is no model yet."""
     if view.fidelity is None:
         return []

@@ -77,7 +77,7 @@ def _one(api: Api, name: str, form: Form) -> str:
     models = api.models(name) if view.phase in ("over_budget", "unsure") else ()
     said = [f"{finding.name}: {finding.said}" for finding in _dirt(api, view)]
     untrusted = _untrusted(name, api.policies.list(name))
-    return "\n".join([_detail(view, models), *said, *_limits(api, view), *_prior(api, name), *untrusted])
+    return "\n".join([_detail(view, models), *said, *_limits(api, view), *_prior(api, view), *untrusted])
 
 
 def _dirt(api: Api, view: SurrogateView) -> list[DirtFinding]:
@@ -92,17 +92,17 @@ def _limits(api: Api, view: SurrogateView) -> list[str]:
     return words_of_steps(view.spec, api.samples(view.name))
 
 
-def _prior(api: Api, name: str) -> list[str]:
+def _prior(api: Api, view: SurrogateView) -> list[str]:
     """Return lines about the prior of a surrogate; empty if it has no prior and does not wait for one."""
-    from surrogym.cli.commands.prior import words_of_prior
+    from surrogym.cli.commands.prior import words_of_prior, words_of_use
     from surrogym_client.transport.priors import PriorCalls
 
-    stored = PriorCalls(api.connection).get(name)
+    stored, name = PriorCalls(api.connection).get(view.name), view.name
     if stored.awaited:
         return [
             f"the design waits for its prior; next: surrogym prior {name} SIMULATOR, or surrogym prior {name} --drop"
         ]
-    return [] if stored.about is None else words_of_prior(stored.about)
+    return [] if stored.about is None else [*words_of_prior(stored.about), *words_of_use(view)]
 
 
 def _untrusted(name: str, policies: Sequence[PolicyView]) -> list[str]:

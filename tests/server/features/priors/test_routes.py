@@ -7,14 +7,13 @@ from collections.abc import Iterator
 import pytest
 
 import surrogym
-from support.hinge import Real, Textbook, hinge_spec, steps_of
+from support.hinge import Textbook, hinge_spec, sent, steps_of
 from support.server import ServerProcess
 from surrogym_client.errors import InvalidInput, SurrogymClientError, UnknownSurrogate
 from surrogym_client.surrogates.waiting import wait_for_model
 from surrogym_client.transport import Api
 from surrogym_client.transport.priors import PriorCalls
 from surrogym_sampler.original.classic import pendulum
-from surrogym_shared import wire
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.surrogate_file import SurrogateFile
 
@@ -45,20 +44,6 @@ def file_of(spec: EnvironmentSpec = SPEC) -> SurrogateFile:
 @pytest.fixture(scope="module")
 def textbook() -> SurrogateFile:
     return file_of()
-
-
-def sent(api: Api, name: str, count: int) -> None:
-    samples = [
-        wire.NewSample(
-            coordinates=list(s.coordinates),
-            action=list(s.action),
-            next_coordinates=list(s.next_coordinates),
-            reward=s.reward,
-            terminated=False,
-        )
-        for s in steps_of(Real(), count)
-    ]
-    api.add_samples(name, "test", samples)
 
 
 def test_the_next_model_after_storing_a_prior_uses_the_prior(api: Api, surrogate: str, textbook: SurrogateFile):
