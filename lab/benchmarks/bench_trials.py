@@ -33,17 +33,21 @@ from dirty_swingup import InProcess
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 
+import numpy as np
+
 from support.server import running_server
 from surrogym_client.transport import Api
 from surrogym_sampler import original
 from surrogym_sampler.original.episodes import RolloutEpisode
 from surrogym_sampler.original.rollouts import answering
-from surrogym_shared.spec import EnvironmentSpec, with_history
+from surrogym_shared.limits import past
+from surrogym_shared.spec import EnvironmentSpec, Limit, Limits, Term, with_history
 from surrogym_trainer.evaluation.evaluator import EvaluationSettings, evaluate
 from surrogym_trainer.policies import load_policy
 
 ROOT = Path(__file__).parents[2]
 MINUTES = 30.0  # longest time of one command
+PATIENT_SECONDS = 5.0  # without an action for this time, the fallback of limits acts
 
 
 @dataclass(frozen=True)
@@ -56,6 +60,7 @@ class Machine:
         changes: number of earlier changes of a coordinate that are declared.
         actions: number of earlier actions that are declared.
         largest: largest change of each coordinate in one step.
+        limits: limits that hold from the first real step on.
     """
 
     name: str
@@ -63,6 +68,7 @@ class Machine:
     changes: int = 0
     actions: int = 0
     largest: tuple[float, ...] = ()
+    limits: Limits | None = None
 
 
 def _program(name: str, folder: str = "examples/machines") -> str:
@@ -78,9 +84,16 @@ def _swing_up(kind: str, actions: int = 0) -> Machine:
 SWING_UPS = {"delay 1": 1, "delay 2.5": 3}
 
 
+# The arm's angle, and the way of six steps with the present speed. The fallback was chosen on seeds 50 to 52.
+STOPS = Limits(
+    keep=(Limit(name="stop", term=Term.linear(**{"arm": 1, "arm.change1": 6}), low=-1.8, high=1.8, margin=0.6),),
+    fallback=(Term.linear(**{"arm": -6, "arm.change1": -60}),),
+)
+
 MACHINES = {
     "belt": Machine(_program("belt"), 450, 2, 1, (0.12, 0.6)),
     "furuta": Machine(_program("furuta"), 2_000, 1, 2, (0.6, 0.8)),
+    "furuta-limits": Machine(_program("furuta"), 2_000, 1, 2, (0.6, 0.8), STOPS),
     "double_pendulum": Machine(_program("double_pendulum"), 2_000, 1, 2, (0.6, 0.9)),
     "invertedpendulum2": Machine("InvertedDoublePendulum-v5", 120),
     "reacher": Machine("Reacher-v5", 200),
@@ -136,6 +149,8 @@ def _run(machine: str, seed: int, budget: int | None, episodes: int, folder: Pat
         with Api(server.url) as api:
             view = api.surrogate(machine)
             trials = [len(query.actions) for query in api.queries(machine) if query.policy]
+            reached = np.array([sample.next_coordinates for sample in api.samples(machine)])
+            left = 0 if view.spec.limits is None else int(past(view.spec, reached).sum())
         found = surrogym("evaluate", str(policy), *where, "--episodes", str(episodes))
     if machine.startswith("swingup-"):
         found["success_rate"] = _upright(
@@ -156,6 +171,9 @@ def _run(machine: str, seed: int, budget: int | None, episodes: int, folder: Pat
         "low": promise.get("low"),
         "high": promise.get("high"),
         "trusted": audited.get("trusted"),
+        "left": left,
+        "violations": found.get("limits", {}).get("violations"),
+        "fallback_episodes": found.get("limits", {}).get("fallback_episodes"),
     }
 
 
@@ -173,6 +191,10 @@ def _specification(machine: Machine, name: str, seed: int, budget: int) -> Envir
     if machine.changes or machine.actions:
         largest = dict(zip([c.name for c in spec.coordinates] if machine.changes else (), machine.largest, strict=True))
         spec = with_history(spec, changes=machine.changes, actions=machine.actions, largest=largest)
+    if machine.limits is not None:
+        # a busy computer may answer late, and a simulated machine does not move meanwhile
+        changes = {"limits": machine.limits.model_dump(), "sampling_period": PATIENT_SECONDS}
+        spec = EnvironmentSpec.model_validate({**spec.model_dump(), **changes})
     return spec.model_copy(update={"design": spec.design.model_copy(update={"budget": budget, "seed": seed})})
 
 

@@ -17,15 +17,18 @@ from support.server import ServerProcess, running_server
 from surrogym_client.surrogates.waiting import DesignUnfinished, wait_for_design
 from surrogym_client.transport import Api, HttpSurrogate
 from surrogym_sampler.original.classic import pendulum
-from surrogym_sampler.original.rollouts import answering
+from surrogym_sampler.original.rollouts import answering, keeping_limits
 from surrogym_sampler.queries import Sampler, SamplerSettings
 from surrogym_shared.integrals import Error
+from surrogym_shared.limits import past
 from surrogym_shared.network import Network
 from surrogym_shared.spec import (
     BoxAction,
     Coordinate,
     Design,
     EnvironmentSpec,
+    Limit,
+    Limits,
     ObservationEntry,
     Term,
     Uniform,
@@ -82,6 +85,23 @@ class Late:
         pass
 
 
+class Edged(Late):
+    """The same level between edges that it must not pass."""
+
+    def spec(self) -> EnvironmentSpec:
+        edges = Limit(name="edges", term=Term.linear(level=1), low=-1.9, high=1.9, margin=0.3)
+        limits = Limits(keep=(edges,), fallback=(Term.linear(level=-1),))
+        own = super().spec()
+        start = {**own.start, "level": Uniform(low=0.5, high=1.5)}
+        changes = {"limits": limits.model_dump(), "sampling_period": 0.1, "start": start}
+        return EnvironmentSpec.model_validate({**own.model_dump(), **changes})
+
+    def reset(self, *, seed=None):
+        super().reset(seed=seed)
+        self.level = 1 + self.level / 3
+        return self.level, {}
+
+
 @pytest.fixture(scope="module")
 def trials_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServerProcess]:
     with running_server(tmp_path_factory.mktemp("trials")) as server:
@@ -89,12 +109,15 @@ def trials_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServerPr
 
 
 @pytest.fixture
-def waiting(trials_server: ServerProcess) -> Iterator[str]:
-    """A surrogate whose design has left the rest of its budget to trials, with a sampler in a thread."""
-    name = f"late-{uuid4().hex[:8]}"
+def waiting(trials_server: ServerProcess, request: pytest.FixtureRequest) -> Iterator[str]:
+    """A surrogate whose design has left the rest of its budget to trials, with a sampler in a thread. The parameter is
+    its environment, by default ``Late``."""
+    name, made = f"late-{uuid4().hex[:8]}", getattr(request, "param", Late)
     with Api(trials_server.url) as api, Api(trials_server.url) as own:
-        api.create_surrogate(name, Late().spec())
-        sampler = Sampler(own, name, answering(Late()), SamplerSettings(name="thread", wait_seconds=0.5))
+        api.create_surrogate(name, made().spec())
+        sampler = Sampler(
+            own, name, keeping_limits(answering(made())), SamplerSettings(name="thread", wait_seconds=0.5)
+        )
         thread = threading.Thread(target=sampler.run)
         thread.start()
         try:
@@ -222,10 +245,27 @@ def trials(trials_server: ServerProcess, waiting: str, tmp_path: Path) -> Iterat
         yield Trials(api, waiting, port, tmp_path / "p.zip", SETTINGS, LoopSettings(queries=0))
 
 
-def idle() -> Network:
-    """A policy whose action is always 0."""
-    size = len(Late().spec().observation)
-    return Network.of(Late().spec(), np.zeros(size), np.ones(size), 4, np.zeros(Network.size(Late().spec(), 4)))
+def idle(push: float = 0.0) -> Network:
+    """A policy whose action is always ``push``."""
+    spec = Late().spec()
+    size, weights = len(spec.observation), np.zeros(Network.size(spec, 4))
+    weights[-1] = push
+    return Network.of(spec, np.zeros(size), np.ones(size), 4, weights)
+
+
+@pytest.mark.parametrize("waiting", [Edged], indirect=True)
+def test_the_sampler_keeps_declared_limits_in_the_trial_of_a_policy_that_pushes_against_them(
+    trials: Trials, waiting: str
+) -> None:
+    before = trials.api.surrogate(waiting)
+    assert (before.phase, before.budget_left > 0) == ("unsure", True)
+    assert allows_trials(before.spec, SETTINGS)
+    assert trials._try(idle(1.0), EPISODE, 0) is True
+    tried = [sample for sample in trials.api.samples(waiting) if sample.id > before.samples]
+    reached = np.array([sample.next_coordinates for sample in tried])
+    assert len(tried) == EPISODE
+    assert not past(before.spec, reached).any()
+    assert {sample.action[0] > 0 for sample in tried} == {True, False}, "the fallback acted"
 
 
 def test_a_trial_that_a_failed_step_cut_off_has_not_succeeded(

@@ -165,9 +165,9 @@ class EnvironmentSpec(Frozen):
 
     @property
     def needs_trials(self) -> bool:
-        """Whether only trained policies can steer the environment: it can only be reset, has no limits that a trial
-        could break, and more coordinates than a planner can steer through."""
-        return self.access == "reset" and self.limits is None and len(self.coordinates) > MOST_PLANNED
+        """Whether only trained policies can steer the environment: it can only be reset, and has more coordinates than
+        a planner can steer through. Declared limits hold in a trial, too, because the sampler keeps them."""
+        return self.access == "reset" and len(self.coordinates) > MOST_PLANNED
 
     @property
     def access(self) -> Access:

@@ -14,11 +14,11 @@ def leave_to_trials(round: Round) -> tuple[Query, ...] | None:
     planner can't act in it; otherwise None.
 
     Sequences of actions hardly reach the states that a good policy visits. The trials of policies (``surrogym train``)
-    reach them, and their steps count towards the budget. Environments with limits are left out, because a trial is not
-    planned to stay inside.
+    reach them, and their steps count towards the budget. If limits are declared, such a policy was trained to keep away
+    from them, and the sampler keeps them in its trial.
     """
     definition, size = round.definition, len(round.definition.coordinates)
-    if not round.continues or round.testing or definition.snapshots or definition.limits is not None:
+    if not round.continues or round.testing or definition.snapshots:
         return None
     if size <= MOST_PLANNED or round.cost < STEPS * (size + definition.action.size):
         return None
