@@ -28,6 +28,7 @@ from surrogym_sampler.original.episodes import open_episode
 from surrogym_sampler.original.errors import EnvironmentDied, StepFailed, StepTimedOut, UnknownEnvironment
 from surrogym_sampler.original.fmus.adapter import Fmu, FmuEnvironment, open_simulator
 from surrogym_sampler.original.loading import fits, is_known, isolated
+from surrogym_sampler.priors.calibration import Parameter, RealTransitions, adjustable, calibrate
 from surrogym_shared.spec import (
     BoxAction,
     Coordinate,
@@ -38,6 +39,8 @@ from surrogym_shared.spec import (
     Term,
     Uniform,
 )
+
+FIELDS = ("coordinates", "action", "next_coordinates")
 
 pytest.importorskip("fmpy")
 pytest.importorskip("pythonfmu")
@@ -187,6 +190,30 @@ def test_fmu_parameters_and_start_values_are_read_from_a_file(tanks: Path, tmp_p
         assert slow.read()[0] < 0.5  # the pump has no flow
     finally:
         slow.close()
+
+
+def test_a_parameter_of_an_fmu_is_calibrated_on_real_steps_of_another_one(tanks: Path, tmp_path: Path) -> None:
+    (tmp_path / "real").mkdir()
+    spec = rewarded(f"fmu:{tanks}", squared("lower", wanted=0.4), steps=20)
+    real = mapping(tmp_path / "real", fmu=str(tanks), start={"flow": 0.0005})
+    plant = original.make(real, spec=spec.model_copy(update={"environment": real}))
+    simulator = original.make(f"fmu:{tanks}", spec=spec)
+    try:
+        rng = np.random.default_rng(0)
+        steps = [plant.step_from(rng.uniform(0.1, 0.9, 2), rng.uniform(0, 1, 1)) for _ in range(6)]
+        taken = RealTransitions(*(np.array([getattr(s, f) for s in steps]) for f in FIELDS))
+        plain = adjustable(simulator)
+        assert plain.parameters() == {"flow": 2.8e-4}
+
+        def step(values: np.ndarray, coordinates: np.ndarray, action: np.ndarray) -> np.ndarray:
+            plain.set_parameters({"flow": float(values[0])})
+            return simulator.step_from(coordinates, action).next_coordinates
+
+        found = calibrate(spec, taken, [Parameter("flow", 0.0002, 0.0008)], np.array([2.8e-4]), step)
+        assert found.values["flow"] == pytest.approx(0.0005, rel=1e-4)
+    finally:
+        plant.close()
+        simulator.close()
 
 
 def test_describing_an_fmu_asks_for_reward_and_limits(moody: Path, tmp_path: Path) -> None:

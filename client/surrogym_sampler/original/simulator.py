@@ -142,6 +142,15 @@ class Simulator(ABC):
         """Return whether bodies touch each other in the current state; False if the simulator has no contacts."""
         return False
 
+    def parameters(self) -> dict[str, float]:
+        """Return the physical parameters that can be changed, with their current values; none by default."""
+        return {}
+
+    def set_parameters(self, values: Mapping[str, float]) -> None:
+        """Change the given ones of ``parameters``, from the next state that is set on."""
+        if values:
+            raise NotImplementedError(f"{type(self).__name__} has no parameters")
+
     def perturb(self, rng: np.random.Generator, sigma: float) -> None:
         """Multiply the original masses by normal factors of mean 1 and standard deviation ``sigma``.
 

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from support.hinge import Textbook
+from support.hinge import Textbook, hinge_spec
+from support.toys import Toy
 from surrogym_sampler import original
 from surrogym_sampler.original.errors import UnknownEnvironment
+from surrogym_sampler.original.simulator import Simulated, Variable
 from surrogym_sampler.priors.calibration import Parameter, adjustable, read_parameters
 
 
@@ -58,6 +60,21 @@ def test_masses_and_damping_of_mujoco_parts_are_simulator_parameters():
     assert abs(after[2] - 0.5) < abs(before[2] - 0.5)
     found.set_parameters({"mass.cart": found.parameters()["mass.cart"] / 5})
     assert environment.step_from(state, push).next_coordinates == pytest.approx(before)
+
+
+def test_an_adapters_simulator_without_physical_parameters_has_none_to_calibrate():
+    class Hinge(Toy):
+        variables = (Variable("angle"), Variable("speed"))
+        power = 3.0
+
+        def reset(self, seed: int | None):
+            raise NotImplementedError
+
+        step = reset
+
+    plain = adjustable(Simulated(Hinge(), hinge_spec()))
+    with pytest.raises(ValueError, match=r"of the simulator \(none\), got 'power'"):
+        read_parameters(["power"], plain)
 
 
 @pytest.mark.parametrize(

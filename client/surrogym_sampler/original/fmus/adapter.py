@@ -10,7 +10,7 @@ Shapes: C coordinates, F action entries.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -68,6 +68,8 @@ class Fmu(Simulator):
             )
         outputs = archive.of_causality("output") or state
         self._state, self._size = state, len(state)
+        given = {v: choices.start.get(v.name, v.start) for v in archive.of_causality("parameter") if v.can_start}
+        self._parameters = {v: float(value) for v, value in given.items() if value is not None}
         self._has_snapshots = archive.snapshots
         step = self.period = step_of(archive, choices)
         self._process = Process(archive, inputs, [*state, *outputs], step, start_values(archive, choices))
@@ -129,6 +131,15 @@ class Fmu(Simulator):
             self._process.restore(snapshot)
         else:
             super().restore(snapshot)
+
+    def parameters(self) -> dict[str, float]:
+        """Return the FMU's real parameters that have a start value, by name."""
+        return {variable.name: value for variable, value in self._parameters.items()}
+
+    def set_parameters(self, values: Mapping[str, float]) -> None:
+        """Change parameters; they take effect when the FMU is initialised, which setting a state does."""
+        self._parameters = {v: values.get(v.name, value) for v, value in self._parameters.items()}
+        self._process.parameters = [(v.type, v.reference, value) for v, value in self._parameters.items()]
 
     def close(self) -> None:
         self._process.close()

@@ -65,6 +65,7 @@ class Process:
         self.step_limit = 30.0  # seconds that one answer may take
         self._archive, self._inputs, self._reads, self._step = archive, inputs, reads, step
         self._start = list(start)
+        self.parameters: list[Start] = []  # values that every initialisation sets after those of ``start``
         self._program = Program(COMMAND, called=f"the process of {archive.path.name}")
         self._values: Array | None = None
         self._directory = Path(tempfile.mkdtemp(prefix="surrogym-fmu-"))
@@ -93,7 +94,7 @@ class Process:
         """Start the simulation again at time 0. The values in ``start`` are set in addition to those that every
         initialisation sets."""
         self._revive()
-        self._take(self._ask("initialise", start=[*self._start, *start]))
+        self._take(self._ask("initialise", start=[*self._start, *self.parameters, *start]))
 
     def step(self, action: Array) -> bool:
         """Set the inputs (F,), and simulate one step. Returns whether the FMU ends the simulation."""
