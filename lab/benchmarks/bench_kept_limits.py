@@ -2,6 +2,7 @@
 
     python lab/benchmarks/bench_kept_limits.py --machines rail tanks levitation --first-seed 1 --seeds 10
     python lab/benchmarks/bench_kept_limits.py --machines rotary --no-policy --first-seed 1 --seeds 10
+    python lab/benchmarks/bench_kept_limits.py --machines tanks levitation --reference 1000000 --first-seed 1
 
 The machines are the cart-pole swing-up on a rail of +-0.8 m, two tanks of which the upper one runs over, a levitated
 ball that must be held, a reactor that must not run away, a quadrotor between floor and ceiling, and a rotary pendulum
@@ -37,7 +38,10 @@ import numpy as np
 import torch
 from audit_resets import Rotary
 from common import OUT
+from gymnasium import spaces
 from scipy.stats import binomtest
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 import surrogym
 from support import levitation
@@ -49,8 +53,9 @@ from surrogym_sampler.original.limits import Guard
 from surrogym_sampler.original.loading import Respecified
 from surrogym_sampler.original.rollouts import answering, keeping_limits
 from surrogym_server.local import LocalSurrogate
-from surrogym_shared.limits import past
+from surrogym_shared.limits import clipped_action, falls_back, past
 from surrogym_shared.spec import EnvironmentSpec, Limit, Limits, Term, limits
+from surrogym_shared.terms import evaluate as value_of
 from surrogym_trainer.evaluation.evaluator import Evaluation, EvaluationSettings, evaluate
 from surrogym_trainer.evaluation.promise import promise_of
 from surrogym_trainer.policies import load_policy
@@ -58,6 +63,7 @@ from surrogym_trainer.policies.predict import Predict
 from surrogym_trainer.training import TrainSettings, train
 
 EPISODES = 50
+REFERENCE_EPISODES = 500
 SEARCH = "FASTPPO"
 # The levitated ball, linearised about its middle: the direction in which it runs away, and a state feedback (LQR).
 # Beyond 2.1 in this direction no voltage holds it any more.
@@ -288,6 +294,11 @@ def main() -> None:
         for machine in options.machines:
             print(machine, "guard, ms: median {:.3f}, 99th percentile {:.3f}".format(*guard_times(machine)))
         return
+    if options.reference:
+        for machine in options.machines:
+            found = reference(machine, options.first_seed, options.reference)
+            print(machine, "PPO in the plant: mean return {:.4g}, {} of {} episodes left".format(*found))
+        return
     rows = read_records(path, Row)
     done = {(row.machine, row.limits, row.seed) for row in rows}
     for seed in range(options.first_seed, options.first_seed + options.seeds):
@@ -298,6 +309,73 @@ def main() -> None:
                     write_records(path, Row, rows)
                     print(rows[-1])
     print(table(rows))
+
+
+class Guarded(VecEnv):
+    """Episodes of a formula's machine in N lanes, in which the guard of the sampler keeps the limits."""
+
+    def __init__(self, machine: str, lanes: int, seed: int) -> None:
+        self.spec, _ = specifications(PLANTS[machine], 0)
+        self.plant: Machine = PLANTS[machine].make(0)._machine
+        size = len(self.plant.ranges)
+        low, high = np.array(self.spec.action.ranges, dtype=np.float32).T
+        super().__init__(lanes, spaces.Box(-np.inf, np.inf, (size,)), spaces.Box(low, high))
+        self.rng, self.steps, self.earned = np.random.default_rng([seed, 6]), 0, np.zeros(lanes)
+        self.left = np.zeros(lanes, dtype=bool)
+
+    def reset(self) -> Array:
+        low, high = np.array(list(self.plant.start.values())).T
+        self.q = self.before = self.rng.uniform(low, high, (self.num_envs, len(low)))
+        self.steps, self.earned, self.left = 0, np.zeros(self.num_envs), np.zeros(self.num_envs, dtype=bool)
+        return self.q.astype(np.float32)
+
+    def step_async(self, actions: Array) -> None:
+        self.asked = actions
+
+    def step_wait(self) -> tuple[Array, Array, Array, list[dict[str, Any]]]:
+        near = falls_back(self.spec, self.before, self.q)
+        (term,) = self.spec.limits.fallback
+        applied = np.where(near, clipped_action(self.spec, value_of(self.spec, term, self.q)), self.asked[:, 0])
+        self.before = self.q
+        self.q, reward, _ = self.plant.step(self.q, applied[:, None], self.plant.real, self.rng)
+        self.steps += 1
+        self.earned += reward
+        self.left |= past(self.spec, self.q)
+        ends, infos = self.steps == self.plant.time_limit, [{} for _ in range(self.num_envs)]
+        seen = self.q.astype(np.float32)
+        if ends:
+            infos = [{"terminal_observation": one, "TimeLimit.truncated": True} for one in seen]
+            seen = self.reset()
+        return seen, reward.astype(np.float32), np.full(self.num_envs, ends), infos
+
+    def close(self) -> None:
+        pass
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        return [None] * self.num_envs
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        raise NotImplementedError
+
+    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
+        raise NotImplementedError
+
+    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
+        return [False] * self.num_envs
+
+
+def reference(machine: str, seed: int, steps: int) -> tuple[float, int, int]:
+    """Train a policy by PPO in the plant itself with its guard. Return the mean return of ``REFERENCE_EPISODES``
+    episodes, how many of them left a limit, and their number."""
+    trained = VecNormalize(Guarded(machine, 64, seed), gamma=0.99)
+    falling = lambda left: 1e-3 * left  # noqa: E731
+    model = PPO("MlpPolicy", trained, falling, 64, 1024, gae_lambda=0.97, seed=seed, device="cpu").learn(steps)
+    plant = Guarded(machine, REFERENCE_EPISODES, seed + 1)
+    seen, earned, left = plant.reset(), plant.earned, plant.left
+    for _ in range(plant.plant.time_limit):
+        plant.step_async(model.predict(trained.normalize_obs(seen), deterministic=True)[0])
+        seen, *_ = plant.step_wait()
+    return float(earned.mean()), int(left.sum()), REFERENCE_EPISODES
 
 
 def guard_times(machine: str) -> tuple[float, float]:
@@ -425,6 +503,7 @@ def _options() -> argparse.Namespace:
     made.add_argument("--machines", nargs="+", choices=list(PLANTS), default=list(PLANTS))
     made.add_argument("--first-seed", type=int, default=0)
     made.add_argument("--seeds", type=int, default=1)
+    made.add_argument("--reference", type=int, metavar="STEPS", help="only train by PPO in the plant for these steps")
     made.add_argument("--time", action="store_true", help="only measure the time that the guard takes in a step")
     made.add_argument("--no-policy", action="store_true", help="designs alone")
     made.add_argument("--with-limits-only", action="store_true", help="no rows without limits")

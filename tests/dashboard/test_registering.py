@@ -5,16 +5,18 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
 from playwright.sync_api import Page, expect
 
-from support import reactor
+from support import limited, reactor
 from support.browser import serious
 from support.server import ServerProcess
 from surrogym_client.transport import Api
 from surrogym_sampler.original.classic import pendulum
+from surrogym_shared.wire import NewSample
 
 Open = Callable[..., Page]
 
@@ -47,6 +49,35 @@ def test_a_drafted_specification_can_be_reviewed_and_registered_on_the_dashboard
         expect(page.locator(".title")).to_contain_text("collecting")
         assert api.surrogate("by-page").spec == pendulum()
         api.delete_surrogate("by-page")
+    assert complaints == []
+
+
+def test_the_dashboard_shows_declared_limits_and_counts_real_steps_beyond_them(
+    url: str, open_page: Open, complaints: list[str]
+):
+    page = open_page(f"{url}/#/register")
+    page.get_by_label("or paste its text").fill(limited.SPEC.model_dump_json())
+    page.get_by_label("Name of the surrogate").fill("limited")
+    page.get_by_role("button", name="Check", exact=True).click()
+    shown = page.get_by_role("region", name="limited: the server would store this")
+    expect(shown.get_by_role("region", name="Limits", exact=True)).to_contain_text(
+        re.compile(r"rail.*x \+ 0\.300 v.*−1\.00 to 1\.00.*0\.400")
+    )
+    expect(shown).to_contain_text(re.compile(r"fallback near a limit.*x \+ .*v"))
+    expect(shown).to_contain_text(re.compile("episodes that may leave a limit.*1 %"))
+    with Api(url) as api:
+        page.get_by_role("button", name="Register limited").click()
+        expect(page.locator(".title")).to_contain_text("collecting")
+        path = [[0.0, 0.0], [0.9, 0.2], [1.1, 0.2]]
+        steps = [
+            NewSample(coordinates=at, action=[1.0], next_coordinates=after, reward=0.0, terminated=False)
+            for at, after in pairwise(path)
+        ]
+        api.add_samples("limited", "person", steps)
+        expect(page.locator("#ledger")).to_contain_text("limit rail: 1 of 2 real steps beyond it, least room -0.16")
+        expect(page.locator("#ledger")).to_contain_text("the fallback was due after 2 of 2 real steps")
+        assert api.limits("limited")[0] in page.locator("#ledger").text_content()
+        api.delete_surrogate("limited")
     assert complaints == []
 
 

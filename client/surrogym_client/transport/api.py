@@ -546,6 +546,10 @@ class Api:
         """Return the dirt that was found in the first real steps of a machine that can only be reset."""
         return self._get(wire.DirtList, f"{routes.surrogate(name)}/dirt").findings
 
+    def limits(self, name: str) -> list[str]:
+        """Describe in sentences how well all real steps kept the limits of the specification; empty without limits."""
+        return self._get(wire.LimitsKept, f"{routes.surrogate(name)}/limits").said
+
     def report_steps(
         self, name: str, steps: int, *, episodes: int = 0, note: str = "", idempotency_key: str | None = None
     ) -> wire.Ledger:

@@ -14,8 +14,11 @@ from surrogym_server.api.state import Use
 from surrogym_server.convert import resources
 from surrogym_server.convert.dirt import FIRST, dirt_of
 from surrogym_server.convert.exports import samples_as_csv, samples_as_npz
+from surrogym_server.convert.stored import read_stored
 from surrogym_server.storage.records import LogPart
 from surrogym_shared.codes import Code
+from surrogym_shared.limits import words_of_steps
+from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import (
     AddedSamples,
     AddSamples,
@@ -23,6 +26,7 @@ from surrogym_shared.wire import (
     DroppedSnapshots,
     DropSnapshots,
     Ledger,
+    LimitsKept,
     ReportSteps,
     SamplePage,
     SnapshotList,
@@ -94,6 +98,19 @@ def dirt(name: str, use: Use) -> DirtList:
     that can only be reset. Nothing is found before, or unless the evidence is clear."""
     record = use.storage.surrogates.get(name)
     return DirtList(findings=dirt_of(record.spec, record.tolerances, use.samples.page(name, 0, FIRST)))
+
+
+@router.get(
+    "/limits",
+    summary="Count real steps beyond limits",
+    dependencies=[READ],
+    responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST),
+)
+def limits(name: str, use: Use) -> LimitsKept:
+    """Count how many of all real steps ended beyond each limit of the specification, and after how many the fallback
+    was due."""
+    spec = read_stored(EnvironmentSpec, "a stored specification", use.storage.surrogates.get(name).spec)
+    return LimitsKept(said=[] if spec.limits is None else words_of_steps(spec, use.samples.all(name)))
 
 
 @router.get(

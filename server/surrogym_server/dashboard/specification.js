@@ -51,6 +51,8 @@ function successWords({ hold, hold_steps: steps, min_steps: least, terminated, m
   ].filter(Boolean).join("; and ");
 }
 
+const fallbackWords = ({ fallback }) => (Array.isArray(fallback) ? fallback.map(termWords).join(", ") : `the program ${fallback.name} at the machine`);
+
 function facts(spec) {
   return [
     ["environment", spec.environment || "an own one"],
@@ -60,6 +62,8 @@ function facts(spec) {
     ["a sampler", spec.query === "step" ? "sets the environment to any state" : "resets the environment and acts from there"],
     spec.starts.length && ["episodes start", `at one of ${plural(spec.starts.length, "state")}`],
     spec.success && ["success", successWords(spec.success)],
+    spec.limits && ["fallback near a limit", fallbackWords(spec.limits)],
+    spec.limits && ["episodes that may leave a limit", percent(spec.limits.probability)],
   ].filter(Boolean);
 }
 
@@ -71,6 +75,9 @@ export function specificationParts(spec, design) {
     h("h3", {}, "Coordinates: the state that the environment is set to"),
     table("Coordinates", [["name", ""], ["kind", ""], ["unit", ""], ["sampled", ""], ["limits", ""], ["episodes start", ""]],
       spec.coordinates.map(({ name, kind, unit, sampling, bounds }) => [name, kind, unit || "–", spread(sampling), limits(bounds), spread(spec.start[name])]), ""),
+    ...(spec.limits ? [h("h3", {}, "Limits: what must not be left, and the margin within which the fallback acts"),
+      table("Limits", [["name", ""], ["value", "wide"], ["range", ""], ["margin", "num"], ["unit", ""]],
+        spec.limits.keep.map(({ name, term, low, high, margin, unit }) => [name, termWords(term), limits({ low, high }), number(margin), unit || "–"]), "")] : []),
     h("h3", {}, "Observation: what a policy sees"),
     table("Observation", [["name", ""], ["value", "wide"], ["limits", ""]],
       spec.observation.map(({ name, term, low, high }) => [name, termWords(term), limits({ low, high })]), ""),

@@ -24,6 +24,7 @@ export function surrogateView(main, name, context) {
   let samples = [];
   let models = [];
   let dirt = [];
+  let kept = []; // how real steps kept the limits, in sentences
   let known = null; // the prior
   let version = null;
   let closed = false;
@@ -53,11 +54,12 @@ export function surrogateView(main, name, context) {
     }
     const newSamples = samples.length !== now.samples && allSamples();
     const newDirt = newSamples && call("GET", `${url}/dirt`).then(({ findings }) => { dirt = findings; });
+    const newKept = newSamples && now.spec.limits && call("GET", `${url}/limits`).then(({ said }) => { kept = said; });
     const newPrior = (newSamples || !known || known.awaited || version !== now.model_version) && call("GET", `${url}/prior`).then((reply) => { known = reply; });
     const newModels = version !== now.model_version && call("GET", `${url}/models`).then((reply) => { models = reply.models; });
-    const [queries, sessions, stored] = await Promise.all([call("GET", `${url}/queries`), call("GET", `${url}/sessions`), policiesNow(now, first), newSamples, newDirt, newPrior, newModels]);
+    const [queries, sessions, stored] = await Promise.all([call("GET", `${url}/queries`), call("GET", `${url}/sessions`), policiesNow(now, first), newSamples, newDirt, newKept, newPrior, newModels]);
     if (closed) return;
-    parts.show({ now, samples, dirt, known, models: newModels && models, queries: queries.queries, sessions: sessions.sessions, policies: stored.policies });
+    parts.show({ now, samples, dirt, kept, known, models: newModels && models, queries: queries.queries, sessions: sessions.sessions, policies: stored.policies });
     version = now.model_version;
   }
 
@@ -65,7 +67,7 @@ export function surrogateView(main, name, context) {
     const missing = error instanceof Problem && error.status === 404;
     parts?.close();
     parts = null;
-    [samples, models, dirt, known, version] = [[], [], [], null, null];
+    [samples, models, dirt, kept, known, version] = [[], [], [], [], null, null];
     main.replaceChildren(h("h1", {}, name), h("div", { class: "card bad", role: "alert" },
       missing ? "There is no surrogate of this name, or it was deleted." : error.message, " ", h("a", { href: "#/" }, "All surrogates")));
   }
@@ -132,7 +134,7 @@ function build(main, name, spec, context) {
   }
 
   return {
-    show({ now, samples, dirt, known, models, queries, sessions: open, policies }) {
+    show({ now, samples, dirt, kept, known, models, queries, sessions: open, policies }) {
       const { created_at, spec: _, ...rest } = now;
       render.title(rest);
       if (dirt) about = { dirt, known };
@@ -146,7 +148,7 @@ function build(main, name, spec, context) {
       map.show(point);
       probing.show(point);
       if (queries) queue.show(queries);
-      ledger.show({ ledger: now.ledger, machine_seconds: now.machine_seconds });
+      ledger.show({ ledger: now.ledger, machine_seconds: now.machine_seconds, kept: kept ?? [] });
       if (open) sessions.show(open);
       steer.show(now);
       log.show();

@@ -35,7 +35,7 @@ export function queueTable() {
 
 export function ledgerTable() {
   const place = h("div");
-  const render = shown(place, ({ ledger, machine_seconds: taken }) => table("Ledger", [["real steps", ""], ["", "num"], ["", "wide"]], [
+  const render = shown(place, ({ ledger, machine_seconds: taken, kept }) => [table("Ledger", [["real steps", ""], ["", "num"], ["", "wide"]], [
     ["initial", count(ledger.initial), "a Latin hypercube, before anything is known"],
     ["adaptive", count(ledger.adaptive), "chosen where the model was uncertain"],
     ["manual", count(ledger.manual), "requested or submitted by a person"],
@@ -47,7 +47,7 @@ export function ledgerTable() {
     ["resets", count(ledger.resets), "rollouts that began at a reset"],
     ...(taken === undefined ? [] : [["seconds", number(taken), "real steps of the design and of audits, times the sampling period; without resets"]]),
     ["wear", count(ledger.wear), "steps in which an entry of the action was at a bound"],
-  ], ""));
+  ], ""), ...kept.map((words) => h("p", { class: "note" }, words))]);
   return { element: section("ledger", "Ledger", "Every real step, by purpose, and what else the machine gave.", place), show: render };
 }
 

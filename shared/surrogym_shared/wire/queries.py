@@ -381,6 +381,12 @@ class DirtList(Reply):
     findings: list[DirtFinding] = Field(description="what was found in the first real steps; empty for nothing")
 
 
+class LimitsKept(Reply):
+    """How well all real steps kept the limits of the specification."""
+
+    said: list[str] = Field(description="a sentence for each limit, and one on the fallback; empty without limits")
+
+
 class ReportSteps(Request):
     """Report of the number of real steps that an evaluation took. They don't count towards the budget."""
 

@@ -25,7 +25,7 @@ ALLOWED = {
         GET /v1/surrogates/{name}/models, GET /v1/surrogates/{name}/models/{version}, GET /v1/surrogates/{name}/events,
         GET /v1/surrogates/{name}/sessions, POST /v1/surrogates/{name}/query_uncertainty,
         POST /v1/surrogates/{name}/predict, POST /v1/surrogates/{name}/imagine, GET /v1/surrogates/{name}/snapshots,
-        GET /v1/surrogates/{name}/dirt""",
+        GET /v1/surrogates/{name}/dirt, GET /v1/surrogates/{name}/limits""",
     "train": """
         POST /v1/surrogates/{name}/sessions, POST /v1/surrogates/{name}/improve, GET /v1/sessions/{id},
         DELETE /v1/sessions/{id}, POST /v1/sessions/{id}/occupancy, POST /v1/sessions/{id}/reset,

@@ -87,9 +87,7 @@ def _dirt(api: Api, view: SurrogateView) -> list[DirtFinding]:
 
 def _limits(api: Api, view: SurrogateView) -> list[str]:
     """Return lines on how all real steps kept the limits of the specification; empty without limits or steps."""
-    from surrogym_shared.limits import words_of_steps
-
-    return words_of_steps(view.spec, api.samples(view.name))
+    return [] if view.spec.limits is None else api.limits(view.name)
 
 
 def _prior(api: Api, view: SurrogateView) -> list[str]:
