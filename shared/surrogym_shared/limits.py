@@ -195,10 +195,23 @@ def _check_term(spec: EnvironmentSpec, limit: Limit) -> None:
             f"{where}: the angle {angles} jumps from pi to -pi: expected its sine or cosine, or a coordinate of kind "
             "'linear'",
         )
-    parts = [part for part in limit.term.parts if part.function != "one"]
-    if limit.unit and len(parts) == 1 and parts[0].function == "linear" and len(parts[0].weights) == 1:
-        own = kinds[next(iter(parts[0].weights))].unit
-        require(not own or own == limit.unit, f"{where}: expected the coordinate's unit {own!r}, got {limit.unit!r}")
+    parts = [
+        part for part in limit.term.parts if part.function != "one" and part.coefficient and any(part.weights.values())
+    ]
+    require(bool(parts), f"{where}: expected a term of the state, got one that is constant")
+    linear = {
+        name: part.coefficient * weight
+        for part in parts
+        if part.function == "linear"
+        for name, weight in part.weights.items()
+    }
+    # The unit is that of a single coordinate, or of those that a sum has unchanged, such as x in x + 0.3 v.
+    alone = [name for name, weight in linear.items() if len(linear) == len(parts) == 1 or abs(weight) == 1]
+    own = {kinds[name].unit for name in alone} - {""}
+    require(
+        not own or limit.unit in {"", *own},
+        f"{where}: expected the coordinate's unit {' or '.join(map(repr, sorted(own)))}, got {limit.unit!r}",
+    )
 
 
 def _check_pairs(declared: Limits) -> None:

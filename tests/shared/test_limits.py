@@ -40,6 +40,10 @@ def test_a_declared_limit_without_bound_or_with_overlapping_margins_is_refused()
         ((limit(term=Term.linear(y=1.0)),), STILL, "names unknown ['y']"),
         ((limit(), limit()), STILL, "given twice"),
         ((limit(unit="cm"),), STILL, "expected the coordinate's unit 'm'"),
+        ((limit(unit="cm", term=Term.linear(x=1.0, v=0.3)),), STILL, "expected the coordinate's unit 'm', got 'cm'"),
+        ((limit(unit="cm", term=Term.linear(x=-1.0, v=1.0)),), STILL, "expected the coordinate's unit 'm' or 'm/s'"),
+        ((limit(term=Term.linear(x=0.0)),), STILL, "expected a term of the state, got one that is constant"),
+        ((limit(term=Term.constant(0.0)),), STILL, "expected a term of the state, got one that is constant"),
         ((limit(low=0.05),), STILL, "every start"),
         ((limit(margin=0.95),), STILL, "every start"),
         ((limit(high=None), limit(name="left", low=None, high=-1.0)), STILL, "contradict each other"),
@@ -52,6 +56,14 @@ def test_declared_limits_that_do_not_fit_the_environment_are_refused(keep: Any, 
     with pytest.raises(ValidationError) as refused:
         with_limits(Limits(keep=keep, fallback=fallback))
     assert said in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("term", "unit"), [({"x": 100.0, "v": 30.0}, "cm"), ({"x": 1.0, "v": 0.3}, "m"), ({"v": 0.3, "x": -1.0}, "")]
+)
+def test_a_limit_of_a_weighted_sum_may_have_a_converted_unit_or_none(term: dict[str, float], unit: str) -> None:
+    kept = limit(unit=unit, term=Term.linear(**term), low=-100.0, high=100.0)
+    assert with_limits(Limits(keep=(kept,), fallback=STILL)).limits
 
 
 def test_declared_limits_without_sampling_period_or_time_limit_are_refused() -> None:
