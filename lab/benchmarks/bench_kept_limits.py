@@ -316,6 +316,7 @@ class Guarded(VecEnv):
 
     def __init__(self, machine: str, lanes: int, seed: int) -> None:
         self.spec, _ = specifications(PLANTS[machine], 0)
+        self.judged = _judging(PLANTS[machine], self.spec)
         self.plant: Machine = PLANTS[machine].make(0)._machine
         size = len(self.plant.ranges)
         low, high = np.array(self.spec.action.ranges, dtype=np.float32).T
@@ -340,7 +341,7 @@ class Guarded(VecEnv):
         self.q, reward, _ = self.plant.step(self.q, applied[:, None], self.plant.real, self.rng)
         self.steps += 1
         self.earned += reward
-        self.left |= past(self.spec, self.q)
+        self.left |= past(self.judged, self.q)
         ends, infos = self.steps == self.plant.time_limit, [{} for _ in range(self.num_envs)]
         seen = self.q.astype(np.float32)
         if ends:
@@ -423,10 +424,11 @@ def run(machine: str, seed: int, *, limited: bool, policy: bool) -> Row:
     design = surrogym.Design(spec, threads=1)
     rollouts = left = 0
     while (query := design.ask()) is not None:
-        environment.begin(int(np.random.SeedSequence([seed, query.id]).generate_state(1)[0]))
-        steps = []
-        for action in query.actions:
-            steps.append(environment.act(np.array(action)))
+        state = environment.begin(int(np.random.SeedSequence([seed, query.id]).generate_state(1)[0]))
+        steps, acting = [], design.acting(query)
+        for number in range(len(query.actions)):
+            steps.append(environment.act(np.array(acting(number, state))))
+            state = np.array(steps[-1].next_coordinates)
             if steps[-1].terminated or steps[-1].truncated:
                 break
         design.tell(query, steps)

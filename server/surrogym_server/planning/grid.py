@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from surrogym_server.environment.definition import EnvironmentDefinition
@@ -39,7 +40,8 @@ class GridModel:
     grid: tuple[Floats, Floats, NDArray[np.int64], NDArray[np.bool_]]  # low, cell, count, cyclic, (C,) each
     actions: Floats  # (A, F)
     levels: Floats  # (F, L) values of each entry of a continuous action; (0, 0) for discrete ones
-    q_next: Singles  # (S, A, C) state after the step; not a number where the episode ended
+    # (S, A, C) state after the step; not a number where the episode ended, or where the fallback of limits would act
+    q_next: Singles
     reward: Singles  # (S, A) reward of the step
 
     @classmethod
@@ -91,6 +93,15 @@ def discount_of(time_limit: int | None) -> float:
     return 1 - DISCOUNTING / (time_limit or LONGEST_EPISODE)
 
 
+def at_nearest_node(policy: GridPolicy, q: Floats) -> Floats:
+    """Return the actions (s, F) of a policy at the node that is nearest to each state q (s, C)."""
+    low, cell, count, cyclic = policy.grid
+    at = np.rint((q - low) / cell).astype(np.int64)
+    at = np.where(cyclic, at % count, at.clip(0, count - 1))
+    actions: Floats = policy.table[(at * np.cumprod([1, *count[:-1]])).sum(1)]
+    return actions
+
+
 def unfit(definition: EnvironmentDefinition) -> str | None:
     """Return what a grid needs and the environment lacks, in words; None if nothing is missing."""
     action, coordinates = definition.action, len(definition.coordinates)
@@ -129,15 +140,23 @@ def _actions(action: BoxAction | DiscreteAction) -> tuple[Floats, Floats]:
 
 def _transitions(steps: ArraySteps, nodes: Floats, actions: Floats, terminal_reward: float) -> tuple[Singles, Singles]:
     """Return the states (S, A, C) after one step from each of the nodes (S, C) with each of the actions (A, F), and its
-    rewards (S, A). The states are not a number where the episode ended."""
-    count = len(actions)
+    rewards (S, A). The states are not a number where the episode ended.
+
+    As in virtual episodes, an episode also ends where the fallback of declared limits would act, and gets the least
+    reward, or 0 if that is less, for each missing step.
+    """
+    count, definition = len(actions), steps.definition
     q_next = np.empty((len(nodes), count, nodes.shape[1]), dtype=np.float32)
     reward = np.empty((len(nodes), count), dtype=np.float32)
+    left = np.zeros((len(nodes), count), dtype=bool)
     for begin in range(0, len(nodes), ROWS):
         q = np.repeat(nodes[begin : begin + ROWS], count, axis=0)
         u = np.tile(actions, (len(q) // count, 1))
         moved = steps(q, u, noise=None, process=None, paths=None, stds=False, reward_std=False)
-        arrived = np.where(moved.terminated[:, None], np.nan, moved.q_next)
+        over = definition.falls_back(torch.from_numpy(q), torch.from_numpy(moved.q_next)).numpy() & ~moved.terminated
+        arrived = np.where((moved.terminated | over)[:, None], np.nan, moved.q_next)
         q_next[begin : begin + ROWS] = arrived.reshape(-1, count, nodes.shape[1])
         reward[begin : begin + ROWS] = (moved.reward + terminal_reward * moved.terminated).reshape(-1, count)
-    return q_next, reward
+        left[begin : begin + ROWS] = over.reshape(-1, count)
+    lost = reward.min(where=~left, initial=0.0) / (1 - discount_of(definition.time_limit))
+    return q_next, np.where(left, np.float32(lost), reward)

@@ -15,7 +15,7 @@ from surrogym_server.environment.observation_inverse import ObservationInverse
 from surrogym_server.errors import InvalidInput
 from surrogym_server.models.abilities import ArraySteps, CompiledSteps, GridPolicy, PlannedActions, offers
 from surrogym_server.models.port import DynamicsModel, with_set_points
-from surrogym_server.planning.grid import solve, unfit
+from surrogym_server.planning.grid import at_nearest_node, solve, unfit
 from surrogym_shared.spec import BoxAction
 
 Floats = NDArray[np.float64]
@@ -90,7 +90,6 @@ def _inverse(definition: EnvironmentDefinition) -> ObservationInverse:
         lacking or "": lacking is None,
         "an action without bins": not (isinstance(action, BoxAction) and action.bins),
         "an action without rate": not definition.rates,
-        "no declared limits": definition.limits is None,
         "no reward outside of the log's states": definition.outside_reward is None,
     }
     for expected, holds in asked.items():
@@ -140,7 +139,13 @@ class Planner:
         return actions[:, 0].astype(np.int64) if self.policy.choices else actions
 
     def from_states(self, q: Floats) -> Floats:
-        """Return the actions (N, F) for states q (N, C). A discrete action is given by its number."""
+        """Return the actions (N, F) for states q (N, C). A discrete action is given by its number.
+
+        If limits are declared, these are the actions of the policy on the grid, which keeps away from the limits. The
+        rollouts do not know the limits.
+        """
+        if self.definition.limits is not None:
+            return at_nearest_node(self.policy, q)
         (plans, offsets), arrived = self._continued(q), np.empty_like(q)
         actions = np.empty((len(q), plans.shape[2]))
         changes = self._changes[self._calls % SETS]

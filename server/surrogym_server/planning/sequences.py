@@ -15,7 +15,7 @@ from torch import Tensor
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.models.abilities import CompiledSteps, GridPolicy, offers
 from surrogym_server.models.port import DynamicsModel
-from surrogym_server.planning.grid import GridModel, discount_of, unfit
+from surrogym_server.planning.grid import GridModel, at_nearest_node, discount_of, unfit
 
 Floats = NDArray[np.float64]
 
@@ -47,18 +47,10 @@ def _actions(model: DynamicsModel, policy: GridPolicy, q: Tensor, length: int) -
     """Return the actions (s, T, F) of a policy along the mean paths from q (s, C). They go on after a termination."""
     taken = []
     for _ in range(length):
-        u = policy.table[_nearest(policy, q.numpy())]
+        u = at_nearest_node(policy, q.numpy())
         taken.append(u)
         q = _bounded(model.definition, model.transition(q, torch.from_numpy(u)).q_next)
     return np.stack(taken, 1)
-
-
-def _nearest(policy: GridPolicy, q: Floats) -> NDArray[np.int64]:
-    """Return the node (s,) that is nearest to each state q (s, C)."""
-    low, cell, count, cyclic = policy.grid
-    at = np.rint((q - low) / cell).astype(np.int64)
-    at = np.where(cyclic, at % count, at.clip(0, count - 1))
-    return np.asarray((at * np.cumprod([1, *count[:-1]])).sum(1))
 
 
 def _bounded(definition: EnvironmentDefinition, q: Tensor) -> Tensor:

@@ -8,20 +8,25 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
+from support import limited
 from support.models import learn
 from support.real_steps import random_steps
 from surrogym_sampler.original.classic import acrobot, cartpole, pendulum
+from surrogym_sampler.original.episodes import open_episode
 from surrogym_sampler.original.mujoco_tasks import reacher
 from surrogym_server.convert import definition_from_spec
+from surrogym_server.environment.samples import Samples
 from surrogym_server.errors import InvalidInput
 from surrogym_server.local import LocalSurrogate
 from surrogym_server.planning import planner_of
 from surrogym_server.planning.grid import GridModel, _nodes, solve
-from surrogym_shared.spec import DeclaredReward, EnvironmentSpec, Quantity, RewardTerm, Term, with_history
+from surrogym_shared.spec import DeclaredReward, EnvironmentSpec, Limits, Quantity, RewardTerm, Term, with_history
 from surrogym_trainer.deployment.controller import NotDeployable
 from surrogym_trainer.deployment.reading import controller_of
 from surrogym_trainer.evaluation import imagined_returns
+from surrogym_trainer.evaluation.imagined import imagine
 from surrogym_trainer.evaluation.promise import promise_of
 from surrogym_trainer.policies import load_policy
 from surrogym_trainer.policies.card import UnusablePolicy, read_card
@@ -142,6 +147,30 @@ def test_a_constant_added_to_all_rewards_adds_the_same_to_the_values_of_all_node
     assert np.ptp(paid.values - plain.values) < 0.02 * np.ptp(plain.values)
     from_zero = GridModel.of(Paying(steps), 0.0).policy(paid.discount)  # type: ignore[arg-type]
     assert np.ptp(from_zero.values - plain.values) > 0.2 * np.ptp(plain.values), "values that begin at 0 need the bound"
+
+
+def cart(limited_to: Limits | None) -> LocalSurrogate:
+    """A cart that earns the more the further it goes to the right, where its rail ends."""
+    rng, spec = np.random.default_rng(0), limited.with_limits(limited_to)
+    q, u = rng.uniform((-1.5, -3), (1.5, 3), (40, 2)), rng.uniform(-1, 1, (40, 1))
+    speed = q[:, 1] + u[:, 0] / 2
+    after = np.stack([q[:, 0] + speed / 10, speed], 1)
+    samples = Samples(*map(torch.tensor, (q, u, after, after[:, 0], np.zeros(40, dtype=bool))))
+    return LocalSurrogate(spec, learn(definition_from_spec(spec), samples).model)
+
+
+def test_a_planner_keeps_away_from_declared_limits_and_passes_them_where_none_are_declared():
+    kept, free = cart(limited.LIMITS), cart(None)
+    imagined = imagine(kept, kept.planner(5), 8, 0)
+    assert imagined.left is not None
+    assert not imagined.left.any()
+    assert imagined_returns(free, free.planner(5), 8, 0).mean() > 2 * imagined.returns.mean() > 20
+    planner, episode = kept.planner(5), open_episode("cart:Cart", None, limited.PatientCart)
+    moment = episode.reset(0)
+    for _ in range(40):
+        moment = episode.step(planner.from_states(moment.coordinates[None])[0])
+        assert not moment.fell_back
+    assert moment.coordinates[0] > 0.3
 
 
 def test_equal_planners_act_alike_and_other_seeds_try_other_changes(hanging: LocalSurrogate):

@@ -7,17 +7,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from support import limited
 from support.models import learn
 from support.real_steps import random_steps
 from surrogym import Design
 from surrogym_sampler import original
 from surrogym_sampler.original.classic import cartpole
+from surrogym_sampler.original.protocol import RolloutEnvironment
+from surrogym_sampler.original.rollouts import answering, keeping_limits
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.planning.planner import allows_planning
 from surrogym_server.sampling.judging import judge_model
 from surrogym_server.sampling.round import Round
 from surrogym_server.sampling.rules.trials import try_planner
 from surrogym_server.sampling.state import DesignState, Request
+from surrogym_shared.limits import past
 from surrogym_shared.spec import EnvironmentSpec
 
 STEPS = 30
@@ -58,6 +62,22 @@ def test_no_trial_is_asked_of_a_machine_for_which_nothing_can_be_planned(trial: 
     assert allows_planning(trial.model)
     assert not allows_planning(hidden), "two of four coordinates can't be read from this observation"
     assert try_planner(replace(trial, model=hidden)) is None
+
+
+def test_rollouts_that_are_planned_anew_keep_declared_limits():
+    design, machine = Design(limited.SPEC), keeping_limits(answering(limited.PatientCart()))
+    assert isinstance(machine, RolloutEnvironment)
+    planned, reached = False, []
+    while not planned and (query := design.ask()) is not None:
+        acting, state, steps = design.acting(query), np.asarray(machine.begin(query.id)), []
+        for number in range(query.steps):
+            steps.append(machine.act(np.array(acting(number, state))))
+            state = np.asarray(steps[-1].next_coordinates)
+        design.tell(query, steps)
+        planned = query.replan
+        reached += [step.next_coordinates for step in steps]
+    assert planned
+    assert not past(limited.SPEC, np.array(reached)).any()
 
 
 def test_a_design_plans_the_actions_of_a_trial_from_the_states_that_were_measured():
