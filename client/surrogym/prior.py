@@ -23,7 +23,7 @@ class Prior(SimulatorPrior):
         >>> design = surrogym.Design(spec, budget=40, prior=prior)
     """
 
-    def learn(self, say: Progress) -> SurrogateFile:
+    def learn(self, say: Progress) -> tuple[SurrogateFile, float]:
         design, simulator = Design(self.spec, threads=min(MOST_THREADS, os.cpu_count() or 1)), Careful(self.simulator)
         while (query := design.ask()) is not None:
             try:
@@ -31,4 +31,4 @@ class Prior(SimulatorPrior):
             except StepRefused:
                 design.give_up(query)
             say(0.5 * design.steps / self.steps, f"{design.steps} of {self.steps} steps of the simulator")
-        return design.to_file("prior")
+        return design.to_file("prior"), design.fidelity["confidence_index"]

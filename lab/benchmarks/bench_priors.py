@@ -3,12 +3,15 @@
     python lab/benchmarks/bench_priors.py --task swingup acrobot --first-seed 1000 --seeds 8
     python lab/benchmarks/bench_priors.py --task swingup --access reset --without friction --first-seed 1000 --seeds 8
 
-For each seed, the plant's parameters are the textbook's, times factors drawn evenly from 0.7 to 1.3. The arms are:
+For each seed, the plant's parameters are the textbook's, times factors drawn evenly from 0.7 to 1.3. The reactor is the
+one of examples/reactor.py, and its simulator's activation energy has the factor. ball_in_cup needs dm_control. The arms
+are:
 
 - cold: a design without a prior;
 - rough: beside a model of the simulator as it is;
 - calibrated: beside a model of the simulator with calibrated parameters;
 - wrong: beside a model of the simulator whose actions are turned round, calibrated all the same;
+- other: beside a calibrated model of another machine: its parameters are five times the textbook's, or a fifth of them;
 - alone: a model of the simulator as it is, in place of the plant, without a real step.
 
 A row has the design's phase and real steps, the largest error of a step (of the standard deviation of the changes,
@@ -20,6 +23,7 @@ Rows are kept in ``--out``/priors.csv, so that the same command goes on after Ct
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -28,8 +32,10 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))
 
 import numpy as np
+import reactor
 import torch
 from common import OUT
 
@@ -39,7 +45,6 @@ from surrogym_sampler import original
 from surrogym_sampler.original.episodes import SteppedEpisode
 from surrogym_sampler.original.protocol import RealStep
 from surrogym_sampler.priors.calibration import adjustable
-from surrogym_sampler.priors.prior import silent
 from surrogym_server.environment.actions import model_actions
 from surrogym_server.local import LocalSurrogate
 from surrogym_shared.spec import BoxAction, EnvironmentSpec
@@ -47,14 +52,37 @@ from surrogym_trainer.evaluation.evaluator import EvaluationSettings, evaluate
 from surrogym_trainer.policies import load_policy
 from surrogym_trainer.training import TrainSettings, train
 
+
+class Tank(reactor.Reactor):
+    """The reactor of the examples, with its activation energy as an attribute."""
+
+    activation = 8750.0  # K
+
+    def step_from(self, coordinates: Any, action: Any) -> RealStep:
+        def derivative(concentration: float, temperature: float, coolant: float) -> tuple[float, float]:
+            rate = 7.2e10 * np.exp(-self.activation / temperature) * concentration
+            return 1.0 - concentration - rate, 350.0 - temperature + 209.2 * rate + 2.092 * (coolant - temperature)
+
+        reactor.derivative = derivative
+        return super().step_from(coordinates, action)
+
+
 TASKS: dict[str, tuple[str, tuple[str, ...], int]] = {  # environment, its parameters, the budget of the cold design
     "swingup": ("surrogym/CartPoleSwingUp-v0", ("masscart", "masspole", "length", "friction"), 120),
     "acrobot": ("Acrobot-v1", ("LINK_LENGTH_1", "LINK_MASS_1", "LINK_MASS_2", "LINK_MOI"), 200),
     "cartpole": ("CartPole-v1", ("masscart", "masspole", "length", "force_mag"), 60),
     "pendulum": ("Pendulum-v1", ("m", "l"), 30),
     "doublependulum": ("InvertedDoublePendulum-v5", ("mass.cart", "mass.pole", "mass.pole2", "gear.slide"), 250),
+    "reactor": ("bench_priors:Tank", ("activation",), 30),
+    "ball_in_cup": (
+        "dm_control:ball_in_cup-catch",
+        ("mass.cup", "mass.ball", "damping.cup_x", "damping.cup_z", "friction.ball", "gear.x", "gear.z"),
+        1_000,
+    ),
 }
-ARMS = ("cold", "rough", "calibrated", "wrong", "alone")
+DRAFT = Path(__file__).parent / "larger" / "ball_in_cup-catch.json"  # its specification
+ARMS = ("cold", "rough", "calibrated", "wrong", "other", "alone")
+ANOTHER = 5.0  # factor or divisor of each parameter of another machine
 OFF = 0.3  # default of the largest share by which a parameter is off
 TESTS = 300
 SEARCH = "FASTPPO"
@@ -118,24 +146,25 @@ def main() -> None:
 
 def run(task: str, access: str, without: str, off: float, arm: str, seed: int, *, policy: bool) -> Row:
     name, names, budget = TASKS[task]
-    factors = np.random.default_rng([seed, 77]).uniform(1 - off, 1 + off, len(names))
+    rng = np.random.default_rng([seed, 77])
+    factors, far = rng.uniform(1 - off, 1 + off, len(names)), ANOTHER ** rng.choice([-1, 1], len(names))
 
     def plant(access: Any = "any") -> Any:
-        made = original.make(name, budget=budget, seed=seed, access=access)
-        known = adjustable(made).parameters()
-        adjustable(made).set_parameters({one: known[one] * by for one, by in zip(names, factors.tolist(), strict=True)})
-        return made
+        made = _made(name, budget=budget, seed=seed, access=access)
+        return made if task == "reactor" else scaled(made, names, factors)
 
     spec, truth = plant(access).spec(), adjustable(plant()).parameters()
-    simulator: Any = original.make(name)
+    simulator: Any = _made(name)
+    if arm == "other" or task == "reactor":
+        scaled(simulator, names, far if arm == "other" else factors)
     if without:
         adjustable(simulator).set_parameters({without: 0.0})
     if arm == "wrong":
         simulator = Turned(simulator)
-    calibrated = [one for one in names if one != without] if arm in ("calibrated", "wrong") else []
+    calibrated = [one for one in names if one != without] if arm in ("calibrated", "wrong", "other") else []
     prior = None if arm == "cold" else surrogym.Prior(simulator, spec, calibrated)
     if arm == "alone" and prior is not None:
-        model, phase, steps = LocalSurrogate.from_bytes(spec, prior.learn(silent).model), "alone", 0
+        model, phase, steps = LocalSurrogate.from_bytes(spec, prior.learned().model), "alone", 0
     else:
         design, machine = surrogym.Design(spec, budget=budget, prior=prior, threads=2), plant(access)
         while (query := design.ask()) is not None:
@@ -149,6 +178,20 @@ def run(task: str, access: str, without: str, off: float, arm: str, seed: int, *
         len(found),
         value_of(model, plant, seed) if policy else float("nan"),
     )
+
+
+def _made(name: str, **choices: Any) -> Any:
+    draft = DRAFT.read_bytes() if DRAFT.stem in name else None
+    spec = None if draft is None else EnvironmentSpec.model_validate(json.loads(draft)["specification"])
+    return original.make(name, spec=spec, **choices)
+
+
+def scaled(environment: Any, names: tuple[str, ...], factors: Any) -> Any:
+    """The environment, whose parameters ``names`` (P,) are multiplied by ``factors`` (P,)."""
+    plain = adjustable(environment)
+    known = plain.parameters()
+    plain.set_parameters({one: known[one] * by for one, by in zip(names, factors.tolist(), strict=True)})
+    return environment
 
 
 def answered(plant: Any, query: surrogym.Query, seed: int) -> list[RealStep]:

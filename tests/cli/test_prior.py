@@ -11,6 +11,7 @@ from support.hinge import PERIOD, Real, hinge_spec, sent
 from support.noting import until
 from surrogym_client.transport import Api
 from surrogym_client.transport.priors import PriorCalls
+from surrogym_sampler.priors import prior
 from surrogym_sampler.queries.settings import SamplerSettings
 from surrogym_sampler.queries.worker import Sampler
 
@@ -73,6 +74,14 @@ def test_the_status_shows_the_calibration_and_the_outputs_that_use_the_prior(on_
     assert said.code == 0
     assert "outputs that use it: angle, speed" in said.out
     assert said.out in on_server("status", sampled).out
+
+
+def test_an_uncertain_model_of_a_simulator_is_learned_from_more_steps_on_the_server(on_server, sampled, monkeypatch):
+    for name, value in (("BY_INPUT", 5), ("FEWEST", 10), ("FURTHER", 80)):
+        monkeypatch.setattr(prior, name, value)
+    said = on_server("prior", sampled, "support.hinge:Stiff", *PARAMETERS, "--json")
+    assert said.code == 0
+    assert said.json["prior"]["about"]["simulated_steps"] == 80
 
 
 def test_a_prior_in_other_units_is_said_to_have_too_large_errors_and_the_design_goes_without_it(on_server, sampled):

@@ -47,9 +47,9 @@ class ServerPrior(SimulatorPrior):
         self._api = api
         self._name = f"{name[:MOST_OF_NAME]}{MARK}{uuid4().hex[:TOKEN]}"
 
-    def learn(self, say: Progress) -> SurrogateFile:
+    def learn(self, say: Progress) -> tuple[SurrogateFile, float]:
         """Let the server learn a model of the simulator from simulated steps, whose number is the attribute ``steps``,
-        and return the model. Progress is reported to ``say``.
+        and return the model and its confidence index. Progress is reported to ``say``.
 
         Raises:
             SurrogymClientError: the server can't be reached, or refuses a request.
@@ -65,8 +65,8 @@ class ServerPrior(SimulatorPrior):
 
             settings = SamplerSettings(until_done=True, max_queries=self.steps, batch=BATCH)
             Sampler(self._api, self._name, Careful(self.simulator), settings, report=count).run()
-            wait_for_model(self._api, self._name, LONGEST_FIT, lambda view: say(0.75, _words(view)))
-            return export_surrogate(self._api, self._name)
+            view = wait_for_model(self._api, self._name, LONGEST_FIT, lambda view: say(0.75, _words(view)))
+            return export_surrogate(self._api, self._name), view.confidence_index or 0.0
         finally:
             self._remove()
 

@@ -33,6 +33,7 @@ from surrogym_shared.wire.priors import CalibratedParameter, PriorAbout
 
 BY_INPUT = 50  # default number of simulated steps to learn from, for each coordinate and action entry
 FEWEST, MOST = 100, 400  # smallest and largest default number of simulated steps
+FURTHER = 1_000  # default number, if the model of so many is not certain
 WORSE = 1.5  # if the error on the real steps so far exceeds this multiple of the calibration's error, calibrate again
 AGAIN = 2  # the parameters are calibrated again when there are this many times the steps of the last calibration
 TRIALS = 5  # number of steps that test whether a simulator works
@@ -90,7 +91,7 @@ class SimulatorPrior(ABC):
         spec: specification of the plant. The simulator has the same coordinates and actions.
         parameters: parameters to be calibrated, each as ``NAME`` or ``NAME=LOW..HIGH``.
         steps: number of simulated steps from which the model is learned. None chooses 100 to 400 by the number of
-            inputs.
+            inputs, and 1,000 if the model is then not certain within its tolerances and the simulator is fast.
 
     Raises:
         UnknownEnvironment: the simulator can't be opened, or can't be set to a state; or some coordinates of the plant
@@ -114,7 +115,8 @@ class SimulatorPrior(ABC):
         size = len(spec.coordinates) + spec.action.size
         self.steps = min(MOST, max(FEWEST, BY_INPUT * size)) if steps is None else steps
         self.source = simulator if isinstance(simulator, str) else type(simulator).__name__
-        self.spec = with_choices(spec, {"initial": self.steps, "budget": self.steps}, access="any")
+        self.spec = _of_steps(spec, self.steps)
+        self._may_extend, self._seconds = steps is None, 0.0  # the mean seconds of a simulated step, once measured
         self.simulator = _opened(simulator, self.spec)
         plant = adjustable(self.simulator)
         self.parameters = read_parameters(parameters, plant)
@@ -125,9 +127,9 @@ class SimulatorPrior(ABC):
         self.file: SurrogateFile | None = None
 
     @abstractmethod
-    def learn(self, say: Progress) -> SurrogateFile:
-        """Learn a model of the simulator with its current parameters from simulated steps, and return the model. The
-        attribute ``steps`` is their number.
+    def learn(self, say: Progress) -> tuple[SurrogateFile, float]:
+        """Learn a model of the simulator with its current parameters from simulated steps, and return the model and its
+        confidence index. The attribute ``steps`` is their number.
 
         ``say`` is called with the share of the work that is done, and a few words.
         """
@@ -163,8 +165,19 @@ class SimulatorPrior(ABC):
             return False
         self.calibration = found
         self._set(found.values)
-        self.file = replace(self.learn(progress), about=self._about(found))
+        self._seconds = step.seconds
+        self.file = replace(self.learned(progress), about=self._about(found))
         return True
+
+    def learned(self, progress: Progress = silent) -> SurrogateFile:
+        """Learn a model of the simulator with its current parameters, and return it. If no number of simulated steps
+        was given, the simulator is not slow, and the model is not certain, learn it from more steps."""
+        file, confidence = self.learn(progress)
+        if self._may_extend and confidence < self.spec.design.target and self._seconds < SLOW:
+            self._may_extend, self.steps = False, FURTHER
+            self.spec = _of_steps(self.spec, self.steps)
+            file, _ = self.learn(progress)
+        return file
 
     def close(self) -> None:
         """Close the simulator."""
@@ -196,6 +209,11 @@ class SimulatorPrior(ABC):
         ).model_dump(mode="json")
 
 
+def _of_steps(spec: EnvironmentSpec, steps: int) -> EnvironmentSpec:
+    """Return the specification for a design of so many simulated steps anywhere in the sampling ranges."""
+    return with_choices(spec, {"initial": steps, "budget": steps}, access="any")
+
+
 class _Reported:
     """A function that takes a step of a simulator, and that reports how many steps it took and what each costs.
 
@@ -207,15 +225,21 @@ class _Reported:
 
     def __init__(self, step: Step, most: float, report: Callable[[str], None]) -> None:
         self._step, self._most, self._report = step, most, report
-        self._taken, self._began = 0, time.monotonic()
-        self._due = self._began + REPORT_SECONDS
+        self._taken, self._busy, self._due = 0, 0.0, time.monotonic() + REPORT_SECONDS
+
+    @property
+    def seconds(self) -> float:
+        """Mean seconds of a step so far."""
+        return self._busy / max(1, self._taken)
 
     def __call__(self, values: Array, coordinates: Array, action: Array) -> Array:
+        began = time.monotonic()
         reached = self._step(values, coordinates, action)
         self._taken += 1
-        if (now := time.monotonic()) > self._due:
+        self._busy += (now := time.monotonic()) - began
+        if now > self._due:
             self._due = now + REPORT_SECONDS
-            each = (now - self._began) / self._taken
+            each = self.seconds
             slow = (
                 ", and a calibration takes hundreds of them: name fewer parameters, or learn a surrogate of the "
                 "simulator beforehand, and use surrogate:NAME"

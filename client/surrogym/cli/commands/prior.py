@@ -59,7 +59,7 @@ def command(
             min=10,
             max=2_000,
             help="Steps of the simulator from which its model is learned. [default: 50 for each coordinate and action "
-            "entry, 100 to 400]",
+            "entry, 100 to 400; 1,000 if the model is then not certain and the simulator is fast]",
         ),
     ] = None,
     drop: Annotated[bool, typer.Option("--drop", help="Remove the prior, or stop waiting for one.")] = False,

@@ -246,7 +246,8 @@ class GaussianProcessModel(
         return self._compiled
 
     def compiled_pays(self, *, stds: bool) -> bool:
-        points = max((len(o.posterior.x) for o in self.outputs if o.posterior is not None), default=0)
+        outputs = (*self.outputs, *(() if self.prior is None else self.prior.outputs))
+        points = max((len(o.posterior.x) for o in outputs if o.posterior is not None), default=0)
         return not stds or points <= COMPILED_SOLVES
 
     @property

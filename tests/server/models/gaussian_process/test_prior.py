@@ -86,10 +86,21 @@ def test_leave_one_out_errors_with_a_prior_are_in_output_units(textbook):
     assert 0 < beside.leave_one_out()[1].error < 0.2 * float(beside.scales[1])
 
 
+def test_the_uncertainty_of_a_prior_model_of_few_steps_is_counted():
+    beside = learned(samples(Textbook(), 4, seed=3), learned(samples(Textbook(), 12, seed=1)))
+    test = samples(Textbook(), 200, seed=99)
+    found = beside.transition(test.q, test.u, stds=True)
+    assert found.std is not None
+    off = (found.q_next - test.q_next)[:, 1].abs()
+    assert float((off < 2 * found.std[:, 1]).double().mean()) > 0.5
+
+
+@pytest.mark.parametrize("count", [12, 80])
 @pytest.mark.parametrize("way", [way for way in WAYS if way != "in C"])
-def test_compiled_steps_with_a_prior_equal_the_model(textbook, way):
+def test_compiled_steps_with_a_prior_equal_the_model(way, count):
     test = samples(Real(), 40, seed=5)
-    check_compiled(learned(samples(Real(), 10, seed=3), textbook), (test.q, test.u), way)
+    prior = learned(samples(Textbook(), count, seed=1))
+    check_compiled(learned(samples(Real(), 10, seed=3), prior), (test.q, test.u), way)
 
 
 def test_a_model_with_a_prior_has_no_c_export(textbook):

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from surrogym_server.environment.features import FeatureMap
 from surrogym_server.gp import NOISE_FLOOR, FitOptions, LeftOut, Posterior, noisy_explanation
+from surrogym_server.gp.kernel import variance
 from surrogym_server.models.abilities import LeaveOneOutErrors
 from surrogym_server.models.gaussian_process.prediction.warp import PEAK_NOISE, Warp
 from surrogym_server.tensors import amplitude
@@ -81,6 +82,15 @@ class OutputModel:
         if self.size_with_prior is not None:
             return self.size_with_prior
         return self.scale if self.warp is None else self.warp.size
+
+    @property
+    def function_variance(self) -> float:
+        """Variance of the output's function before any sample, in its unit squared: mean over the points of its
+        process; infinite for an output without a process."""
+        if self.posterior is None:
+            return math.inf
+        x = self.posterior.x
+        return float(((self.scale * self.amplitude(x)).square() * variance(self.posterior.hyper, x)).mean())
 
     @property
     def noise_floor(self) -> float:

@@ -7,6 +7,7 @@ are computed from the observation.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -53,17 +54,42 @@ class Predictor:
 
         ``paths`` (m, W) are the weights of the sampled function that each row follows, or None for the mean.
         """
+        doubt: Tensor | None = None
+        if self.prior is not None and (stds or reward_std or noise is not None):
+            doubt = self._doubt(self.prior, q, u)
+            noise = None if noise is None else noise * doubt[:, :-1]
         columns = self._columns if stds or noise is not None else ()
         columns += (self._reward_column,) if reward_std else ()
         rows = min(group.serving.rows for group in self._groups if group)
         q_next, mean, spread = in_blocks(rows, partial(self._step, columns), q, u, noise, process, paths)
         reward, edges = self._rewards(q, u, q_next, mean[:, -1])
-        return Transition(
-            q_next,
-            reward,
-            spread[:, list(self._columns)] if stds else None,
-            self._reward_spread(mean[:, -1], spread[:, -1], edges) if reward_std else None,
-        )
+        std = spread[:, list(self._columns)] if stds else None
+        of_reward = self._reward_spread(mean[:, -1], spread[:, -1], edges) if reward_std else None
+        if doubt is not None:
+            std = None if std is None else std * doubt[:, :-1]
+            of_reward = None if of_reward is None else of_reward * doubt[:, -1]
+        return Transition(q_next, reward, std, of_reward)
+
+    def _doubt(self, prior: Predictor, q: Tensor, u: Tensor) -> Tensor:
+        """Return by how much the standard deviations of the outputs (m, O) are larger because the prior model is not
+        certain either: sqrt(1 + sigma_p^2 / a^2), sigma_p its standard deviation and a^2 the ``doubted`` variance.
+
+        The process of an output has learned the difference from the prior's mean at the samples, so what the prior
+        gets wrong is part of it, with an amplitude that grows with sigma_p. So samples narrow it as they do the rest.
+        """
+        known = prior.transition(q, u, None, None, None, stds=True, reward_std=True)
+        assert known.std is not None
+        assert known.reward_std is not None
+        sigma = torch.cat([known.std, known.reward_std[:, None]], -1)
+        return (1 + sigma.square() / self.doubted).sqrt()
+
+    @cached
+    def doubted(self) -> Tensor:
+        """For each output (O,), the variance of its function before any sample; infinite if it does not use a
+        prior."""
+        outputs = (*self.transitions, self.reward)
+        variances = [math.inf if output.size_with_prior is None else output.function_variance for output in outputs]
+        return torch.tensor(variances, dtype=torch.float64, device=self.definition.device)
 
     def means(self, q: Tensor, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return the mean changes (m, M), next coordinates (m, C) and mean rewards (m,) at q (m, C) and u (m, F)."""

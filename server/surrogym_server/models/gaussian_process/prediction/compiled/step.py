@@ -403,6 +403,7 @@ class StepsOfModel(ArraySteps):
     # (columns,) for each coordinate or observation entry, and last the reward: 1 if the prior model's prediction is
     # added to it, otherwise 0.
     uses: Floats
+    doubted: Floats  # (O,) for each output, see ``Predictor.doubted``
 
     @classmethod
     def of(cls, predictor: Predictor, ending: Region | None, prior: StepsOfModel | None) -> Self:
@@ -416,7 +417,8 @@ class StepsOfModel(ArraySteps):
         regions = ending is not None or bool(predictor.jumps)
         points = sum(group.serving.exponents.shape[1] for group in predictor._groups if group)
         outputs, tables = len(predictor.transitions) + 1, tables_of(predictor, ending)
-        return cls(predictor.definition, tables, outputs, regions, points, prior, predictor.uses_prior.cpu().numpy())
+        of_prior = (array.cpu().numpy() for array in (predictor.uses_prior, predictor.doubted))
+        return cls(predictor.definition, tables, outputs, regions, points, prior, *of_prior)
 
     def __call__(
         self,
@@ -457,6 +459,11 @@ class StepsOfModel(ArraySteps):
         )
         noise, process, paths = (NO_ROWS if given is None else given for given in (noise, process, paths))
         known = NO_ROWS if self.prior is None else self._by_prior(self.prior, q, u)
+        doubt: Floats | None = None
+        if self.prior is not None and (stds or reward_std or len(noise)):
+            sigma = self.prior._steps(q, u, None, None, None, True, True, NO_ROWS).std
+            doubt = np.sqrt(1 + sigma**2 / self.doubted)  # see ``Predictor._doubt``
+            noise = noise * doubt[:, :-1] if len(noise) else noise
 
         def rows(at: slice) -> None:
             step(
@@ -493,4 +500,6 @@ class StepsOfModel(ArraySteps):
                 moved.std,
                 moved.terminated,
             )
+        if doubt is not None:
+            moved.std[:] *= doubt
         return moved
