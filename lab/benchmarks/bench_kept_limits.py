@@ -2,7 +2,8 @@
 
     python lab/benchmarks/bench_kept_limits.py --machines rail tanks levitation --first-seed 1 --seeds 10
     python lab/benchmarks/bench_kept_limits.py --machines rotary --no-policy --first-seed 1 --seeds 10
-    python lab/benchmarks/bench_kept_limits.py --machines tanks levitation --reference 1000000 --first-seed 1
+    python lab/benchmarks/bench_kept_limits.py --machines tanks levitation --reference 300000 --first-seed 1
+    python lab/benchmarks/bench_kept_limits.py --machines rail tanks --random 500 --first-seed 1
 
 The machines are the cart-pole swing-up on a rail of +-0.8 m, two tanks of which the upper one runs over, a levitated
 ball that must be held, a reactor that must not run away, a quadrotor between floor and ceiling, and a rotary pendulum
@@ -16,8 +17,10 @@ with limits or without:
   reaction), of which neither model nor policy nor fallback knows.
 
 Each row is judged by the physical quantity that must stay in its range, such as the position of the cart. The declared
-limit may be of another term, such as the position plus the way of 0.1 s. Rows are saved in ``--out``/limits.csv, so
-that the same command continues after Ctrl-C.
+limit may be of another term, such as the position plus the way of 0.2 s. Rows are saved in ``--out``/limits.csv, so
+that the same command continues after Ctrl-C. ``--reference`` trains a policy by PPO in the plant itself, with the same
+guard: a measure for the returns of policies that a model trained. ``--random`` takes episodes of random actions, each
+of which is held for some steps, with the guard and without.
 """
 
 from __future__ import annotations
@@ -198,7 +201,8 @@ PLANTS = {
         lambda _: original.make("surrogym/CartPoleSwingUp-v0", access="reset"),
         _limits(
             Term.linear(x=-8.0, velocity=-6.0),
-            Limit(name="rail", term=Term.linear(x=1.0, velocity=0.1), low=-0.8, high=0.8, margin=0.2),
+            # chosen with --random on seed 0
+            Limit(name="rail", term=Term.linear(x=1.0, velocity=0.2), low=-0.8, high=0.8, margin=0.4),
         ),
         Limit(name="rail", term=Term.linear(x=1.0), low=-0.8, high=0.8),
         lambda _: original.make("surrogym/CartPoleSwingUp-v0", access="reset"),
@@ -299,6 +303,13 @@ def main() -> None:
             found = reference(machine, options.first_seed, options.reference)
             print(machine, "PPO in the plant: mean return {:.4g}, {} of {} episodes left".format(*found))
         return
+    if options.random:
+        for machine in options.machines:
+            for limited in (True, False):
+                kept = random_episodes(machine, options.first_seed, options.random, limited=limited)
+                words = "with" if limited else "without"
+                print(machine, words, "limits: {} of {} left, fallback in {:.0%} of the steps".format(*kept))
+        return
     rows = read_records(path, Row)
     done = {(row.machine, row.limits, row.seed) for row in rows}
     for seed in range(options.first_seed, options.first_seed + options.seeds):
@@ -377,6 +388,31 @@ def reference(machine: str, seed: int, steps: int) -> tuple[float, int, int]:
         plant.step_async(model.predict(trained.normalize_obs(seen), deterministic=True)[0])
         seen, *_ = plant.step_wait()
     return float(earned.mean()), int(left.sum()), REFERENCE_EPISODES
+
+
+def random_episodes(machine: str, seed: int, episodes: int, *, limited: bool) -> tuple[int, int, float]:
+    """Take whole episodes of random actions. Return the number of those that left the physical limit, their number, and
+    the share of steps in which the fallback acted."""
+    plant, rng = PLANTS[machine], np.random.default_rng([seed, 7])
+    kept, free = specifications(plant, seed)
+    judged, spec = _judging(plant, kept), kept if limited else free
+    environment = open_episode("plant:Plant", spec, lambda: Respecified(plant.make(seed), spec))
+    low, high = np.array(spec.action.ranges).T
+    left = steps = fallbacks = 0
+    for _ in range(episodes):
+        moment, path, held = environment.reset(int(rng.integers(2**31))), [], int(rng.choice((1, 2, 4, 8)))
+        for number in range(spec.time_limit or 0):
+            if number % held == 0:
+                extreme = rng.random(len(low)) < 0.7
+                action = np.where(extreme, rng.choice((low, high)), rng.uniform(low, high))
+            moment = environment.step(action)
+            path.append(moment.coordinates)
+            fallbacks += moment.fell_back
+            if moment.terminated or moment.truncated:
+                break
+        steps += len(path)
+        left += bool(past(judged, np.array(path)).any())
+    return left, episodes, fallbacks / steps
 
 
 def guard_times(machine: str) -> tuple[float, float]:
@@ -505,6 +541,7 @@ def _options() -> argparse.Namespace:
     made.add_argument("--machines", nargs="+", choices=list(PLANTS), default=list(PLANTS))
     made.add_argument("--first-seed", type=int, default=0)
     made.add_argument("--seeds", type=int, default=1)
+    made.add_argument("--random", type=int, metavar="EPISODES", help="only take episodes of random actions")
     made.add_argument("--reference", type=int, metavar="STEPS", help="only train by PPO in the plant for these steps")
     made.add_argument("--time", action="store_true", help="only measure the time that the guard takes in a step")
     made.add_argument("--no-policy", action="store_true", help="designs alone")
