@@ -16,8 +16,8 @@ are:
 
 A row has the design's phase and real steps, the largest error of a step (of the standard deviation of the changes,
 over 300 states drawn from the sampling range), and with ``--policy`` the mean real return of 50 episodes of a policy
-that was trained in the model. ``--without`` names a parameter that the simulator lacks: it is 0 there.
-Rows are kept in ``--out``/priors.csv, so that the same command goes on after Ctrl-C.
+that was trained in the model, and the share of them that succeed. ``--without`` names a parameter that the simulator
+lacks: it is 0 there. Rows are kept in ``--out``/priors.csv, so that the same command goes on after Ctrl-C.
 """
 
 from __future__ import annotations
@@ -84,6 +84,7 @@ DRAFT = Path(__file__).parent / "larger" / "ball_in_cup-catch.json"  # its speci
 ARMS = ("cold", "rough", "calibrated", "wrong", "other", "alone")
 ANOTHER = 5.0  # factor or divisor of each parameter of another machine
 OFF = 0.3  # default of the largest share by which a parameter is off
+USUAL_RANGE = 0.5  # with a larger share, parameters get wider ranges than half to twice the simulator's own value
 TESTS = 300
 SEARCH = "FASTPPO"
 
@@ -105,6 +106,7 @@ class Row:
     inside: int  # calibrated parameters whose 90 % interval holds the true value
     parameters: int  # calibrated
     value: float  # mean real return of the policy; nan without --policy
+    success: float  # share of its episodes that succeed; nan without --policy, or if success is not declared
 
 
 class Turned:
@@ -139,13 +141,17 @@ def main() -> None:
             for arm in options.arms:
                 if (task, options.access, options.without, options.off, arm, seed) in done:
                     continue
-                rows.append(run(task, options.access, options.without, options.off, arm, seed, policy=options.policy))
+                chosen = (options.access, options.without, options.off)
+                rows.append(run(task, *chosen, arm, seed, policy=options.policy, budget=options.budget))
                 write_records(path, Row, rows)
                 print(rows[-1])
 
 
-def run(task: str, access: str, without: str, off: float, arm: str, seed: int, *, policy: bool) -> Row:
-    name, names, budget = TASKS[task]
+def run(
+    task: str, access: str, without: str, off: float, arm: str, seed: int, *, policy: bool, budget: int | None = None
+) -> Row:
+    name, names, usual = TASKS[task]
+    budget = budget or usual
     rng = np.random.default_rng([seed, 77])
     factors, far = rng.uniform(1 - off, 1 + off, len(names)), ANOTHER ** rng.choice([-1, 1], len(names))
 
@@ -162,6 +168,9 @@ def run(task: str, access: str, without: str, off: float, arm: str, seed: int, *
     if arm == "wrong":
         simulator = Turned(simulator)
     calibrated = [one for one in names if one != without] if arm in ("calibrated", "wrong", "other") else []
+    if off > USUAL_RANGE:
+        own = adjustable(simulator).parameters()
+        calibrated = [f"{one}={own[one] * (1 - off) / 2}..{own[one] * (1 + off) * 2}" for one in calibrated]
     prior = None if arm == "cold" else surrogym.Prior(simulator, spec, calibrated)
     if arm == "alone" and prior is not None:
         model, phase, steps = LocalSurrogate.from_bytes(spec, prior.learned().model), "alone", 0
@@ -176,7 +185,7 @@ def run(task: str, access: str, without: str, off: float, arm: str, seed: int, *
         sum(one.startswith("prior + ") for one in model.model.structures),
         sum(one.low <= truth[one.name] <= one.high for one in found),
         len(found),
-        value_of(model, plant, seed) if policy else float("nan"),
+        *(earned(model, plant, seed) if policy else (float("nan"), float("nan"))),
     )
 
 
@@ -235,13 +244,14 @@ def _drawn(sampling: Any, rng: np.random.Generator) -> Any:
     return rng.uniform(sampling.low, sampling.high, TESTS)
 
 
-def value_of(model: LocalSurrogate, plant: Callable[[], Any], seed: int) -> float:
-    """Mean real return of a policy that was trained in the model."""
+def earned(model: LocalSurrogate, plant: Callable[[], Any], seed: int) -> tuple[float, float]:
+    """Mean real return of a policy that was trained in the model, and the share of its episodes that succeed."""
     with TemporaryDirectory() as folder:
         path = Path(folder) / "policy.zip"
         train(model, path, TrainSettings(SEARCH, seed=seed))
         predict = load_policy(path, SEARCH)
-    return float(np.mean(evaluate(predict, lambda: SteppedEpisode(plant()), EvaluationSettings(50, 10_000)).returns))
+    found = evaluate(predict, lambda: SteppedEpisode(plant()), EvaluationSettings(50, 10_000))
+    return float(np.mean(found.returns)), float("nan") if found.success_rate is None else found.success_rate
 
 
 def _options() -> argparse.Namespace:
@@ -251,6 +261,7 @@ def _options() -> argparse.Namespace:
     made.add_argument("--access", choices=("any", "reset"), default="any")
     made.add_argument("--without", default="", help="parameter that the simulator lacks")
     made.add_argument("--off", type=float, default=OFF, help="largest share by which a parameter of the plant is off")
+    made.add_argument("--budget", type=int, help="real steps that a design may take [default: those of a cold one]")
     made.add_argument("--first-seed", type=int, default=0)
     made.add_argument("--seeds", type=int, default=1)
     made.add_argument("--policy", action="store_true", help="train a policy, and measure its real return")

@@ -16,7 +16,9 @@ from surrogym_server.errors import InvalidInput
 from surrogym_server.models.files import from_bytes, to_bytes
 from surrogym_server.models.gaussian_process.codec.model import GaussianProcessCodec
 from surrogym_server.models.gaussian_process.family import GaussianProcesses
+from surrogym_server.models.gaussian_process.learning import prior
 from surrogym_server.models.gaussian_process.model import GaussianProcessModel
+from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 from surrogym_shared.nouns import RealSteps
 
 HINGE = definition_from_spec(hinge_spec())
@@ -74,6 +76,21 @@ def test_a_wrong_prior_model_is_ignored_once_samples_contradict_it(textbook):
     many = samples(Real(), 30, seed=3)
     beside, alone = learned(many, wrong), learned(many)
     assert speed_error(beside, Real()) <= 1.1 * speed_error(alone, Real())
+
+
+@pytest.mark.parametrize(("alone", "uses"), [(-1.0, True), (0.2, True), (0.5, False)])
+def test_an_output_is_learned_without_the_prior_only_if_samples_contradict_it_by_a_margin(alone, uses, monkeypatch):
+    """Ten left-out samples are likelier without the prior by a log factor of 2, or of 5."""
+    scores = {prior.BESIDE: 0.0, "": alone}
+    found = learned(samples(Real(), 10, seed=3)).transitions[1]
+
+    def learn(name: str, target: torch.Tensor) -> OutputModel:
+        return replace(found, name=name, scale=math.exp(-scores[prior.BESIDE if prior.BESIDE in name else ""]))
+
+    monkeypatch.setattr(prior, "log_density", lambda output: -math.log(output.scale))
+    every, target = torch.ones(10, dtype=torch.bool), torch.arange(10.0)
+    chosen = prior.better_of(learn, "speed", target, torch.zeros(10), every)
+    assert (chosen.size_with_prior is not None) == uses
 
 
 def test_output_scales_do_not_depend_on_the_prior(textbook):

@@ -21,6 +21,8 @@ from surrogym_server.models.gaussian_process.prediction.output_model import Outp
 
 # Differences from the prior model's mean up to this share of an output's standard deviation are rounding errors.
 NOTHING = 1e-9
+# An output is learned without the prior model if all left-out samples together are likelier by this log factor.
+MARGIN = 3.0
 BY_PRIOR = "with the prior, mean log density of a left-out sample"
 # For a fit of the difference from a prior model, this is added to the output's name in the key of its warm start.
 BESIDE = " beside prior"
@@ -44,8 +46,8 @@ class Known:
 
 
 def better_of(learn: Learn, name: str, target: Tensor, known: Tensor | None, keep: Tensor) -> OutputModel:
-    """Learn an output from its targets (n,) with and without the prior model. Return the result that gives left-out
-    samples the greater density; if both are equal, the result with the prior model.
+    """Learn an output from its targets (n,) with and without the prior model. Return the result with the prior model,
+    unless ``contradicts`` says that left-out samples speak against it.
 
     Args:
         learn: function that fits an output.
@@ -60,8 +62,14 @@ def better_of(learn: Learn, name: str, target: Tensor, known: Tensor | None, kee
     found = beside(learn, name, target, known, keep)
     scores = (log_density(found), log_density(alone))
     noted = tuple((name, score) for name, score in zip((BY_PRIOR, ALONE), scores, strict=True) if math.isfinite(score))
-    chosen = found if scores[0] >= scores[1] else alone
+    chosen = alone if contradicts(scores[0], scores[1], int(keep.sum())) else found
     return replace(chosen, scores=(*chosen.scores, *noted))
+
+
+def contradicts(by_prior: float, alone: float, count: int) -> bool:
+    """Return whether ``count`` left-out samples, whose mean log densities are ``by_prior`` and ``alone``, are clearly
+    likelier without the prior model."""
+    return count * (alone - by_prior) > MARGIN
 
 
 def beside(learn: Learn, name: str, target: Tensor, known: Tensor, keep: Tensor) -> OutputModel:

@@ -16,7 +16,7 @@ from surrogym_server.models.gaussian_process.feature_maps import reward_candidat
 from surrogym_server.models.gaussian_process.learning.jumps import with_jumps
 from surrogym_server.models.gaussian_process.learning.output_learner import OutputLearner
 from surrogym_server.models.gaussian_process.learning.peaks import with_peak
-from surrogym_server.models.gaussian_process.learning.prior import Known, beside
+from surrogym_server.models.gaussian_process.learning.prior import Known, beside, contradicts, log_density
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 from surrogym_server.models.gaussian_process.prediction.regions import Jump, jumped
 from surrogym_shared.spec import REWARD
@@ -31,7 +31,7 @@ def learn_reward(
     give in addition, and the jumps of the reward.
 
     ``prior`` contains predictions of a prior model, or is None. The output is instead learned as the difference from
-    these predictions, if the leave-one-out error is then not larger.
+    these predictions, unless left-out samples contradict them, or peaks or jumps predict left-out samples better.
     """
     definition = learner.definition
     if (declared := definition.declared_reward) is not None:
@@ -50,7 +50,7 @@ def learn_reward(
     by_prior = torch.zeros_like(samples.reward)
     if prior is not None:
         found = beside(partial(_plain, learner, inputs, going), REWARD, samples.reward, prior.reward, going)
-        if found.leave_one_out().error <= output.leave_one_out().error:
+        if not _contradicted(found, output, jumps, int(going.sum())):
             output, jumps, by_prior = found, (), prior.reward
     ended = ~going
     if not bool(ended.any()):
@@ -58,6 +58,14 @@ def learn_reward(
     state = samples.q_next if output.feature_map.after else samples.q
     bonus = (samples.reward - by_prior - output.mean(inputs[output.feature_map]) - jumped(jumps, state)[0])[ended]
     return output, float(bonus.mean()), jumps
+
+
+def _contradicted(found: OutputModel, output: OutputModel, jumps: tuple[Jump, ...], count: int) -> bool:
+    """Return whether the reward is learned by ``output`` and its jumps from ``count`` samples, rather than beside the
+    prior model (``found``). With peaks or jumps, whose densities can't be compared, leave-one-out errors decide."""
+    if jumps or output.warp is not None:
+        return found.leave_one_out().error > output.leave_one_out().error
+    return contradicts(log_density(found), log_density(output), count)
 
 
 def _plain(
