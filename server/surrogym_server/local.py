@@ -31,12 +31,15 @@ from surrogym_server.models.files import from_bytes, to_bytes
 from surrogym_server.models.port import DynamicsModel
 from surrogym_server.planning import Planner, planner_of
 from surrogym_shared.acting import ActingPolicy, NoiseKey, PolicyRun
+from surrogym_shared.limits import distances, limit_of
 from surrogym_shared.port import Bools, Floats, Ints, PolicyRollout, ResetResult, StepResult, quick
-from surrogym_shared.spec import EnvironmentSpec
+from surrogym_shared.spec import EnvironmentSpec, Limit
 from surrogym_shared.surrogate_file import SurrogateFile
 from surrogym_shared.wire import OpenSession, SessionView, SubmittedOccupancy
 
 VERSION = 1
+# number of virtual episodes in which a planner's limit is tried, and their largest number of steps
+TRIED, LONGEST = 4, 200
 
 
 class LocalSurrogate:
@@ -104,17 +107,48 @@ class LocalSurrogate:
     def model_file(self) -> bytes:
         return to_bytes(self._model)
 
-    def planner(self, horizon: int, seed: int = 0, set_points: Mapping[str, float] | None = None) -> Planner:
+    def planner(
+        self,
+        horizon: int,
+        seed: int = 0,
+        set_points: Mapping[str, float] | None = None,
+        limits: Sequence[str] = (),
+    ) -> Planner:
         """Return a policy that plans each action by rollouts of ``horizon`` steps, after value iteration on a grid of
         states, which takes some seconds. ``seed`` is that of the changes of actions that it tries.
 
-        ``set_points`` replaces set points of the declared reward, by coordinate: ``{"level": 12}``.
+        ``set_points`` replaces set points of the declared reward, by coordinate: ``{"level": 12}``. The planner keeps
+        ``limits`` such as ``"level<=11"``, besides those of the specification.
 
         Raises:
-            InvalidInput: the horizon is out of its range, the reward or the model does not support a set point, or the
-                model or its environment does not allow planning.
+            InvalidInput: the horizon is out of its range, the reward or the model does not support a set point, a limit
+                can't be kept, or the model or its environment does not allow planning.
         """
-        return planner_of(self._model, horizon, seed, set_points)
+        try:
+            keep = [limit_of(self._spec, text) for text in limits]
+        except ValueError as error:
+            raise InvalidInput(str(error)) from error
+        planner = planner_of(self._model, horizon, seed, set_points, keep)
+        for limit in keep:
+            self._require_kept(planner, limit)
+        return planner
+
+    def _require_kept(self, planner: Planner, limit: Limit) -> None:
+        """Raise ``InvalidInput`` if a planner leaves a limit in each of a few virtual episodes from declared starts."""
+        session = self.open(OpenSession(num_envs=TRIED, seed=0, start_box=0.0)).id
+        try:
+            observation, least = self.reset(session, seed=0).observation, np.full(TRIED, np.inf)
+            for _ in range(min(self._spec.time_limit or LONGEST, LONGEST)):
+                states = planner.states(observation)
+                least = np.minimum(least, distances(self._spec, [limit], states)[:, 0])
+                if (least < 0).all():
+                    raise InvalidInput(
+                        f"limit {limit.name!r}: expected one that plans from the declared starts keep, but each of "
+                        f"{TRIED} virtual episodes left it, by up to {-least.min():.3g}: choose a wider limit"
+                    )
+                observation = self.step(session, planner(observation)).observation
+        finally:
+            self.close(session)
 
     def open(self, request: OpenSession) -> SessionView:
         if request.model not in ("latest", VERSION):

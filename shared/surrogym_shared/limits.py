@@ -6,7 +6,8 @@ Shapes: n states, C coordinates, L limits, F action entries.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+import re
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import product
 from typing import Protocol
 
@@ -14,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from surrogym_shared.checks import require, require_known, require_unique
-from surrogym_shared.spec import BoxAction, EnvironmentSpec, limits
+from surrogym_shared.spec import BoxAction, EnvironmentSpec, Term, limits
 from surrogym_shared.spec.safety import Limit, Limits, NamedFallback
 from surrogym_shared.terms import evaluate
 
@@ -26,6 +27,9 @@ FEWEST_LEFT = 2  # a machine is stopped only if at least this number of its epis
 # is stopped by mistake with at most this probability.
 LEFT_LEVEL = 0.01
 STARTS = 1_000  # number of random start states at which limits are checked
+# margin of a limit that is given at run time, as a share of the range of its term, for errors of the model
+MARGIN = 0.01
+LIMIT = re.compile(r"(?P<sum>.+?)\s*(?P<relation><=|>=)\s*(?P<value>\S+)")  # a limit that is given at run time
 
 
 def limits_of(spec: EnvironmentSpec) -> Limits:
@@ -37,8 +41,13 @@ def limits_of(spec: EnvironmentSpec) -> Limits:
 def room(spec: EnvironmentSpec, coordinates: Array) -> Array:
     """Return the distances (n, L) of n states with coordinates (n, C) from the nearer end of each of L limits, in the
     limit's unit. A distance is negative beyond the end."""
+    return distances(spec, limits_of(spec).keep, coordinates)
+
+
+def distances(spec: EnvironmentSpec, keep: Sequence[Limit], coordinates: Array) -> Array:
+    """Return what ``room`` does, for the limits ``keep``."""
     columns = []
-    for limit in limits_of(spec).keep:
+    for limit in keep:
         value = evaluate(spec, limit.term, coordinates)
         below = np.inf if limit.low is None else value - limit.low
         above = np.inf if limit.high is None else limit.high - value
@@ -212,6 +221,59 @@ def _check_term(spec: EnvironmentSpec, limit: Limit) -> None:
         not own or limit.unit in {"", *own},
         f"{where}: expected the coordinate's unit {' or '.join(map(repr, sorted(own)))}, got {limit.unit!r}",
     )
+
+
+def limit_of(spec: EnvironmentSpec, text: str) -> Limit:
+    """Return the limit of a text such as ``level<=11`` or ``x+0.3*v>=-1``: a sum of coordinates, a relation, a number.
+    Its margin is ``MARGIN`` of the range of the sum.
+
+    Raises:
+        ValueError: the text is another one, a coordinate is unknown or an angle, the number lies outside of the range
+            of the sum over the sampling ranges, or an episode may start beyond the limit or within its margin.
+    """
+    names, sides = spec.coordinate_names, LIMIT.fullmatch(text.strip())
+    weights, value = ({}, math.nan) if sides is None else (_weights(sides["sum"], names), _number(sides["value"]))
+    require(
+        any(weights.values()) and math.isfinite(value + sum(weights.values())),
+        f"limit {text!r}: expected a sum of coordinates, <= or >=, and a number, such as {names[0]}<=1 or "
+        f"0.3*{names[0]}+{names[-1]}>=-1, with the coordinates {', '.join(names)}",
+    )
+    ranges = {c.name: limits(c.sampling) for c in spec.coordinates}
+    low, high = np.sum([sorted(weight * end for end in ranges[name]) for name, weight in weights.items()], axis=0)
+    margin, side = MARGIN * float(high - low), "high" if sides and sides["relation"] == "<=" else "low"
+    limit = Limit.model_validate({"name": text[:64], "term": Term.linear(**weights), side: value, "margin": margin})
+    _check_term(spec, limit)
+    require(
+        low + margin < value < high - margin,
+        f"limit {text!r}: expected a number between {low:g} and {high:g}, where the model has samples, got {value:g}",
+    )
+    for states in _starts(spec):
+        inside = distances(spec, [limit], states)[:, 0]
+        start = dict(zip(spec.coordinate_names, states[np.argmin(inside)].round(6).tolist(), strict=True))
+        require(
+            inside.min() >= margin,
+            f"limit {text!r}: expected every start to be inside by at least {margin:g}, got the start {start}",
+        )
+    return limit
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
+
+
+def _weights(text: str, names: Sequence[str]) -> dict[str, float]:
+    """Return the weight of each coordinate in a sum such as ``x+0.3*v``; empty for another text."""
+    one = "|".join(re.escape(name) for name in sorted(names, key=len, reverse=True))
+    summand = rf"\s*([+-]?)\s*(?:([0-9.eE]+)\s*\*\s*)?({one})\s*"
+    if not re.fullmatch(rf"{summand}(?:(?=[+-]){summand})*", text):
+        return {}
+    weights: dict[str, float] = {}
+    for sign, factor, name in re.findall(summand, text):
+        weights[name] = weights.get(name, 0.0) + _number(f"{sign}{factor or 1}")
+    return weights
 
 
 def _check_pairs(declared: Limits) -> None:

@@ -196,9 +196,16 @@ HORIZON = 12  # default number of steps of each rollout of a planner
 class PlanningPort(SurrogatePort, Protocol):
     """A surrogate in this process, on whose model actions can be planned."""
 
-    def planner(self, horizon: int, seed: int, set_points: Mapping[str, float] | None = None) -> Planning:
+    def planner(
+        self,
+        horizon: int,
+        seed: int,
+        set_points: Mapping[str, float] | None = None,
+        limits: Sequence[str] = (),
+    ) -> Planning:
         """Return a function that plans each action by rollouts of ``horizon`` steps, in which it tries random changes
-        of actions. ``set_points`` replaces set points of the declared reward, by coordinate."""
+        of actions. ``set_points`` replaces set points of the declared reward, by coordinate. The plans keep ``limits``,
+        inequalities that ``surrogym_shared.limits.limit_of`` reads."""
         ...
 
 

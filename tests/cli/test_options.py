@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from surrogym.cli.errors import CommandError
 from surrogym.cli.options import Quiet, Token, typed
-from surrogym.cli.train_options import SessionOptions
+from surrogym.cli.train_options import SearchOptions, SessionOptions
 
 
 @pytest.mark.parametrize(
@@ -42,6 +42,13 @@ def test_a_recommended_command_repeats_the_typed_options_without_secrets(line: s
     again = CliRunner().invoke(app, line)
     assert again.exception is None
     assert again.output == said + "\n"
+
+
+def test_limits_are_a_setting_of_the_planner_alone():
+    options = SearchOptions(algorithm="Planner", limits=["level<=11", "x+v>=1"], chosen=["horizon=20"])
+    assert options.hyperparameters() == {"horizon": 20, "limits": ["level<=11", "x+v>=1"]}
+    with pytest.raises(CommandError, match=r"--limit: expected --algorithm planner, .* got another search"):
+        SearchOptions(limits=["level<=11"]).hyperparameters()
 
 
 def test_set_points_are_session_options_of_a_training():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,8 @@ from pydantic import ValidationError
 from scipy.stats import binomtest
 
 from support.limited import BRAKE, LIMITS, RAIL, SPEC, with_limits
-from surrogym_shared.limits import fallback_action, falls_back, left_too_often, nearest, past, room
+from surrogym_sampler.original.classic import pendulum
+from surrogym_shared.limits import fallback_action, falls_back, left_too_often, limit_of, nearest, past, room
 from surrogym_shared.spec import Coordinate, DiscreteAction, EnvironmentSpec, Limit, Limits, Term, Uniform
 
 X = Term.linear(x=1.0)
@@ -151,3 +153,39 @@ def test_a_fallback_may_be_the_name_of_a_program_and_nothing_else() -> None:
     for wrong in ({"name": "a b; c"}, {"name": "brake", "program": "os:abort"}, {}, []):
         with pytest.raises(ValidationError):
             EnvironmentSpec.model_validate({**named, "limits": {**named["limits"], "fallback": wrong}})
+
+
+@pytest.mark.parametrize(
+    ("text", "weights", "low", "high"),
+    [
+        ("x<=0.5", {"x": 1}, None, 0.5),
+        (" v >= -2.5 ", {"v": 1}, -2.5, None),
+        ("x+0.3*v<=1e0", {"x": 1, "v": 0.3}, None, 1),
+        ("-2 * v - x >= -3", {"v": -2, "x": -1}, -3, None),
+    ],
+)
+def test_a_limit_in_words_is_read(text: str, weights: dict[str, float], low: float | None, high: float | None) -> None:
+    read = limit_of(SPEC, text)
+    assert (read.term, read.low, read.high) == (Term.linear(**weights), low, high)
+    width = sum(abs(weight) * {"x": 3, "v": 6}[name] for name, weight in weights.items())
+    assert read.margin == pytest.approx(0.01 * width)
+
+
+@pytest.mark.parametrize("text", ["", "x", "x<1", "x<=", "x<=fast", "1<=x", "w<=1", "x v<=1", "x*v<=1", "1..2*x<=1"])
+def test_a_limit_in_other_words_is_refused_with_the_coordinates(text: str) -> None:
+    said = (
+        "expected a sum of coordinates, <= or >=, and a number, such as x<=1 or 0.3*x+v>=-1, with the coordinates x, v"
+    )
+    with pytest.raises(ValueError, match=re.escape(f"limit {text!r}: {said}")):
+        limit_of(SPEC, text)
+
+
+def test_a_limit_where_nothing_was_learned_or_that_a_start_violates_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"limit 'x<=1.6': expected a number between -1.5 and 1.5, .* got 1.6"):
+        limit_of(SPEC, "x<=1.6")
+    with pytest.raises(
+        ValueError, match=r"'x>=0': expected every start to be inside by at least 0.03, got .*'x': -0.1"
+    ):
+        limit_of(SPEC, "x>=0")
+    with pytest.raises(ValueError, match=r"the angle .* jumps from pi to -pi"):
+        limit_of(pendulum(), "theta<=1")

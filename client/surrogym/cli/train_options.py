@@ -54,6 +54,14 @@ class SearchOptions:
         typer.Option("--set", help="Hyperparameter of the algorithm, as NAME=VALUE. May be given several times."),
     ] = None
     seed: Annotated[int, typer.Option(min=0, help="Seed of the policy and of the virtual environment.")] = 0
+    limits: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--limit",
+            help="Limit that a planner keeps, such as level<=11 or x+0.3*v<=1, besides those of the specification. May "
+            "be given several times. Only with planner.",
+        ),
+    ] = None
     integral: Annotated[
         list[str] | None,
         typer.Option(
@@ -64,7 +72,8 @@ class SearchOptions:
     ] = None
 
     def hyperparameters(self) -> dict[str, Any]:
-        """Return the hyperparameters of ``--set`` by name. Values are parsed as JSON, or are text if that fails."""
+        """Return the hyperparameters of ``--set`` by name, with the limits. Values are parsed as JSON, or are text if
+        that fails."""
         found: dict[str, Any] = {}
         for pair in self.chosen or []:
             name, equals, value = pair.partition("=")
@@ -74,6 +83,13 @@ class SearchOptions:
                 found[name] = json.loads(value)
             except ValueError:
                 found[name] = value
+        if self.limits:
+            if (self.algorithm or "").lower() != "planner":
+                raise CommandError(
+                    "--limit: expected --algorithm planner, because trained policies keep the limits that the "
+                    f"specification declares, got {self.algorithm or 'another search'}"
+                )
+            found["limits"] = self.limits
         return found
 
 

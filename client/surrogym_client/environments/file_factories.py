@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib.metadata import entry_points
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -37,7 +37,9 @@ def open_file(path: str | Path) -> SurrogatePort:
     return opened
 
 
-def planner_of(file: bytes, horizon: int, seed: int, set_points: Mapping[str, float]) -> Planning:
+def planner_of(
+    file: bytes, horizon: int, seed: int, set_points: Mapping[str, float], limits: Sequence[str] = ()
+) -> Planning:
     """Return a function that plans actions in this process, on the model in the content of a surrogate's ``file``. This
     computes its values, in some seconds. ``PlanningPort.planner`` explains the other arguments.
 
@@ -52,7 +54,7 @@ def planner_of(file: bytes, horizon: int, seed: int, set_points: Mapping[str, fl
         port = open_file(path)
     if not isinstance(port, PlanningPort):
         raise TypeError("the installed server can't plan")
-    return port.planner(horizon, seed, set_points)
+    return port.planner(horizon, seed, set_points, limits)
 
 
 def make_env(*, file: str | Path, **options: Any) -> RemoteEnv:

@@ -76,6 +76,11 @@ class PolicyCard(BaseModel):
         """Coordinates whose errors the policy also sees, summed over the episode; empty if there are none."""
         return tuple(self.settings.get("integral") or ())
 
+    @property
+    def limits(self) -> tuple[str, ...]:
+        """Limits that a planner keeps besides those of the specification, such as ``level<=11``."""
+        return tuple(self.settings.get("limits") or ())
+
 
 def set_points_in(settings: Mapping[str, Any]) -> dict[str, float]:
     """Return the set points, by coordinate, in the settings of a training, as a card and the server have them."""

@@ -23,10 +23,11 @@ MODEL = "model.surrogate"
 class _Head(BaseModel):
     """JSON header in the file of a planner."""
 
-    version: Literal[1] = 1
+    version: Literal[1, 2]  # 2 if there are limits, which a reader of version 1 would not keep
     horizon: int
     seed: int
     set_points: dict[str, float] = Field(default_factory=dict)
+    limits: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -37,11 +38,18 @@ class PlannerFile:
     horizon: int  # number of steps of each planned rollout
     seed: int  # seed of the changes of actions that the planner tries
     set_points: Mapping[str, float] = field(default_factory=dict)  # other set points of the reward, by coordinate
+    limits: tuple[str, ...] = ()  # limits that the plans keep, as ``surrogym_shared.limits.limit_of`` reads them
 
     def save(self, path: Path) -> None:
         """Write the planner to a zip file, which contains no code."""
         with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
-            head = _Head(horizon=self.horizon, seed=self.seed, set_points=dict(self.set_points))
+            head = _Head(
+                version=2 if self.limits else 1,
+                horizon=self.horizon,
+                seed=self.seed,
+                set_points=dict(self.set_points),
+                limits=self.limits,
+            )
             file.writestr(PLANNER_HEAD, head.model_dump_json())
             file.writestr(MODEL, self.surrogate)
 
@@ -51,7 +59,7 @@ class PlannerFile:
         try:
             entries = read_entries(path, MAX_FILE_BYTES)
             head = _Head.model_validate_json(entries[PLANNER_HEAD])
-            return cls(entries[MODEL], head.horizon, head.seed, head.set_points)
+            return cls(entries[MODEL], head.horizon, head.seed, head.set_points, head.limits)
         except ValidationError as error:
             raise UnusablePolicy(f"{path} is not a planner: {first_fault(error)}; train it again") from error
         except (KeyError, ValueError) as error:
@@ -69,6 +77,6 @@ class PlannerFile:
             UnusablePolicy: the extra ``server`` is missing, or the model does not allow planning; with the reason.
         """
         try:
-            return planner_of(self.surrogate, self.horizon, self.seed, self.set_points)
+            return planner_of(self.surrogate, self.horizon, self.seed, self.set_points, self.limits)
         except Exception as error:  # errors of the server's package, whose classes the client does not import
             raise UnusablePolicy(str(error)) from error

@@ -18,6 +18,7 @@ class Planner(PolicySearch):
     """A policy that plans each action by rollouts of the model. Nothing is trained."""
 
     horizon: int = HORIZON  # number of steps of each planned rollout
+    limits: tuple[str, ...] = ()  # limits that the plans keep, as ``surrogym_shared.limits.limit_of`` reads them
 
     suggested_steps = 1
     resumable = False  # it computes its values anew from the latest model
@@ -29,7 +30,8 @@ class Planner(PolicySearch):
                 "algorithm PLANNER: expected no integral, because a planner corrects lasting disturbances itself, got "
                 f"{', '.join(settings.integral)}"
             )
-        planner = PlannerFile(_file_of(task.port).to_bytes(), self.horizon, settings.seed, settings.set_points)
+        file = _file_of(task.port).to_bytes()
+        planner = PlannerFile(file, self.horizon, settings.seed, settings.set_points, tuple(self.limits))
         task.progress(TrainProgress(0, 0, None, 0.0, stage="computes values on a grid"))
         try:
             predict = planner.acting()

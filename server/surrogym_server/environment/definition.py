@@ -349,7 +349,7 @@ class EnvironmentDefinition:
     @cached
     def _limits(self) -> LimitSet:
         assert self.limits is not None
-        return LimitSet.of(self.limits, self.coordinate_names, self.device)
+        return LimitSet.of(self.limits.keep, self.coordinate_names, self.device)
 
     @cached
     def _termination(self) -> Conditions:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from surrogym_server.environment.terms import TermSet, compile_terms
 from surrogym_server.tensors import CPU, to_device
-from surrogym_shared.spec import Limits, ends_of
+from surrogym_shared.spec import Limit, ends_of
 
 
 @dataclass(frozen=True)
@@ -23,10 +23,10 @@ class LimitSet:
     margin: Tensor  # (L,) a declared fallback action takes over if a term is closer than this to an end of its range
 
     @classmethod
-    def of(cls, declared: Limits, names: Sequence[str], device: torch.device = CPU) -> LimitSet:
+    def of(cls, keep: Sequence[Limit], names: Sequence[str], device: torch.device = CPU) -> LimitSet:
         """Compile limits over the C coordinates ``names`` on a device."""
-        terms = compile_terms([limit.term for limit in declared.keep], names)
-        rows = [(*ends_of(limit.low, limit.high), limit.margin) for limit in declared.keep]
+        terms = compile_terms([limit.term for limit in keep], names)
+        rows = [(*ends_of(limit.low, limit.high), limit.margin) for limit in keep]
         low, high, margin = torch.tensor(rows, dtype=torch.float64).T.contiguous().unbind()
         return to_device(cls(terms, low, high, margin), device)
 

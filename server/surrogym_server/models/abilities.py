@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TypeVar
 
 import numpy as np
@@ -341,6 +341,16 @@ class ArraySteps(ABC):
 
 
 @dataclass(frozen=True)
+class Avoided:
+    """Limits that plans keep. A step beyond them costs ``price`` times 1 plus its distance beyond them, as
+    ``environment.compiled.limits`` computes it from the tables ``numbers`` and ``places``."""
+
+    numbers: Floats = field(default_factory=lambda: np.zeros(0))
+    places: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 3), np.int64))  # of length 0: no limits
+    price: float = 0.0
+
+
+@dataclass(frozen=True)
 class GridPolicy:
     """A policy and its values at the S nodes of a grid of states, as ``compiled.grid`` describes it."""
 
@@ -351,6 +361,7 @@ class GridPolicy:
     choices: int  # number of discrete actions; 0 for continuous actions
     least: Floats  # (F,) smallest action
     most: Floats  # (F,) largest action
+    avoided: Avoided = field(default_factory=Avoided)
 
 
 class PlannedActions(ABC):

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from surrogym_server.environment.definition import EnvironmentDefinition
-from surrogym_server.models.abilities import ArraySteps, GridPolicy
+from surrogym_server.environment.safety import LimitSet
+from surrogym_server.models.abilities import ArraySteps, Avoided, GridPolicy
 from surrogym_shared.spec import MOST_PLANNED, BoxAction, DiscreteAction
 
 Floats = NDArray[np.float64]
@@ -22,11 +24,13 @@ MOST_ALONG = 201  # largest number of nodes along one coordinate
 LEVELS = {1: 5, 2: 3, 3: 3}  # number of values of each entry that value iteration tries, by the number of entries
 FINE = 100  # smallest number of nodes along each coordinate of a grid on which the values begin at an upper bound
 SWEEPS = 400  # largest number of sweeps of value iteration
+SHIFTED = 20  # number of sweeps after which all values are moved by a constant, for a policy that keeps limits
 SWEEPS_PER_CHOICE = 5  # the best actions are chosen again in one of this number of sweeps
 CHANGE = 1e-3  # value iteration stops once no value changes by more than this share of the range of the values
 # one minus the discount, as a share of one step of an episode, so that an episode's last reward counts almost in full
 DISCOUNTING = 0.04
 LONGEST_EPISODE = 1_000  # number of steps of an episode that has no time limit
+
 ROWS = 4_096  # number of steps that are predicted at once
 
 
@@ -43,43 +47,98 @@ class GridModel:
     # (S, A, C) state after the step; not a number where the episode ended, or where the fallback of limits would act
     q_next: Singles
     reward: Singles  # (S, A) reward of the step
+    # (S, A) how far the step leads beyond limits, as a share of the range of their terms; None without limits
+    beyond: Singles | None = None
 
     @classmethod
-    def of(cls, steps: ArraySteps, terminal_reward: float, nodes: int = NODES) -> Self:
+    def of(cls, steps: ArraySteps, terminal_reward: float, nodes: int = NODES, limits: LimitSet | None = None) -> Self:
         """Predict the steps.
 
         Args:
             steps: the model's compiled steps.
             terminal_reward: reward that steps that end the episode pay in addition.
             nodes: largest number of nodes.
+            limits: limits that the actions are to keep.
         """
         action = steps.definition.action
         assert isinstance(action, BoxAction | DiscreteAction)
         grid, (actions, levels) = _grid(steps.definition, nodes), _actions(action)
-        return cls(grid, actions, levels, *_transitions(steps, _nodes(*grid[:3]), actions, terminal_reward))
+        return cls(grid, actions, levels, *_transitions(steps, _nodes(*grid[:3]), actions, terminal_reward, limits))
 
     def policy(self, discount: float, reward: Singles | None = None, *, first: float = 0.0) -> GridPolicy:
         """Return the best policy by value iteration, for other rewards (S, A) than the model's if they are given.
         ``first`` is the value of each node before the first sweep."""
-        from surrogym_server.compiled.grid import choose, sweep
-
         paid = self.reward if reward is None else reward
-        values, best = np.full(len(paid), first), np.zeros(len(paid), dtype=np.int64)
-        for number in range(SWEEPS):
+        values = np.full(len(paid), first)
+        self._settle(values, discount, paid)
+        return self._greedy(values, discount, paid)
+
+    def within(self, plain: GridPolicy, price: float) -> GridPolicy:
+        """Return the best policy if each step beyond the limits costs ``price`` times 1 plus its distance beyond them.
+        ``plain`` is the best policy without limits."""
+        assert self.beyond is not None
+        paid = np.where(self.beyond > 0, self.reward - price * (1 + self.beyond), self.reward).astype(np.float32)
+        values, discount, least = plain.values.copy(), plain.discount, CHANGE * float(np.ptp(plain.values))
+        for _ in range(SWEEPS // SHIFTED):
+            if self._settle(values, discount, paid, SHIFTED, least):
+                break
+            # If the limits exclude where the plain policy stays, all values fall by about as much in each sweep, and
+            # thousands of sweeps would be needed. A sweep uses values that it has changed, so they fall by up to twice
+            # what the discount explains: hence the half.
+            before = values.copy()
+            self._settle(values, discount, paid, 2, least)
+            values += 0.5 * np.median(values - before) / 2 / (1 - discount)
+        return self._greedy(values, discount, paid)
+
+    def _settle(
+        self, values: Floats, discount: float, paid: Singles, sweeps: int = SWEEPS, least: float | None = None
+    ) -> bool:
+        """Update the values (S,) in place for rewards (S, A), until no value changes by more than ``least``, or than a
+        share of their range. Return whether this was reached within a number of sweeps."""
+        from surrogym_server.compiled.grid import sweep
+
+        best = np.zeros(len(paid), dtype=np.int64)
+        for number in range(sweeps):
             choosing = number % SWEEPS_PER_CHOICE == 0
             change = sweep(*self.grid, self.q_next, paid, discount, choosing, number % 2 == 0, values, best)
-            if choosing and change <= CHANGE * np.ptp(values):
-                break
+            if choosing and change <= (CHANGE * np.ptp(values) if least is None else least):
+                return True
+        return False
+
+    def _greedy(self, values: Floats, discount: float, paid: Singles) -> GridPolicy:
+        from surrogym_server.compiled.grid import choose
+
         table = np.empty((len(paid), self.actions.shape[1]))
         choose(*self.grid, self.q_next, paid, discount, values, self.levels, table)
         choices = 0 if len(self.levels) else len(self.actions)
         return GridPolicy(self.grid, values, table, discount, choices, self.actions.min(0), self.actions.max(0))
 
 
-def solve(steps: ArraySteps, terminal_reward: float, time_limit: int | None) -> GridPolicy:
-    """Return the policy with the highest return on a grid, for episodes of at most ``time_limit`` steps, if they have a
-    limit. ``terminal_reward`` is what steps that end the episode pay in addition."""
-    on_grid, discount = GridModel.of(steps, terminal_reward), discount_of(time_limit)
+def solve(
+    steps: ArraySteps, terminal_reward: float, time_limit: int | None, limits: LimitSet | None = None
+) -> GridPolicy:
+    """Return the policy with the highest return on a grid.
+
+    Args:
+        steps: the model's compiled steps.
+        terminal_reward: reward that steps that end the episode pay in addition.
+        time_limit: largest number of steps of an episode, if there is one.
+        limits: limits that the policy keeps. A step beyond them costs as much as the rewards of a whole episode can
+            differ, and more with the distance, so no reward makes up for it.
+    """
+    on_grid, discount = GridModel.of(steps, terminal_reward, limits=limits), discount_of(time_limit)
+    plain = _solved(on_grid, discount)
+    if limits is None or on_grid.beyond is None:
+        return plain
+    least = on_grid.reward.min(where=~np.isnan(on_grid.q_next[:, :, 0]), initial=0.0)  # of steps that go on
+    price = float(on_grid.reward.max() - least or 1.0) * (time_limit or LONGEST_EPISODE)
+    kept = on_grid.within(plain, price)
+    from surrogym_server.environment.compiled.limits import tables_of
+
+    return replace(kept, avoided=Avoided(*tables_of(limits, _range_of(limits, _nodes(*on_grid.grid[:3]))), price))
+
+
+def _solved(on_grid: GridModel, discount: float) -> GridPolicy:
     if on_grid.grid[2].min() < FINE:
         return on_grid.policy(discount)
     # Thousands of sweeps would be needed to raise the values from 0 to those of an endless episode. Until then they
@@ -138,9 +197,18 @@ def _actions(action: BoxAction | DiscreteAction) -> tuple[Floats, Floats]:
     return np.array(list(itertools.product(*levels))), np.ascontiguousarray(levels)
 
 
-def _transitions(steps: ArraySteps, nodes: Floats, actions: Floats, terminal_reward: float) -> tuple[Singles, Singles]:
-    """Return the states (S, A, C) after one step from each of the nodes (S, C) with each of the actions (A, F), and its
-    rewards (S, A). The states are not a number where the episode ended.
+def _range_of(limits: LimitSet, nodes: Floats) -> Tensor:
+    """Return the range of the term of each of L limits over the nodes (S, C) of a grid, (L,)."""
+    values = limits.terms(torch.from_numpy(nodes))
+    return (values.amax(0) - values.amin(0)).clamp(min=1e-12)
+
+
+def _transitions(
+    steps: ArraySteps, nodes: Floats, actions: Floats, terminal_reward: float, limits: LimitSet | None
+) -> tuple[Singles, Singles, Singles | None]:
+    """Return the states (S, A, C) after one step from each of the nodes (S, C) with each of the actions (A, F), its
+    rewards (S, A), and how far it leads beyond ``limits`` (S, A), None without them. The states are not a number where
+    the episode ended.
 
     As in virtual episodes, an episode also ends where the fallback of declared limits would act, and gets the least
     reward, or 0 if that is less, for each missing step.
@@ -149,6 +217,8 @@ def _transitions(steps: ArraySteps, nodes: Floats, actions: Floats, terminal_rew
     q_next = np.empty((len(nodes), count, nodes.shape[1]), dtype=np.float32)
     reward = np.empty((len(nodes), count), dtype=np.float32)
     left = np.zeros((len(nodes), count), dtype=bool)
+    beyond = None if limits is None else np.empty_like(reward)
+    unit = None if limits is None else _range_of(limits, nodes)
     for begin in range(0, len(nodes), ROWS):
         q = np.repeat(nodes[begin : begin + ROWS], count, axis=0)
         u = np.tile(actions, (len(q) // count, 1))
@@ -158,5 +228,8 @@ def _transitions(steps: ArraySteps, nodes: Floats, actions: Floats, terminal_rew
         q_next[begin : begin + ROWS] = arrived.reshape(-1, count, nodes.shape[1])
         reward[begin : begin + ROWS] = (moved.reward + terminal_reward * moved.terminated).reshape(-1, count)
         left[begin : begin + ROWS] = over.reshape(-1, count)
+        if limits is not None and beyond is not None and unit is not None:
+            far = (limits.margin - limits.room(torch.from_numpy(moved.q_next))) / unit
+            beyond[begin : begin + ROWS] = far.amax(-1).clamp(min=0).numpy().reshape(-1, count)
     lost = reward.min(where=~left, initial=0.0) / (1 - discount_of(definition.time_limit))
-    return q_next, np.where(left, np.float32(lost), reward)
+    return q_next, np.where(left, np.float32(lost), reward), beyond

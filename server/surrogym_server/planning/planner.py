@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,11 +12,13 @@ from numpy.typing import NDArray
 
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.observation_inverse import ObservationInverse
+from surrogym_server.environment.safety import LimitSet
 from surrogym_server.errors import InvalidInput
 from surrogym_server.models.abilities import ArraySteps, CompiledSteps, GridPolicy, PlannedActions, offers
 from surrogym_server.models.port import DynamicsModel, with_set_points
 from surrogym_server.planning.grid import at_nearest_node, solve, unfit
 from surrogym_shared.spec import BoxAction
+from surrogym_shared.spec.safety import Limit
 
 Floats = NDArray[np.float64]
 
@@ -37,7 +39,11 @@ GAIN = 0.1  # share of the error of such a step by which the estimate changes, s
 
 
 def planner_of(
-    model: DynamicsModel, horizon: int, seed: int = 0, set_points: Mapping[str, float] | None = None
+    model: DynamicsModel,
+    horizon: int,
+    seed: int = 0,
+    set_points: Mapping[str, float] | None = None,
+    limits: Sequence[Limit] = (),
 ) -> Planner:
     """Return a planner on a model, after value iteration on a grid, which takes some seconds.
 
@@ -46,6 +52,7 @@ def planner_of(
         horizon: number of steps of each rollout.
         seed: seed of the changes of actions that the planner tries.
         set_points: values of coordinates, in the place of those that the declared reward measures errors from.
+        limits: limits that the planner keeps besides those of the specification.
 
     Raises:
         InvalidInput: the horizon is out of its range, the reward or the model does not support a set point, or the
@@ -55,7 +62,8 @@ def planner_of(
         raise InvalidInput(f"horizon: expected a whole number of steps from 1 to {MOST_HORIZON}, got {horizon!r}")
     model = with_set_points(model, tuple((set_points or {}).items()))
     inverse, able, steps = _requirements(model)
-    policy = solve(steps, model.terminal_reward, model.definition.time_limit)
+    kept = LimitSet.of(limits, model.definition.coordinate_names) if limits else None
+    policy = solve(steps, model.terminal_reward, model.definition.time_limit, kept)
     return Planner(model.definition, inverse, able, policy, horizon, seed)
 
 
@@ -134,9 +142,13 @@ class Planner:
         self._states, self._offsets = self._arrived, self._arrived
 
     def __call__(self, observations: NDArray[np.floating[Any]]) -> NDArray[Any]:
-        shown = torch.from_numpy(np.asarray(observations, dtype=np.float64))
-        actions = self.from_states(self.inverse(shown, shown.new_zeros(len(shown), len(self._span))).numpy())
+        actions = self.from_states(self.states(observations))
         return actions[:, 0].astype(np.int64) if self.policy.choices else actions
+
+    def states(self, observations: NDArray[np.floating[Any]]) -> Floats:
+        """Return the states (N, C) that observations (N, D) show."""
+        shown = torch.from_numpy(np.asarray(observations, dtype=np.float64))
+        return self.inverse(shown, shown.new_zeros(len(shown), len(self._span))).numpy()
 
     def from_states(self, q: Floats) -> Floats:
         """Return the actions (N, F) for states q (N, C). A discrete action is given by its number.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import zipfile
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -22,7 +24,16 @@ from surrogym_server.errors import InvalidInput
 from surrogym_server.local import LocalSurrogate
 from surrogym_server.planning import planner_of
 from surrogym_server.planning.grid import GridModel, _nodes, solve
-from surrogym_shared.spec import DeclaredReward, EnvironmentSpec, Limits, Quantity, RewardTerm, Term, with_history
+from surrogym_shared.spec import (
+    DeclaredReward,
+    EnvironmentSpec,
+    Limits,
+    Quantity,
+    RewardTerm,
+    Term,
+    Uniform,
+    with_history,
+)
 from surrogym_trainer.deployment.controller import NotDeployable
 from surrogym_trainer.deployment.reading import controller_of
 from surrogym_trainer.evaluation import imagined_returns
@@ -254,6 +265,51 @@ def test_a_set_point_at_run_time_plans_as_a_model_with_a_specification_of_it(tmp
     with pytest.raises(ValueError, match="set point 'speed': expected a number in the sampling range"):
         train(plain, tmp_path / "far.zip", far)
     assert not (tmp_path / "far.zip").exists()
+
+
+STEP = np.array([[1.0, 0.1, 0.05], [0.0, 1.0, 0.5]])  # of the cart of tests/support/limited.py
+
+
+def way_of(planner) -> np.ndarray:
+    """The states (T + 1, C) of an episode of the cart with a planner from rest."""
+    path = [np.zeros(2)]
+    for _ in range(40):
+        path.append(STEP @ np.concatenate([path[-1], planner.from_states(path[-1][None])[0]]))
+    return np.array(path)
+
+
+def test_a_planner_keeps_limits_at_run_time_that_its_reward_contradicts(tmp_path):
+    free, limits = cart(None), ("x<=0.8", "0.1*x+v<=0.5")
+    plain, kept = way_of(free.planner(10, 3)), way_of(free.planner(10, 3, limits=limits))
+    assert plain[:, 0].max() > 1.2
+    assert plain[:, 1].max() > 1
+    assert 0.6 < kept[:, 0].max() <= 0.8
+    assert 0.3 < (kept @ [0.1, 1.0]).max() <= 0.5
+    both = way_of(cart(limited.LIMITS).planner(10, 3, limits=["x<=0.3"]))
+    assert 0.2 < both[:, 0].max() <= 0.3, "besides those of the specification"
+
+    settings = TrainSettings(algorithm="planner", seed=3, hyperparameters={"horizon": 10, "limits": list(limits)})
+    result = train(free, tmp_path / "planner.zip", settings)
+    assert way_of(load_policy(result.path)).tolist() == kept.tolist()
+    assert read_card(result.path).limits == limits
+    with zipfile.ZipFile(result.path) as file:
+        assert json.loads(file.read("surrogym-planner.json"))["version"] == 2, "others would not keep the limits"
+
+
+@pytest.mark.parametrize(
+    ("limit", "said"),
+    [
+        ("speed<=0.5", "expected every start to be inside by at least 0.16"),
+        ("speed<=2", r"but each of 4 virtual episodes left it, by up to [0-9.]+: choose a wider limit"),
+    ],
+)
+def test_a_limit_that_can_not_be_kept_is_refused_and_leaves_no_file(hanging: LocalSurrogate, tmp_path, limit, said):
+    starts = {"theta": Uniform(low=1.4, high=1.6), "speed": Uniform(low=0.4, high=0.6)}
+    falling = LocalSurrogate.from_bytes(hanging.spec().model_copy(update={"start": starts}), hanging.model_file())
+    settings = TrainSettings(algorithm="planner", hyperparameters={"limits": [limit]})
+    with pytest.raises(ValueError, match=f"PLANNER: limit '{limit}': .*{said}"):
+        train(falling, tmp_path / "planner.zip", settings)
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_planner_that_can_not_be_made_leaves_no_file(hanging: LocalSurrogate, tmp_path):

@@ -195,7 +195,8 @@ def command(
     summary |= {"promise_kept": None if elsewhere else _kept(expected, result)}
     summary |= {"version": version, "disagreements": found and found.as_json()}
     summary |= {} if filmed is None else {"video": str(filmed)}
-    more = _aimed(card) if result.limits is None else [*_aimed(card), result.limits.words()]
+    more = [*_aimed(card), *_planned_limits(card, result)]
+    more += [] if result.limits is None else [result.limits.words()]
     if result.limits is not None and promise is not None and promise.fallback is not None and not elsewhere:
         more.append(result.limits.expected(promise.fallback.low, promise.fallback.high))
     more += [*elsewhere, *(found.in_words(card.spec) if found else [])]
@@ -217,6 +218,21 @@ def _aimed(card: PolicyCard) -> list[str]:
             "the policy's card has no specification by which to compute them"
         ]
     return [f"returns are for the set point {points}, by the declared reward of the policy's card"]
+
+
+def _planned_limits(card: PolicyCard, result: Evaluation) -> list[str]:
+    """Return how real episodes kept each limit that was given to a planner."""
+    from surrogym_shared.limits import distances, limit_of
+
+    if card.spec is None:
+        return []
+    lines = []
+    for text in card.limits:
+        keep = [limit_of(card.spec, text)]
+        least = [float(distances(card.spec, keep, trace.coordinates).min()) for trace in result.traces]
+        left, nearest = sum(one < 0 for one in least), min(least)
+        lines.append(f"limit {text}: {left} of {counted(len(least), 'episode')} left it; least distance {nearest:.4g}")
+    return lines
 
 
 def _named(env: str | None, card: PolicyCard) -> str:

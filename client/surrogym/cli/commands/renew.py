@@ -272,8 +272,8 @@ class _Renewal:
         return design.model_copy(update={"budget": budget, "initial": initial})
 
     def train(self, out: Path, update: Update, check: Callable[[], object]) -> Handover:
-        """Wait for the design, train a policy from the network of the old one with its set points and integrals, audit
-        it and store it.
+        """Wait for the design, train a policy from the network of the old one with its set points, integrals
+        and limits, audit it and store it.
 
         Args:
             out: file for the policy.
@@ -304,8 +304,13 @@ class _Renewal:
         with TemporaryDirectory() as folder, HttpSurrogate(self.api.url, self.target, self.token) as http:
             port = with_integrals(http, integral, self._aimed().get("set_points", {}))
             start = self._network(Path(folder) / "old.zip", port)
+            limits = self.old.settings.get("limits")  # of a planner
             settings = TrainSettings(
-                algorithm=self._algorithm(), start_from=start, integral=integral, session=self._aimed()
+                algorithm=self._algorithm(),
+                start_from=start,
+                integral=integral,
+                session=self._aimed(),
+                hyperparameters={"limits": limits} if limits else {},
             )
             training = AuditedTraining(
                 self.api, self.target, port, out, settings, audit=AuditSettings(), progress=record, waiting=look

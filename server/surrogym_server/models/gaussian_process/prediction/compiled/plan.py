@@ -7,6 +7,7 @@ from numba import types
 from numpy.typing import NDArray
 
 from surrogym_server.compiled.grid import GRID, interpolated, locate, policy_action
+from surrogym_server.environment.compiled.limits import beyond
 from surrogym_server.models.gaussian_process.prediction.compiled.regions import judge
 from surrogym_server.models.gaussian_process.prediction.compiled.step import step
 from surrogym_shared.compiled.jit import entry
@@ -32,6 +33,9 @@ KEEP = -2.0  # in the changes of a discrete action: the action of the best plan 
     types.float64[::1],
     types.float64[::1],
     types.float64[::1],
+    types.int64[:, ::1],
+    types.float64,
+    types.float64[::1],
     types.float64[:, ::1],
     types.float64[:, :, :, ::1],
     types.int64,
@@ -55,6 +59,9 @@ def plan(
     choices: int,
     least: Floats,
     most: Floats,
+    limit_numbers: Floats,
+    limit_places: Ints,
+    price: float,
     start: Floats,
     known: Floats,
     changes: Floats,
@@ -78,6 +85,9 @@ def plan(
         discount: factor of later rewards.
         choices: number of discrete actions; 0 for continuous actions.
         least, most: (F,) smallest and largest action.
+        limit_numbers, limit_places: tables of limits, as in ``environment.compiled.limits``; none if there are no
+            places.
+        price: cost of a step beyond limits, in addition to as much for each unit of the distance beyond them.
         start: (C,) state.
         known: (N, columns) numbers to add to the model's outputs at each step, or (0, 0), as in ``step.step``.
         changes: (R, N, T, F) changes to try. Continuous ones are added to the mean of the ``elite`` best plans of the
@@ -122,6 +132,11 @@ def plan(
             step(numbers, places, q, u, none, none, none, known, False, False, q_next, reward, std, over, none)
             if has_regions:
                 judge(numbers, places, q, q_next, entries, False, reward, std, over)
+            if len(limit_places):
+                far = beyond(limit_numbers, limit_places, q_next)
+                for i in range(lanes):
+                    if far[i] > 0:
+                        reward[i] -= price * (1 + far[i])
             for i in range(lanes):
                 if t == 0:
                     first[i], reached[i] = u[i], q_next[i]
