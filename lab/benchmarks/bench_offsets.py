@@ -2,6 +2,7 @@
 
     python lab/benchmarks/bench_offsets.py --plants tanks reactor --seeds 345 346
     python lab/benchmarks/bench_offsets.py --plants tanks --seeds 347 348 --set-points
+    python lab/benchmarks/bench_offsets.py --seeds 372 373 --limits
     python lab/benchmarks/bench_offsets.py --plants rotary --seeds 347 348
     python lab/benchmarks/bench_offsets.py --plants tanks --seeds 353 354 --integral
 
@@ -19,6 +20,9 @@ the error.
 With ``--set-points`` the specification declares the reward, and the plants stay as they were learned. For each of two
 other set points a planner on the model gets it at run time, and a policy is trained in the same model with a
 specification of this set point. Returns are those of the reward with this set point.
+
+With ``--limits`` a planner gets a limit at run time that its best way leaves, in the plant as learned and in changed
+ones. Rows have the share of steps beyond the limit, and the least distance from it, negative beyond it.
 """
 
 from __future__ import annotations
@@ -48,6 +52,7 @@ from surrogym_sampler.original.episodes import RolloutEpisode
 from surrogym_sampler.original.rollouts import FromReset
 from surrogym_server.local import LocalSurrogate
 from surrogym_server.planning import planner_of
+from surrogym_shared.limits import distances, limit_of
 from surrogym_shared.set_points import with_set_points
 from surrogym_shared.spec import DeclaredReward, EnvironmentSpec, Quantity, RewardTerm, Term
 from surrogym_trainer.evaluation.evaluator import EvaluationSettings, evaluate
@@ -70,6 +75,7 @@ class Plant:
     width: float  # error at which the reward is exp(-1/2)
     off: float  # action at which the actuator does nothing
     others: tuple[float, ...]  # other set points
+    limited: tuple[float, str]  # a set point, and a limit that the best way to it leaves
 
     @property
     def name(self) -> str:
@@ -88,8 +94,8 @@ class Plant:
 
 
 PLANTS = {
-    "tanks": Plant(TANKS, 1, 0.0, 1.0, -1.0, (-4.0, 4.0)),
-    "reactor": Plant(REACTOR, 0, 0.42, 0.1, 0.0, (0.35, 0.5)),
+    "tanks": Plant(TANKS, 1, 0.0, 1.0, -1.0, (-4.0, 4.0), (4.0, "upper<=6")),
+    "reactor": Plant(REACTOR, 0, 0.42, 0.1, 0.0, (0.35, 0.5), (0.42, "temperature+40*concentration<=23")),
 }
 CHANGES = {"as learned": (1.0, 0.0), "20 % weaker": (0.8, 0.0), "offset of 5 %": (1.0, 0.1)}  # factor, offset
 
@@ -115,8 +121,8 @@ def trained(model: LocalSurrogate, seed: int, integral: tuple[str, ...] = ()) ->
         return acting_with_integrals(load_policy(result.path, SEARCH), model.spec(), integral, {})
 
 
-def measured(plant: Plant, acts: Acting, change: str, seed: int) -> tuple[float, float]:
-    """Return the mean steady error and the mean return of the episodes."""
+def measured(plant: Plant, acts: Acting, change: str, seed: int) -> tuple[float, float, Array]:
+    """Return the mean steady error, the mean return, and the states (T, N, C) after the T steps of the N episodes."""
     factor, offset = CHANGES[change]
     formula: Callable[[Array, Array, Parameters], tuple[Array, Array]] = plant.machine.formula
 
@@ -126,7 +132,7 @@ def measured(plant: Plant, acts: Acting, change: str, seed: int) -> tuple[float,
     machine = replace(plant.machine, formula=changed, noise=0.0)
     rng = np.random.default_rng([seed, 77])
     low, high = np.array(list(machine.start.values())).T
-    q, total, errors = rng.uniform(low, high, (EPISODES, len(low))), np.zeros(EPISODES), []
+    q, total, path = rng.uniform(low, high, (EPISODES, len(low))), np.zeros(EPISODES), []
     numbers = [next(NUMBERS) for _ in range(EPISODES)]
     for _ in range(machine.time_limit):
         shown = machine.observe(q)
@@ -134,9 +140,10 @@ def measured(plant: Plant, acts: Acting, change: str, seed: int) -> tuple[float,
         u = np.asarray(chosen, dtype=float).reshape(EPISODES, -1)
         total += plant.reward(q)
         q = machine.step(q, u, machine.real, rng)[0]
-        errors.append(q[:, plant.coordinate] - plant.target)
-    steady = np.abs(np.mean(errors[-LAST:], axis=0))
-    return float(steady.mean()), float(total.mean())
+        path.append(q)
+    states = np.array(path)
+    steady = np.abs(np.mean(states[-LAST:, :, plant.coordinate] - plant.target, axis=0))
+    return float(steady.mean()), float(total.mean()), states
 
 
 def at_set_points(name: str, seed: int) -> None:
@@ -149,8 +156,22 @@ def at_set_points(name: str, seed: int) -> None:
         policies: dict[str, Acting] = {"planner": model.planner(HORIZON, set_points=points)}
         policies["trained"] = trained(own, seed)
         for policy, acts in policies.items():
-            error, total = measured(aimed, acts, "as learned", seed)
+            error, total, _ = measured(aimed, acts, "as learned", seed)
             print(f"| {name} | {seed} | {target:g} | {policy} | {error:.2g} | {total:.3g} |", flush=True)
+
+
+def at_limits(name: str, seed: int) -> None:
+    """Print a row for each change of a plant, without and with a limit."""
+    plant = PLANTS[name]
+    model, (target, limit) = learned(plant, seed, plant.declared()), plant.limited
+    keep = [limit_of(model.spec(), limit)]
+    for limits in ((), (limit,)):
+        acts = model.planner(HORIZON, set_points={plant.name: target}, limits=limits)
+        for change in CHANGES:
+            error, total, states = measured(replace(plant, target=target), acts, change, seed)
+            room = distances(model.spec(), keep, states.reshape(-1, states.shape[2]))
+            kept = f"{', '.join(limits) or 'none'} | {100 * (room < 0).mean():.2g} % | {room.min():.3g}"
+            print(f"| {name} | {seed} | {change} | {kept} | {error:.2g} | {total:.3g} |", flush=True)
 
 
 class WeakerRotary(Rotary):
@@ -215,10 +236,20 @@ def main() -> None:
     options.add_argument("--seeds", nargs="+", type=int, default=[345, 346])
     options.add_argument("--no-training", action="store_true", help="planners alone")
     options.add_argument("--set-points", action="store_true", help="other set points, in the plant as learned")
+    options.add_argument("--limits", action="store_true", help="planners with a limit at run time")
     options.add_argument("--integral", action="store_true", help="also a policy that sees the integral of the error")
     given = options.parse_args()
-    if "rotary" in given.plants and given.set_points:
-        options.error("the rotary pendulum has no rows of other set points: leave it out")
+    if "rotary" in given.plants and (given.set_points or given.limits):
+        options.error("the rotary pendulum has no rows of other set points or limits: leave it out")
+    if given.limits:
+        print(
+            f"| plant | seed | change | limit | beyond | least distance | steady error | return |\n{'|---' * 8}|",
+            flush=True,
+        )
+        for name in given.plants:
+            for seed in given.seeds:
+                at_limits(name, seed)
+        return
     if given.set_points:
         print("| plant | seed | set point | policy | steady error | return |\n|---|---|---|---|---|---|", flush=True)
         for name in given.plants:
@@ -240,7 +271,7 @@ def main() -> None:
                 policies["trained, integral"] = trained(model, seed, (plant.name,))
             for policy, acts in policies.items():
                 for change in CHANGES:
-                    error, total = measured(plant, acts, change, seed)
+                    error, total, _ = measured(plant, acts, change, seed)
                     print(f"| {name} | {seed} | {policy} | {change} | {error:.2g} | {total:.3g} |", flush=True)
 
 

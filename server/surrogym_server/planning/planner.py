@@ -17,8 +17,7 @@ from surrogym_server.errors import InvalidInput
 from surrogym_server.models.abilities import ArraySteps, CompiledSteps, GridPolicy, PlannedActions, offers
 from surrogym_server.models.port import DynamicsModel, with_set_points
 from surrogym_server.planning.grid import at_nearest_node, solve, unfit
-from surrogym_shared.spec import BoxAction
-from surrogym_shared.spec.safety import Limit
+from surrogym_shared.spec import BoxAction, Limit
 
 Floats = NDArray[np.float64]
 
