@@ -487,7 +487,7 @@ def run(machine: str, seed: int, *, limited: bool, policy: bool) -> Row:
         _left(judged, result),
         share,
         fell_back,
-        float("nan") if fallback is None else fallback.median,
+        float("nan") if fallback is None or fallback.mean is None else fallback.mean,
         _left(judged, elsewhere),
     )
 

@@ -113,6 +113,12 @@ def nearest(spec: EnvironmentSpec, coordinates: Array) -> tuple[Limit, float]:
     return limits_of(spec).keep[index], float(every[index])
 
 
+def words_of_fallbacks(expected: float, low: float, high: float) -> str:
+    """Say in which share of the episodes of a policy the fallback is expected, with the interval of the share."""
+    interval = f"{100 * low:.2g} to {100 * high:.2g} %"
+    return f"the fallback is expected in {100 * expected:.2g} % of the episodes ({interval}), so no more leave a limit"
+
+
 def left_too_often(left: int, episodes: int, share: float, level: float) -> bool:
     """Return whether more of the ``episodes`` left a limit (``left`` of them) than the allowed ``share`` explains:
     an exact one-sided binomial test with the significance level ``level``."""

@@ -18,7 +18,7 @@ from support.server import ServerProcess
 from surrogym_client.transport import Api
 from surrogym_sampler.original.classic import cartpole, pendulum
 from surrogym_shared import wire
-from surrogym_shared.wire.policies import AddDrift
+from surrogym_shared.wire.policies import AddDrift, PolicyFallback
 from surrogym_trainer.evaluation.evaluator import Evaluation, Trace
 from surrogym_trainer.evaluation.videos import record
 
@@ -67,6 +67,15 @@ def test_the_dashboard_shows_promised_and_real_return_of_a_policy(url: str, open
     part.get_by_role("button", name="Make it production").click()
     expect(part.locator("summary").first).to_contain_text("production")
     assert complaints == []
+
+
+def test_the_dashboard_shows_the_expected_share_of_episodes_with_a_fallback(url: str, open_page: Open):
+    share = PolicyFallback(mean=0.031, median=0.0, low=0.0, high=0.09)
+    with Api(url) as api:
+        promise = wire.PolicyPromise(median=-150, low=-170, high=-130, fallback=share)
+        store(api, "bare", seed=1, mean=-150, promise=promise)
+    said = "the fallback is expected in 3.1 % of the episodes (0 % to 9 %), so no more leave a limit"
+    expect(open_page(f"{url}/#/s/bare").locator("#policies summary").first).to_contain_text(said)
 
 
 def test_the_dashboard_shows_drift_as_soon_as_it_is_reported(url: str, open_page: Open, complaints: list[str]):

@@ -123,9 +123,21 @@ def test_without_limits_a_promise_says_nothing_about_a_fallback():
 def test_a_fallback_that_no_virtual_episode_shows_is_expected_in_at_most_the_share_that_could_be_missed():
     never = fallback_share(np.zeros((STARTS, FUNCTIONS), dtype=bool))
     assert (never.low, never.median) == (0.0, 0.0)
-    assert (1 - never.high) ** (STARTS * FUNCTIONS) == pytest.approx(0.05)
+    assert (1 - never.high) ** FUNCTIONS == pytest.approx(0.05)
     always = fallback_share(np.ones((STARTS, FUNCTIONS), dtype=bool))
     assert (always.low, always.median, always.high) == (pytest.approx(1 - never.high), 1.0, 1.0)
+
+
+@pytest.mark.parametrize(("bad", "all_or_nothing"), [(1, True), (1, False), (FUNCTIONS - 1, True)])
+def test_the_interval_of_a_share_contains_its_mean_if_all_fallbacks_are_along_few_functions(
+    bad: int, all_or_nothing: bool
+):
+    fallen = np.zeros((STARTS, FUNCTIONS), dtype=bool)
+    fallen[: None if all_or_nothing else 1, :bad] = True
+    share = fallback_share(fallen)
+    assert share.mean == fallen.mean()
+    assert share.low <= fallen.mean() <= share.high
+    assert f"expected in {100 * fallen.mean():.2g} % of the episodes" in share.words()
 
 
 @pytest.mark.parametrize("share", [0.02, 0.2, 0.6])

@@ -17,6 +17,7 @@ from support.server import ServerProcess
 from surrogym_client.transport import Api
 from surrogym_shared import wire
 from surrogym_shared.spec import Inequality, Success, Term
+from surrogym_shared.wire.policies import PolicyFallback
 from surrogym_trainer.coverage import Cut
 from surrogym_trainer.policies.evidence import chosen_real
 from surrogym_trainer.report.decision import cost, criterion, decision, original, outcome, share
@@ -294,6 +295,13 @@ def test_the_report_of_an_unevaluated_policy_tells_how_to_evaluate(modelled: Kno
     assert "has not been tested in the original environment" in parts[""]
     assert parts["Was it predicted?"] == "Nothing was predicted."
     assert "surrogym evaluate policy.zip --compare zero" in parts["What to do next"]
+
+
+def test_the_report_shows_the_expected_share_of_episodes_with_a_fallback(modelled: Known):
+    share = PolicyFallback(mean=0.031, median=0.0, low=0.0, high=0.09)
+    promise = wire.PolicyPromise(median=-151.9, low=-169.8, high=-134.0, fallback=share)
+    said = told(replace(modelled, policy=policy(promise=promise)))["Was it predicted?"]
+    assert "the fallback is expected in 3.1 % of the episodes (0 to 9 %), so no more leave a limit" in said
 
 
 def test_the_report_shows_numbers_although_episode_traces_are_missing(modelled: Known):

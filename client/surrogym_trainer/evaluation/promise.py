@@ -63,18 +63,20 @@ def fallback_share(fallen: NDArray[np.bool_]) -> FallbackShare:
     """Predict the share of 100 real episodes in which the fallback of declared limits will act.
 
     The function ``interval`` computes the prediction, with 1 as the return of a virtual episode in which the fallback
-    acts, and 0 as that of any other. If no virtual episode has a fallback, or all have one, the interval ends at the
-    exact one-sided 95 % bound.
+    acts, and 0 as that of any other. Often all episodes along one function have a fallback and those along the others
+    none. Then the quantiles say little, so the interval always contains the mean. If no virtual episode has a fallback,
+    or all have one, the interval ends at the exact one-sided 95 % bound of the share of such functions.
 
     Args:
         fallen: mask (starts, functions) of the virtual episodes in which the fallback acts.
     """
     share = interval(fallen.astype(np.float64))
-    # share of episodes with a fallback at which, with a probability of 5 %, all ``fallen.size`` episodes have none
-    bound = 1 - (1 - HIGH) ** (1 / fallen.size)
-    high = max(share.high, bound) if not fallen.any() else share.high
-    low = min(share.low, 1 - bound) if fallen.all() else share.low
-    return FallbackShare(median=share.median, low=low, high=high)
+    mean = float(fallen.mean())
+    # share of functions with a fallback at which, with a probability of 5 %, none of those drawn has one
+    bound = 1 - (1 - HIGH) ** (1 / fallen.shape[1])
+    high = max(share.high, mean, bound if not fallen.any() else 0.0)
+    low = min(share.low, mean, 1 - bound if fallen.all() else 1.0)
+    return FallbackShare(mean=mean, median=share.median, low=low, high=high)
 
 
 def interval(returns: Array, floor: float | None = None) -> Promise:

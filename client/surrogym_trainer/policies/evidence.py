@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from pydantic import BaseModel, ConfigDict
 
 from surrogym_shared.kinds import Side
+from surrogym_shared.limits import words_of_fallbacks
 
 if TYPE_CHECKING:
     from surrogym_shared.wire import EvaluationView, PolicyView
@@ -16,10 +17,13 @@ if TYPE_CHECKING:
 class FallbackShare(BaseModel):
     """The predicted share of 100 real episodes in which the fallback of declared limits acts.
 
+    An episode that leaves a limit has a fallback, too, so no larger share of the episodes is expected to leave one.
+
     Attributes:
         median: median of the prediction.
-        low: its 5 % quantile.
-        high: its 95 % quantile.
+        low: its 5 % quantile, or the mean if that is less.
+        high: its 95 % quantile, or the mean if that is more.
+        mean: mean of the prediction, the expected share; None in older cards.
     """
 
     model_config = ConfigDict(frozen=True, extra="ignore")
@@ -27,10 +31,11 @@ class FallbackShare(BaseModel):
     median: float
     low: float
     high: float
+    mean: float | None = None
 
     def words(self) -> str:
-        """Return the interval in words."""
-        return f"the fallback is expected in {100 * self.low:.2g} to {100 * self.high:.2g} % of the episodes"
+        """Return the expected share and the interval in words."""
+        return words_of_fallbacks(self.median if self.mean is None else self.mean, self.low, self.high)
 
 
 class Promise(BaseModel):

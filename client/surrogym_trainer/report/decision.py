@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from surrogym_client.surrogates.advice import advice, verdict
 from surrogym_sampler.original.loading import env_option, is_known, sample_command
 from surrogym_shared import intervals
+from surrogym_shared.limits import words_of_fallbacks
 from surrogym_shared.spec import (
     Coordinate,
     EnvironmentSpec,
@@ -539,6 +540,9 @@ def prediction(known: Known) -> str:
     said = ["Nobody judged the prediction."]
     if policy.trusted is not None:
         said = [f"The prediction was {'trusted' if policy.trusted else 'not trusted'}: {policy.reason}."]
+    if (share := promise.fallback) is not None:
+        expected = share.median if share.mean is None else share.mean
+        said.append(f"Limits: {words_of_fallbacks(expected, share.low, share.high)}.")
     found = outcome_of(known)
     if found is None or real is None:
         said.append("It has not been compared with reality from the same kind of starts.")

@@ -42,9 +42,15 @@ export function sentence(policy) {
   return `${outcome(policy)}${policy.trusted === false ? ` Not trusted: ${policy.reason}.` : ""}`;
 }
 
+/** An episode that leaves a limit has a fallback, too. */
+function fallbacks({ fallback }) {
+  if (!fallback) return "";
+  return `; the fallback is expected in ${percent(fallback.mean ?? fallback.median)} of the episodes (${percent(fallback.low)} to ${percent(fallback.high)}), so no more leave a limit`;
+}
+
 function outcome(policy) {
   const [real, { promise }] = [realOf(policy), policy];
-  const said = promise ? `Promised ${number(promise.low)} to ${number(promise.high)}` : "No promise";
+  const said = promise ? `Promised ${number(promise.low)} to ${number(promise.high)}${fallbacks(promise)}` : "No promise";
   if (!real) return `${said}; no real episodes from the declared starts yet.`;
   const unjudged = promise ? ": too few to judge the promise" : "";
   const kept = real.promise_kept === null ? unjudged : real.promise_kept ? ": the promise was kept" : ": the promise was broken";

@@ -38,6 +38,7 @@ class PolicyFallback(BaseModel):
     median: float = Field(description="median of the predicted share, from 0 to 1")
     low: float = Field(description="5 % quantile of the predicted share")
     high: float = Field(description="95 % quantile of the predicted share")
+    mean: float | None = Field(default=None, description="expected share; null in older policies")
 
 
 class PolicyPromise(BaseModel):

@@ -222,6 +222,7 @@ def _from_zip(content: bytes, form: str, algorithm: str) -> bytes:
 
 
 def _words(name: str, policy: PolicyDetail) -> str:
+    from surrogym_shared.limits import words_of_fallbacks
     from surrogym_trainer.policies.card import set_points_in, words_of_set_points
 
     aliases = f", {', '.join(policy.aliases)}" if policy.aliases else ""
@@ -241,9 +242,8 @@ def _words(name: str, policy: PolicyDetail) -> str:
         between = f"between {promise.low:.4g} and {promise.high:.4g} with 90 % chance"
         lines.append(f"promise: mean return {promise.median:.4g}, {between}; {trusted}: {policy.reason or '-'}")
         if (fallback := promise.fallback) is not None:
-            lines.append(
-                f"fallback of the limits: expected in {fallback.low:.2%} to {fallback.high:.2%} of the episodes"
-            )
+            expected = fallback.median if fallback.mean is None else fallback.mean
+            lines.append(f"limits: {words_of_fallbacks(expected, fallback.low, fallback.high)}")
     if policy.differs:
         lines.append(f"made for another specification: it differs in {policy.differs}")
     files = [f"{one.form} {one.bytes} bytes" if one.stored else f"{one.form} missing" for one in policy.files]
