@@ -12,6 +12,7 @@ import pytest
 from support.models import learn
 from support.real_steps import random_steps
 from surrogym.cli.commands import train
+from surrogym.cli.errors import CommandError
 from surrogym_sampler.original.classic import pendulum
 from surrogym_sampler.original.loading import env_option
 from surrogym_server.convert import definition_from_spec
@@ -120,6 +121,15 @@ def test_the_train_command_warns_if_another_session_of_the_surrogate_is_open(
     monkeypatch.setattr(train, "connect", lambda *_, **__: nullcontext(SimpleNamespace(url="here")))
     assert train._trainable("rig", None, None, 0.0, TrainSettings(), quiet=False) == (pendulum(), "here")
     assert ("warning" in capsys.readouterr().err) is (sessions > 0)
+
+
+def test_a_limit_that_can_not_be_kept_is_refused_before_the_design_is_awaited(monkeypatch) -> None:
+    view = SimpleNamespace(name="rig", spec=pendulum())
+    monkeypatch.setattr(train, "awaited_surrogate", lambda *_, **__: view)
+    monkeypatch.setattr(train, "connect", lambda *_, **__: nullcontext(SimpleNamespace(url="here")))
+    settings = TrainSettings(algorithm="PLANNER", hyperparameters={"limits": ["speed<=99"]})
+    with pytest.raises(CommandError, match=r"limit 'speed<=99': expected a number between -8 and 8"):
+        train._trainable("rig", None, None, 60.0, settings, quiet=True)
 
 
 def test_a_training_says_why_its_policies_try_no_episodes():

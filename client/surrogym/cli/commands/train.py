@@ -183,7 +183,8 @@ def _trainable(
     import the packages of the policy search in the meantime.
 
     Raises:
-        CommandError: the surrogate has no model yet, or its reward lacks a set point or an integral of the settings.
+        CommandError: the surrogate has no model yet, its reward lacks a set point or an integral of the settings, or
+            a limit of the settings can't be kept.
     """
     from surrogym_client.surrogates.waiting import (
         COMPLETED,
@@ -193,6 +194,7 @@ def _trainable(
         words_of_uncertainty,
     )
     from surrogym_shared.integrals import Integrals, errors_of
+    from surrogym_shared.limits import limit_of
     from surrogym_shared.set_points import with_set_points
     from surrogym_trainer.training.search import SEARCHES, name_of
 
@@ -201,6 +203,8 @@ def _trainable(
         try:
             with_set_points(view.spec, settings.set_points)
             Integrals.of(view.spec, errors_of(view.spec, settings.integral, settings.set_points))
+            for limit in settings.hyperparameters.get("limits") or ():
+                limit_of(view.spec, str(limit))
         except ValueError as error:
             raise CommandError(str(error)) from error
         if wait > 0:
