@@ -111,6 +111,12 @@ def test_the_command_recommended_after_an_interrupted_training_repeats_its_impro
     assert words.endswith("to continue: surrogym train cart --improve 5 --rounds 3 --start-from p.zip --out p.zip")
 
 
+def test_the_command_recommended_after_an_interrupted_planner_makes_it_again():
+    planner = replace(RESULT, algorithm="PLANNER", virtual_steps=0)
+    words = words_of_interruption(planner, "cart --algorithm planner")
+    assert words.endswith("not audited; to make it again: surrogym train cart --algorithm planner --out p.zip")
+
+
 @pytest.mark.parametrize("sessions", [0, 1, 2])
 def test_the_train_command_warns_if_another_session_of_the_surrogate_is_open(
     sessions: int, monkeypatch, capsys

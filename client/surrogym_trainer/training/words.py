@@ -92,6 +92,11 @@ def words_of_range(left: RangeLeft) -> str:
 def words_of_interruption(result: TrainResult, asked: str) -> str:
     """Return a text about the policy that was saved at Ctrl-C, and about how to continue its training. ``asked`` holds
     the arguments of the command: the surrogate and its options."""
+    if not result.virtual_steps:  # nothing was trained, so nothing can be continued
+        return (
+            f"interrupted; the policy is in {result.path}, not audited; to make it again: surrogym train {asked} --out "
+            f"{result.path}"
+        )
     return (
         f"interrupted after {result.virtual_steps} virtual steps; the policy so far is in {result.path}; to continue: "
         f"surrogym train {asked} --start-from {result.path} --out {result.path}"
