@@ -16,7 +16,7 @@ from uuid import uuid4
 import numpy as np
 import pytest
 
-from support import rail, wheel
+from support import limited, rail, wheel
 from support.moody import DECLARED, SPEC, Line
 from support.server import ServerProcess
 from surrogym.cli import main
@@ -28,6 +28,7 @@ from surrogym_client.transport import Api, HttpSurrogate
 from surrogym_sampler.original import RealStep
 from surrogym_sampler.original.episode import Episode
 from surrogym_sampler.original.episodes import open_episode
+from surrogym_sampler.original.rollouts import answering, keeping_limits
 from surrogym_sampler.queries import Sampler, SamplerSettings
 from surrogym_shared.network import Network
 from surrogym_shared.spec import Design, EnvironmentSpec, ModelChoice
@@ -237,6 +238,27 @@ def test_an_audit_by_whole_episodes_checks_dynamics_and_return(server_process: S
         assert handover.trusted is not changed, handover.reason
         if changed:
             assert handover.reason.startswith("the audit failed: 3 whole episodes earned 2.")
+
+
+@pytest.mark.parametrize("often", [False, True])
+def test_an_audit_in_which_the_fallback_acts_more_often_than_promised_has_failed(
+    server_process: ServerProcess, often: bool
+) -> None:
+    machine = keeping_limits(answering(limited.PatientCart()))
+    with placed(server_process.url, limited.SPEC, machine, Design(initial=12, budget=24)) as place:
+        subject = replace(place.subject(), predict=lambda shown: np.clip(-shown[:, :1] - shown[:, 1:], -1, 1))
+        make = partial(open_episode, "a cart", None, limited.PatientCart)
+        result = evaluate(subject.predict, make, EvaluationSettings(3))
+        assert result.limits is not None
+        assert result.limits.fallback_episodes == 0
+        if often:
+            result = replace(result, limits=replace(result.limits, fallback_episodes=3, fallbacks=9))
+        handover = judge_episodes(subject, result)
+        assert handover.audit is not None
+        assert handover.audit.passed is not often
+        if often:
+            assert "in 3 of 3 episodes" in handover.audit.faults[0]
+            assert handover.audit.faults[1].startswith("the fallback acted more often than expected")
 
 
 def test_whole_episodes_are_judged_by_the_reward_with_the_policys_set_points(

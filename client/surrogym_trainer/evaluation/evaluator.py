@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -575,13 +575,18 @@ class LimitsKept:
             f"{self.steps} steps, in {self.fallback_episodes} of {self.episodes} episodes"
         )
 
-    def expected(self, low: float, high: float) -> str:
-        """Compare the share of episodes with a fallback with its predicted interval from ``low`` to ``high``, in words.
-        The share differs if its exact 95 % interval lies outside of the predicted one."""
+    def found(self, low: float, high: float) -> Literal["more often", "less often", "as often"]:
+        """Return how often the fallback acted, beside the predicted interval of its share from ``low`` to ``high``: the
+        share differs if its exact 95 % interval lies outside of the predicted one."""
         from scipy.stats import binomtest
 
         real = binomtest(self.fallback_episodes, self.episodes).proportion_ci(method="exact")
-        found = "more often" if real.low > high else "less often" if real.high < low else "as often"
+        return "more often" if real.low > high else "less often" if real.high < low else "as often"
+
+    def expected(self, low: float, high: float) -> str:
+        """Compare the share of episodes with a fallback with its predicted interval from ``low`` to ``high``, in
+        words."""
+        found = self.found(low, high)
         return (
             f"the fallback acted {found} {'as' if found == 'as often' else 'than'} expected: in {_percent(low, high)}"
         )

@@ -257,8 +257,8 @@ def judge_episodes(subject: Subject, result: Evaluation) -> Handover:
     beside = compared(api, spec, view, steps, UNNOTICED * earned(before, subject.floor) / float(result.lengths.mean()))
     found = _consequence(subject, beside, before, view, Inputs.over(spec, q, u))
     audit = missed(judge(beside, before, before, subject.floor, found), result.returns, subject.floor)
-    if result.limits is not None and result.limits.broken:
-        audit = audit.model_copy(update={"passed": False, "faults": (result.limits.words(), *audit.faults)})
+    if faults := _limit_faults(result, before):
+        audit = audit.model_copy(update={"passed": False, "faults": (*faults, *audit.faults)})
     about = {"steps": result.steps, "episodes": len(result.returns), "range_left": range_left(spec, q)}
     starts = [trace.coordinates[0] for trace in result.traces]
     others = [sample for sample in api.samples(subject.name) if sample.trajectory is not None]
@@ -266,6 +266,16 @@ def judge_episodes(subject: Subject, result: Evaluation) -> Handover:
     audit = _with_machine(audit.model_copy(update=about), spec, seen)
     trusted, reason = _verdict(audit, subject.floor)
     return Handover(audit.after, audit, trusted, reason)
+
+
+def _limit_faults(result: Evaluation, promise: Promise) -> tuple[str, ...]:
+    """Return what whole episodes show against the limits: too many left them, or the fallback acted more often than
+    promised."""
+    kept, share = result.limits, promise.fallback
+    if kept is None:
+        return ()
+    more = () if share is None or kept.found(share.low, share.high) != "more often" else (share.low, share.high)
+    return (*([kept.words()] if kept.broken or more else []), *([kept.expected(*more)] if more else []))
 
 
 def _answers(
