@@ -29,6 +29,7 @@ LEFT_LEVEL = 0.01
 STARTS = 1_000  # number of random start states at which limits are checked
 # margin of a limit that is given at run time, as a share of the range of its term, for errors of the model
 MARGIN = 0.01
+LONGEST = 1_000  # largest number of characters of such a limit, which a file from anybody may have
 LIMIT = re.compile(r"(?P<sum>.+?)\s*(?P<relation><=|>=)\s*(?P<value>\S+)")  # a limit that is given at run time
 
 
@@ -237,7 +238,7 @@ def limit_of(spec: EnvironmentSpec, text: str) -> Limit:
         ValueError: the text is another one, a coordinate is unknown or an angle, the number lies outside of the range
             of the sum over the sampling ranges, or an episode may start beyond the limit or within its margin.
     """
-    names, sides = spec.coordinate_names, LIMIT.fullmatch(text.strip())
+    names, sides = spec.coordinate_names, LIMIT.fullmatch(text.strip()) if len(text) <= LONGEST else None
     weights, value = ({}, math.nan) if sides is None else (_weights(sides["sum"], names), _number(sides["value"]))
     require(
         any(weights.values()) and math.isfinite(value + sum(weights.values())),

@@ -171,7 +171,10 @@ def test_a_limit_in_words_is_read(text: str, weights: dict[str, float], low: flo
     assert read.margin == pytest.approx(0.01 * width)
 
 
-@pytest.mark.parametrize("text", ["", "x", "x<1", "x<=", "x<=fast", "1<=x", "w<=1", "x v<=1", "x*v<=1", "1..2*x<=1"])
+@pytest.mark.parametrize(
+    "text",
+    ["", "x", "x<1", "x<=", "x<=fast", "1<=x", "w<=1", "x v<=1", "x*v<=1", "1..2*x<=1", "x" + 1_000 * " " + "<=1"],
+)
 def test_a_limit_in_other_words_is_refused_with_the_coordinates(text: str) -> None:
     said = (
         "expected a sum of coordinates, <= or >=, and a number, such as x<=1 or 0.3*x+v>=-1, with the coordinates x, v"

@@ -13,6 +13,7 @@ from pydantic import BaseModel, Field, ValidationError
 from surrogym_client.environments.file_factories import planner_of
 from surrogym_shared.archives import has_entry, read_entries
 from surrogym_shared.faults import first_fault
+from surrogym_shared.spec.base import MAX_INEQUALITIES
 from surrogym_shared.surrogate_file import MAX_FILE_BYTES, PLANNER_HEAD
 from surrogym_trainer.policies.card import UnusablePolicy
 from surrogym_trainer.policies.predict import Predict
@@ -27,7 +28,7 @@ class _Head(BaseModel):
     horizon: int
     seed: int
     set_points: dict[str, float] = Field(default_factory=dict)
-    limits: tuple[str, ...] = ()
+    limits: tuple[str, ...] = Field(default=(), max_length=MAX_INEQUALITIES)
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 
 from surrogym_shared.port import HORIZON, ModelPort, SurrogatePort
+from surrogym_shared.spec.base import MAX_INEQUALITIES
 from surrogym_shared.surrogate_file import RealSamples, SurrogateFile
 from surrogym_trainer.policies.card import UnusablePolicy
 from surrogym_trainer.policies.planner_files import PlannerFile
@@ -29,6 +30,10 @@ class Planner(PolicySearch):
             raise ValueError(
                 "algorithm PLANNER: expected no integral, because a planner corrects lasting disturbances itself, got "
                 f"{', '.join(settings.integral)}"
+            )
+        if isinstance(self.limits, str) or len(self.limits) > MAX_INEQUALITIES:
+            raise ValueError(
+                f"algorithm PLANNER: expected limits as a list of at most {MAX_INEQUALITIES} texts, got {self.limits!r:.80}"
             )
         file = _file_of(task.port).to_bytes()
         planner = PlannerFile(file, self.horizon, settings.seed, settings.set_points, tuple(self.limits))

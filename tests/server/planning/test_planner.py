@@ -312,6 +312,13 @@ def test_a_limit_that_can_not_be_kept_is_refused_and_leaves_no_file(hanging: Loc
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("limits", ["speed<=2", ["speed<=2"] * 17])
+def test_limits_that_are_no_list_or_too_many_are_refused(hanging: LocalSurrogate, tmp_path, limits):
+    settings = TrainSettings(algorithm="planner", hyperparameters={"limits": limits})
+    with pytest.raises(ValueError, match="PLANNER: expected limits as a list of at most 16 texts, got"):
+        train(hanging, tmp_path / "planner.zip", settings)
+
+
 def test_a_planner_that_can_not_be_made_leaves_no_file(hanging: LocalSurrogate, tmp_path):
     settings = TrainSettings(algorithm="planner", hyperparameters={"horizon": 0})
     with pytest.raises(ValueError, match="algorithm PLANNER: horizon: expected"):
