@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
 from surrogym_shared.port import HORIZON, ModelPort, SurrogatePort
@@ -19,7 +20,7 @@ class Planner(PolicySearch):
     """A policy that plans each action by rollouts of the model. Nothing is trained."""
 
     horizon: int = HORIZON  # number of steps of each planned rollout
-    limits: tuple[str, ...] = ()  # limits that the plans keep, as ``surrogym_shared.limits.limit_of`` reads them
+    limits: Sequence[str] = ()  # limits that the plans keep, as ``surrogym_shared.limits.limit_of`` reads them
 
     suggested_steps = 1
     resumable = False  # it computes its values anew from the latest model
@@ -33,7 +34,8 @@ class Planner(PolicySearch):
             )
         if isinstance(self.limits, str) or len(self.limits) > MAX_INEQUALITIES:
             raise ValueError(
-                f"algorithm PLANNER: expected limits as a list of at most {MAX_INEQUALITIES} texts, got {self.limits!r:.80}"
+                f"algorithm PLANNER: expected limits as a list of at most {MAX_INEQUALITIES} texts, got "
+                f"{self.limits!r:.80}"
             )
         file = _file_of(task.port).to_bytes()
         planner = PlannerFile(file, self.horizon, settings.seed, settings.set_points, tuple(self.limits))
