@@ -184,7 +184,8 @@ class Design:
         self._require_open(query)
         if not query.replan:
             return lambda number, _: query.actions[number]
-        planner = self.surrogate().planner(HORIZON, query.id)
+        noise = {output["name"]: output["sensor_noise"] for output in self.fidelity["outputs"]}
+        planner = self.surrogate().planner(HORIZON, query.id, sensor_noise=noise)
         return lambda _, state: tuple(planner.from_states(np.array([state], dtype=np.float64))[0].tolist())
 
     def tell(

@@ -7,10 +7,12 @@ targets are those of the demo, without its second evaluation. Prints one line fo
 
     python lab/benchmarks/bench_resets.py --seeds 9903 9904 9905 9906 9907 --tasks pendulum cartpole
     python lab/benchmarks/bench_resets.py --seeds 121 122 123 124 125 --tasks swingup --dirt encoder --budget 150
+    python lab/benchmarks/bench_resets.py --seeds 220 221 222 --tasks furuta --budget 400 --horizon 25
 
 ``--dirt`` gives the swing-up one kind of dirt, and sizes that each seed draws (``dirty_swingup.py``). A rod that is up
 is judged by its own angle then, not by what is read of it. ``--acting-with`` is the dirt of the machine on which the
-planner acts, if it is another one than the machine that was learned.
+planner acts, if it is another one than the machine that was learned. The other tasks are the dirty machines that a
+planner can steer (``bench_trials.py``), which have no target here.
 """
 
 from __future__ import annotations
@@ -24,6 +26,7 @@ from pathlib import Path
 
 import numpy as np
 from bench_dirt import KINDS
+from bench_trials import MACHINES, SWING_UPS, specification
 from common import OUT, append_row
 from dirty_swingup import InProcess
 
@@ -33,7 +36,7 @@ from surrogym_sampler import original
 from surrogym_sampler.original.episodes import Episode, RolloutEpisode, open_episode
 from surrogym_sampler.original.protocol import RolloutEnvironment
 from surrogym_sampler.original.rollouts import answering
-from surrogym_server.local import LocalSurrogate
+from surrogym_shared.spec import with_history
 from surrogym_trainer.evaluation.evaluator import EvaluationSettings, evaluate
 from surrogym_trainer.training.planner import Planner
 
@@ -46,17 +49,20 @@ BUDGETS = {
     "swingup-narrow": 120,
     "acrobot": 120,
     "invertedpendulum": 30,
+    "furuta": 400,
+    "double_pendulum": 1_000,
 }
 
 
 def main() -> None:
     made = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    made.add_argument("--tasks", nargs="+", default=tuple(BUDGETS), choices=tuple(BUDGETS))
+    made.add_argument("--tasks", nargs="+", default=tuple(t for t in BUDGETS if t in TASKS), choices=tuple(BUDGETS))
     made.add_argument("--seeds", nargs="+", type=int, required=True)
     made.add_argument("--episodes", type=int, default=100)
     made.add_argument("--budget", type=int, help="largest number of real steps, instead of the task's")
     made.add_argument("--dirt", default="", choices=("", *KINDS), help="kind of dirt of the swing-up")
     made.add_argument("--acting-with", choices=KINDS, help="dirt of the swing-up on which the planner acts")
+    made.add_argument("--horizon", type=int, default=Planner.horizon, help="steps of each rollout of the planner")
     made.add_argument("--rounds", action="store_true", help="returns after each round of a design")
     made.add_argument("--out", type=Path, default=OUT)
     options = made.parse_args()
@@ -68,17 +74,23 @@ def main() -> None:
 
 
 def _run(task: str, seed: int, options: argparse.Namespace) -> list[dict[str, object]]:
-    environment, begun, dirt, rounds = TASKS[task].environment, time.process_time(), options.dirt, options.rounds
-    machine = original.make(environment, access="reset", seed=seed, budget=options.budget or BUDGETS[task])
+    begun, dirt, rounds, budget = time.process_time(), options.dirt, options.rounds, options.budget or BUDGETS[task]
+    if task in MACHINES:
+        name = MACHINES[task].name.format(seed=seed)
+        machine = original.make(name, spec=specification(MACHINES[task], name, seed, budget))
+    else:
+        machine = original.make(TASKS[task].environment, access="reset", seed=seed, budget=budget)
     if dirt:
-        machine = answering(InProcess(dirt, seed, machine.spec()))
+        spec = machine.spec()
+        spec = with_history(spec, actions=SWING_UPS[dirt]) if dirt in SWING_UPS else spec
+        machine = answering(InProcess(dirt, seed, spec))
     assert isinstance(machine, RolloutEnvironment)
     design, starts, rows = surrogym.Design(machine.spec()), np.random.default_rng(seed), []
     resets, known = 0, 0
 
     def row(count: int) -> dict[str, object]:
         taken = time.process_time() - begun
-        earned = _earned(task, options.acting_with or dirt, design.surrogate(), seed, count)
+        earned = _earned(task, options.acting_with or dirt, design, seed, count, options.horizon)
         facts = {
             "task": f"{task} {dirt}".strip(),
             "seed": seed,
@@ -106,10 +118,12 @@ def _run(task: str, seed: int, options: argparse.Namespace) -> list[dict[str, ob
     return [*rows, row(10 if rounds else options.episodes)]
 
 
-def _earned(task: str, dirt: str, surrogate: LocalSurrogate, seed: int, episodes: int) -> dict[str, object]:
+def _earned(task: str, dirt: str, design: surrogym.Design, seed: int, episodes: int, horizon: int) -> dict[str, object]:
     """Return what a planner earns in the original environment, and whether this reaches the task's target."""
+    surrogate, noise = design.surrogate(), {o["name"]: o["sensor_noise"] for o in design.fidelity["outputs"]}
     spec, settings = surrogate.spec(), EvaluationSettings(episodes)
-    planner, name = surrogate.planner(Planner.horizon, seed), spec.environment or task
+    planner = surrogate.planner(horizon, seed, sensor_noise=noise)
+    name = MACHINES[task].name.format(seed=seed) if task in MACHINES else spec.environment or task
     judged = InProcess(dirt or "clean", seed, spec)
 
     def episode() -> Episode:
@@ -121,8 +135,9 @@ def _earned(task: str, dirt: str, surrogate: LocalSurrogate, seed: int, episodes
     real = evaluate(planner, episode, settings)
     mean, least = float(real.returns.mean()), float(real.returns.min())
     success = None if real.success is None else float(np.mean(judged.ups if dirt else real.success))
-    target = replace(TASKS[task].target, also_success=None)
-    reached = target.reached(Outcome(mean, least, success))
+    reached = None
+    if task in TASKS:
+        reached = replace(TASKS[task].target, also_success=None).reached(Outcome(mean, least, success))
     return {"mean": round(mean, 2), "least": round(least, 2), "success": success, "reached": reached}
 
 

@@ -113,22 +113,25 @@ class LocalSurrogate:
         seed: int = 0,
         set_points: Mapping[str, float] | None = None,
         limits: Sequence[str] = (),
+        sensor_noise: Mapping[str, float] | None = None,
     ) -> Planner:
         """Return a policy that plans each action by rollouts of ``horizon`` steps, after value iteration on a grid of
         states, which takes some seconds. ``seed`` is that of the changes of actions that it tries.
 
         ``set_points`` replaces set points of the declared reward, by coordinate: ``{"level": 12}``. The planner keeps
-        ``limits`` such as ``"level<=11"``, besides those of the specification.
+        ``limits`` such as ``"level<=11"``, besides those of the specification. ``sensor_noise`` has standard deviations
+        of measurements, by coordinate: the planner then filters what it measures.
 
         Raises:
             InvalidInput: the horizon is out of its range, the reward or the model does not support a set point, a limit
-                can't be kept, or the model or its environment does not allow planning.
+                can't be kept, the model does not move a coordinate with sensor noise, or the model or its environment
+                does not allow planning.
         """
         try:
             keep = [limit_of(self._spec, text) for text in limits]
         except ValueError as error:
             raise InvalidInput(str(error)) from error
-        planner = planner_of(self._model, horizon, seed, set_points, keep)
+        planner = planner_of(self._model, horizon, seed, set_points, keep, sensor_noise)
         for limit in keep:
             self._require_kept(planner, limit)
         return planner

@@ -202,10 +202,12 @@ class PlanningPort(SurrogatePort, Protocol):
         seed: int,
         set_points: Mapping[str, float] | None = None,
         limits: Sequence[str] = (),
+        sensor_noise: Mapping[str, float] | None = None,
     ) -> Planning:
         """Return a function that plans each action by rollouts of ``horizon`` steps, in which it tries random changes
         of actions. ``set_points`` replaces set points of the declared reward, by coordinate. The plans keep ``limits``,
-        inequalities that ``surrogym_shared.limits.limit_of`` reads."""
+        inequalities that ``surrogym_shared.limits.limit_of`` reads. ``sensor_noise`` has standard deviations of
+        measurements, by coordinate, and the function then filters what is measured."""
         ...
 
 

@@ -38,7 +38,12 @@ def open_file(path: str | Path) -> SurrogatePort:
 
 
 def planner_of(
-    file: bytes, horizon: int, seed: int, set_points: Mapping[str, float], limits: Sequence[str] = ()
+    file: bytes,
+    horizon: int,
+    seed: int,
+    set_points: Mapping[str, float],
+    limits: Sequence[str] = (),
+    sensor_noise: Mapping[str, float] | None = None,
 ) -> Planning:
     """Return a function that plans actions in this process, on the model in the content of a surrogate's ``file``. This
     computes its values, in some seconds. ``PlanningPort.planner`` explains the other arguments.
@@ -54,7 +59,7 @@ def planner_of(
         port = open_file(path)
     if not isinstance(port, PlanningPort):
         raise TypeError("the installed server can't plan")
-    return port.planner(horizon, seed, set_points, limits)
+    return port.planner(horizon, seed, set_points, limits, sensor_noise)
 
 
 def make_env(*, file: str | Path, **options: Any) -> RemoteEnv:

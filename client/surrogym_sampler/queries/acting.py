@@ -30,7 +30,9 @@ def replanning(api: Api, surrogate: str, spec: EnvironmentSpec) -> Acting:
     """
     model = api.export_model(surrogate, api.model(surrogate).version)
     samples = RealSamples.none(len(spec.coordinates), spec.action.size)
-    planner = planner_of(SurrogateFile(surrogate, spec, model, samples).to_bytes(), HORIZON, spec.design.seed, {})
+    file, fidelity = SurrogateFile(surrogate, spec, model, samples).to_bytes(), api.surrogate(surrogate).fidelity
+    noise = {} if fidelity is None else {output.name: output.sensor_noise for output in fidelity.outputs}
+    planner = planner_of(file, HORIZON, spec.design.seed, {}, sensor_noise=noise)
     return lambda state: planner.from_states(np.asarray(state, dtype=np.float64)[None])[0].tolist()
 
 

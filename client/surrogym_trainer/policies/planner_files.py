@@ -6,9 +6,9 @@ import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, Self
+from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import BaseModel, Field, FiniteFloat, ValidationError
 
 from surrogym_client.environments.file_factories import planner_of
 from surrogym_shared.archives import has_entry, read_entries
@@ -29,6 +29,7 @@ class _Head(BaseModel):
     seed: int
     set_points: dict[str, float] = Field(default_factory=dict)
     limits: tuple[str, ...] = Field(default=(), max_length=MAX_INEQUALITIES)
+    sensor_noise: dict[str, Annotated[FiniteFloat, Field(ge=0)]] = Field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,8 @@ class PlannerFile:
     seed: int  # seed of the changes of actions that the planner tries
     set_points: Mapping[str, float] = field(default_factory=dict)  # other set points of the reward, by coordinate
     limits: tuple[str, ...] = ()  # limits that the plans keep, as ``surrogym_shared.limits.limit_of`` reads them
+    # standard deviations of measurements, by coordinate, from which the planner filters the state
+    sensor_noise: Mapping[str, float] = field(default_factory=dict)
 
     def save(self, path: Path) -> None:
         """Write the planner to a zip file, which contains no code."""
@@ -50,6 +53,7 @@ class PlannerFile:
                 seed=self.seed,
                 set_points=dict(self.set_points),
                 limits=self.limits,
+                sensor_noise=dict(self.sensor_noise),
             )
             file.writestr(PLANNER_HEAD, head.model_dump_json())
             file.writestr(MODEL, self.surrogate)
@@ -60,7 +64,7 @@ class PlannerFile:
         try:
             entries = read_entries(path, MAX_FILE_BYTES)
             head = _Head.model_validate_json(entries[PLANNER_HEAD])
-            return cls(entries[MODEL], head.horizon, head.seed, head.set_points, head.limits)
+            return cls(entries[MODEL], head.horizon, head.seed, head.set_points, head.limits, head.sensor_noise)
         except ValidationError as error:
             raise UnusablePolicy(f"{path} is not a planner: {first_fault(error)}; train it again") from error
         except (KeyError, ValueError) as error:
@@ -78,6 +82,7 @@ class PlannerFile:
             UnusablePolicy: the extra ``server`` is missing, or the model does not allow planning; with the reason.
         """
         try:
-            return planner_of(self.surrogate, self.horizon, self.seed, self.set_points, self.limits)
+            given = (self.set_points, self.limits, self.sensor_noise)
+            return planner_of(self.surrogate, self.horizon, self.seed, *given)
         except Exception as error:  # errors of the server's package, whose classes the client does not import
             raise UnusablePolicy(str(error)) from error

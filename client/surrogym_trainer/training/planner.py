@@ -37,8 +37,9 @@ class Planner(PolicySearch):
                 f"algorithm PLANNER: expected limits as a list of at most {MAX_INEQUALITIES} texts, got "
                 f"{self.limits!r:.80}"
             )
-        file = _file_of(task.port).to_bytes()
-        planner = PlannerFile(file, self.horizon, settings.seed, settings.set_points, tuple(self.limits))
+        file, noise = _file_of(task.port).to_bytes(), dict(settings.session.get("sensor_noise", {}))
+        limits = tuple(self.limits)
+        planner = PlannerFile(file, self.horizon, settings.seed, settings.set_points, limits, noise)
         task.progress(TrainProgress(0, 0, None, 0.0, stage="computes values on a grid"))
         try:
             predict = planner.acting()

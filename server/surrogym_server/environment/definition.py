@@ -195,6 +195,24 @@ class EnvironmentDefinition:
         return tuple(i for i, c in enumerate(self.coordinates) if c.lag is not None)
 
     @cached_property
+    def repeated_actions(self) -> NDArray[np.int64]:
+        """Index, action entry and age of each coordinate that repeats an action, (L, 3)."""
+        size, found = len(self.coordinates), []
+        for index in self.lags:
+            source = self.sources[index]
+            while source < size and self.sources[source] != source:
+                source = self.sources[source]
+            if source >= size:
+                found.append((index, source - size, self.ages[index]))
+        return np.array(found, dtype=np.int64).reshape(-1, 3)
+
+    @property
+    def kept(self) -> int:
+        """Number of the first coordinates up to the last one that repeats no action."""
+        repeated = set(self.repeated_actions[:, 0].tolist())
+        return 1 + max(i for i in range(len(self.coordinates)) if i not in repeated)
+
+    @cached_property
     def ages(self) -> tuple[int, ...]:
         """Number of steps that each coordinate looks back, (C,); 0 for coordinates that repeat no past value."""
         ages: list[int] = []

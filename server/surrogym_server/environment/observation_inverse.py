@@ -20,20 +20,21 @@ from surrogym_shared.spec import ends_of, limits
 
 @dataclass(frozen=True)
 class ObservationInverse:
-    """Where each moving coordinate is found in an observation: the indices (value,) or (cos, sin) of its entries."""
+    """Where coordinates are found in an observation: the indices (value,) or (cos, sin) of the entries of each."""
 
-    # For each moving coordinate: its index, and the indices of the observation entries from which it is computed.
+    # For each of these coordinates: its index, and the indices of the observation entries from which it is computed.
     sources: tuple[tuple[int, tuple[int, ...]], ...]
 
     @classmethod
-    def of(cls, definition: EnvironmentDefinition) -> ObservationInverse:
-        """Find the observation entries from which each moving coordinate can be computed. Raises ``InvalidSpec`` if
-        there are none for a moving coordinate."""
-        return cls(tuple((i, _source(definition, i)) for i in definition.moving))
+    def of(cls, definition: EnvironmentDefinition, *, lags: bool = False) -> ObservationInverse:
+        """Find the observation entries from which each moving coordinate can be computed, and with ``lags`` each that
+        repeats a past value. Raises ``InvalidSpec`` if there are none for one of them."""
+        asked = definition.moving + (definition.lags if lags else ())
+        return cls(tuple((i, _source(definition, i)) for i in asked))
 
     def __call__(self, o: Tensor, q: Tensor) -> Tensor:
-        """Return the coordinates (m, C) of m states, computed from their observations o (m, D). Coordinates that the
-        dynamics don't move are copied from q (m, C)."""
+        """Return the coordinates (m, C) of m states, computed from their observations o (m, D). Other coordinates
+        are copied from q (m, C)."""
         recovered = q.clone()
         for index, entries in self.sources:
             if len(entries) == 2:

@@ -352,9 +352,10 @@ class Avoided:
 
 @dataclass(frozen=True)
 class GridPolicy:
-    """A policy and its values at the S nodes of a grid of states, as ``compiled.grid`` describes it."""
+    """A policy and its values at the S nodes of a grid of states, as ``compiled.grid`` describes it. The grid is one of
+    the first K coordinates; the others repeat past actions."""
 
-    grid: tuple[Floats, Floats, NDArray[np.int64], NDArray[np.bool_]]  # low, cell, count, cyclic, (C,) each
+    grid: tuple[Floats, Floats, NDArray[np.int64], NDArray[np.bool_]]  # low, cell, count, cyclic, (K,) each
     values: Floats  # (S,) expected return from each node
     table: Floats  # (S, F) action at each node
     discount: float  # factor of later rewards
@@ -377,7 +378,15 @@ class PlannedActions(ABC):
 
     @abstractmethod
     def planned(
-        self, policy: GridPolicy, start: Floats, offset: Floats, changes: Floats, elite: int, best: Floats
+        self,
+        policy: GridPolicy,
+        start: Floats,
+        offset: Floats,
+        early: NDArray[np.int64],
+        late: bool,
+        changes: Floats,
+        elite: int,
+        best: Floats,
     ) -> tuple[Floats, Floats]:
         """Return the first action (F,) of the best of R rounds of N rollouts over T steps, and the state (C,) that the
         model predicts after it.
@@ -387,6 +396,9 @@ class PlannedActions(ABC):
             start: (C,) state.
             offset: (C,) numbers to add to the predicted change of each coordinate at every step. A model of changes of
                 the observation ignores them.
+            early: (E, 2) index and action entry of the coordinates that take the value of each step's action before the
+                step, because an action acts later than it is chosen.
+            late: whether the policy and the values are functions of the end of a step without the new action.
             changes: (R, N, T, F) changes of the policy's actions to try: numbers to add to the mean plan of the round
                 before; or discrete actions, -1 for the policy's, -2 for the best plan's.
             elite: number of the best rollouts of a round whose mean the next round changes.

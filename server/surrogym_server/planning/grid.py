@@ -13,7 +13,8 @@ from torch import Tensor
 
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.safety import LimitSet
-from surrogym_server.models.abilities import ArraySteps, Avoided, GridPolicy
+from surrogym_server.models.abilities import ArrayTransition, Avoided, GridPolicy
+from surrogym_server.planning.pending import PendingActions
 from surrogym_shared.spec import MOST_PLANNED, BoxAction, DiscreteAction
 
 Floats = NDArray[np.float64]
@@ -41,29 +42,31 @@ class GridModel:
     ``compiled.grid`` explains grids.
     """
 
-    grid: tuple[Floats, Floats, NDArray[np.int64], NDArray[np.bool_]]  # low, cell, count, cyclic, (C,) each
+    grid: tuple[Floats, Floats, NDArray[np.int64], NDArray[np.bool_]]  # low, cell, count, cyclic, (K,) each
     actions: Floats  # (A, F)
     levels: Floats  # (F, L) values of each entry of a continuous action; (0, 0) for discrete ones
-    # (S, A, C) state after the step; not a number where the episode ended, or where the fallback of limits would act
+    # (S, A, K) state after the step; not a number where the episode ended, or where the fallback of limits would act
     q_next: Singles
     reward: Singles  # (S, A) reward of the step
     # (S, A) how far the step leads beyond limits, as a share of the range of their terms; None without limits
     beyond: Singles | None = None
 
     @classmethod
-    def of(cls, steps: ArraySteps, terminal_reward: float, nodes: int = NODES, limits: LimitSet | None = None) -> Self:
+    def of(
+        cls, pending: PendingActions, terminal_reward: float, nodes: int = NODES, limits: LimitSet | None = None
+    ) -> Self:
         """Predict the steps.
 
         Args:
-            steps: the model's compiled steps.
+            pending: the model's compiled steps, and what is known of actions that act later.
             terminal_reward: reward that steps that end the episode pay in addition.
             nodes: largest number of nodes.
             limits: limits that the actions are to keep.
         """
-        action = steps.definition.action
+        action = pending.steps.definition.action
         assert isinstance(action, BoxAction | DiscreteAction)
-        grid, (actions, levels) = _grid(steps.definition, nodes), _actions(action)
-        return cls(grid, actions, levels, *_transitions(steps, _nodes(*grid[:3]), actions, terminal_reward, limits))
+        grid, (actions, levels) = _grid(pending.steps.definition, nodes), _actions(action)
+        return cls(grid, actions, levels, *_transitions(pending, _nodes(*grid[:3]), actions, terminal_reward, limits))
 
     def policy(self, discount: float, reward: Singles | None = None, *, first: float = 0.0) -> GridPolicy:
         """Return the best policy by value iteration, for other rewards (S, A) than the model's if they are given.
@@ -115,18 +118,18 @@ class GridModel:
 
 
 def solve(
-    steps: ArraySteps, terminal_reward: float, time_limit: int | None, limits: LimitSet | None = None
+    pending: PendingActions, terminal_reward: float, time_limit: int | None, limits: LimitSet | None = None
 ) -> GridPolicy:
     """Return the policy with the highest return on a grid.
 
     Args:
-        steps: the model's compiled steps.
+        pending: the model's compiled steps, and what is known of actions that act later.
         terminal_reward: reward that steps that end the episode pay in addition.
         time_limit: largest number of steps of an episode, if there is one.
         limits: limits that the policy keeps. A step beyond them costs as much as the rewards of a whole episode can
             differ, and more with the distance, so no reward makes up for it.
     """
-    on_grid, discount = GridModel.of(steps, terminal_reward, limits=limits), discount_of(time_limit)
+    on_grid, discount = GridModel.of(pending, terminal_reward, limits=limits), discount_of(time_limit)
     plain = _solved(on_grid, discount)
     if limits is None or on_grid.beyond is None:
         return plain
@@ -135,7 +138,9 @@ def solve(
     kept = on_grid.within(plain, price)
     from surrogym_server.environment.compiled.limits import tables_of
 
-    return replace(kept, avoided=Avoided(*tables_of(limits, _range_of(limits, _nodes(*on_grid.grid[:3]))), price))
+    return replace(
+        kept, avoided=Avoided(*tables_of(limits, _range_of(limits, pending, _nodes(*on_grid.grid[:3]))), price)
+    )
 
 
 def _solved(on_grid: GridModel, discount: float) -> GridPolicy:
@@ -155,7 +160,7 @@ def discount_of(time_limit: int | None) -> float:
 def at_nearest_node(policy: GridPolicy, q: Floats) -> Floats:
     """Return the actions (s, F) of a policy at the node that is nearest to each state q (s, C)."""
     low, cell, count, cyclic = policy.grid
-    at = np.rint((q - low) / cell).astype(np.int64)
+    at = np.rint((q[:, : len(low)] - low) / cell).astype(np.int64)
     at = np.where(cyclic, at % count, at.clip(0, count - 1))
     actions: Floats = policy.table[(at * np.cumprod([1, *count[:-1]])).sum(1)]
     return actions
@@ -163,19 +168,19 @@ def at_nearest_node(policy: GridPolicy, q: Floats) -> Floats:
 
 def unfit(definition: EnvironmentDefinition) -> str | None:
     """Return what a grid needs and the environment lacks, in words; None if nothing is missing."""
-    action, coordinates = definition.action, len(definition.coordinates)
+    action, coordinates = definition.action, definition.kept
     if coordinates > MOST_PLANNED:
-        return f"at most {MOST_PLANNED} coordinates, got {coordinates}"
+        return f"at most {MOST_PLANNED} coordinates that repeat no action, got {coordinates}"
     if isinstance(action, DiscreteAction) or (isinstance(action, BoxAction) and action.size in LEVELS):
         return None
     return "one discrete action, or at most three continuous ones"
 
 
 def _grid(definition: EnvironmentDefinition, nodes: int) -> tuple[Floats, Floats, NDArray[np.int64], NDArray[np.bool_]]:
-    """Return low, cell, count and cyclic, (C,) each, of a grid over the sampling range (see ``compiled.grid``), with at
-    most so many nodes."""
-    low, high = (ends.cpu().numpy() for ends in definition.sampled)
-    cyclic = np.array([c.kind == "angle" for c in definition.coordinates])
+    """Return low, cell, count and cyclic, (K,) each, of a grid over the sampling range of the K coordinates that repeat
+    no action (see ``compiled.grid``), with at most so many nodes."""
+    low, high = (ends[: definition.kept].cpu().numpy() for ends in definition.sampled)
+    cyclic = np.array([c.kind == "angle" for c in definition.coordinates[: definition.kept]])
     along = min(int(nodes ** (1 / len(low))), MOST_ALONG)
     # An odd number of nodes has one in the middle of the range. The ends of an angle's range are the same node.
     count = np.where(cyclic, along, along - 1 + along % 2).astype(np.int64)
@@ -183,7 +188,7 @@ def _grid(definition: EnvironmentDefinition, nodes: int) -> tuple[Floats, Floats
 
 
 def _nodes(low: Floats, cell: Floats, count: NDArray[np.int64]) -> Floats:
-    """Return the states (S, C) of all nodes, the first coordinate running fastest."""
+    """Return the states (S, K) of all nodes, the first coordinate running fastest."""
     axes = [a + b * np.arange(n) for a, b, n in zip(low, cell, count, strict=True)]
     return np.stack([axis.ravel(order="F") for axis in np.meshgrid(*axes, indexing="ij")], 1)
 
@@ -197,39 +202,60 @@ def _actions(action: BoxAction | DiscreteAction) -> tuple[Floats, Floats]:
     return np.array(list(itertools.product(*levels))), np.ascontiguousarray(levels)
 
 
-def _range_of(limits: LimitSet, nodes: Floats) -> Tensor:
-    """Return the range of the term of each of L limits over the nodes (S, C) of a grid, (L,)."""
-    values = limits.terms(torch.from_numpy(nodes))
+def _range_of(limits: LimitSet, pending: PendingActions, nodes: Floats) -> Tensor:
+    """Return the range of the term of each of L limits over the nodes (S, K) of a grid, (L,)."""
+    lags = pending.steps.definition.repeated_actions
+    past = np.tile(pending.neutral[lags[lags[:, 0] >= nodes.shape[1], 1]], (len(nodes), 1))
+    values = limits.terms(torch.from_numpy(np.concatenate([nodes, past], 1)))
     return (values.amax(0) - values.amin(0)).clamp(min=1e-12)
 
 
 def _transitions(
-    steps: ArraySteps, nodes: Floats, actions: Floats, terminal_reward: float, limits: LimitSet | None
+    pending: PendingActions, nodes: Floats, actions: Floats, terminal_reward: float, limits: LimitSet | None
 ) -> tuple[Singles, Singles, Singles | None]:
-    """Return the states (S, A, C) after one step from each of the nodes (S, C) with each of the actions (A, F), its
+    """Return the states (S, A, K) after one step from each of the nodes (S, K) with each of the actions (A, F), its
     rewards (S, A), and how far it leads beyond ``limits`` (S, A), None without them. The states are not a number where
     the episode ended.
 
     As in virtual episodes, an episode also ends where the fallback of declared limits would act, and gets the least
     reward, or 0 if that is less, for each missing step.
+
+    With late actions, both states are what ``PendingActions.seen`` returns: the end of a step without the action.
     """
-    count, definition = len(actions), steps.definition
-    q_next = np.empty((len(nodes), count, nodes.shape[1]), dtype=np.float32)
+    count, size, definition = len(actions), nodes.shape[1], pending.steps.definition
+    q_next = np.empty((len(nodes), count, size), dtype=np.float32)
     reward = np.empty((len(nodes), count), dtype=np.float32)
     left = np.zeros((len(nodes), count), dtype=bool)
     beyond = None if limits is None else np.empty_like(reward)
-    unit = None if limits is None else _range_of(limits, nodes)
+    unit = None if limits is None else _range_of(limits, pending, nodes)
+    repeated = definition.repeated_actions[definition.repeated_actions[:, 0] >= size]
+    cyclic = [i for i, c in enumerate(definition.coordinates[:size]) if c.kind == "angle"]
+
+    def step(q: Floats, u: Floats, past: Floats) -> tuple[Floats, ArrayTransition]:
+        """Predict the step from q (m, K) with the actions u (m, F) and, where those act late, ``past`` (m, F). Return
+        the whole states (m, C) before it, too."""
+        acting = np.where(repeated[:, 2] <= pending.dead, u[:, repeated[:, 1]], past[:, repeated[:, 1]])
+        whole = np.concatenate([q, acting], 1)
+        return whole, pending.steps(whole, u, noise=None, process=None, paths=None, stds=False, reward_std=False)
+
     for begin in range(0, len(nodes), ROWS):
         q = np.repeat(nodes[begin : begin + ROWS], count, axis=0)
         u = np.tile(actions, (len(q) // count, 1))
-        moved = steps(q, u, noise=None, process=None, paths=None, stds=False, reward_std=False)
-        over = definition.falls_back(torch.from_numpy(q), torch.from_numpy(moved.q_next)).numpy() & ~moved.terminated
-        arrived = np.where((moved.terminated | over)[:, None], np.nan, moved.q_next)
-        q_next[begin : begin + ROWS] = arrived.reshape(-1, count, nodes.shape[1])
+        none = np.tile(pending.neutral, (len(u), 1))
+        before, moved = step(q, u, none if pending.late else u)
+        after = moved.q_next
+        if pending.late:
+            # The action moves the end of this step as it would move the end of a step from there.
+            begun = q + after[:, :size] - step(q, none, none)[1].q_next[:, :size]
+            begun[:, cyclic] = (begun[:, cyclic] + np.pi) % (2 * np.pi) - np.pi
+            after = step(begun, none, u)[1].q_next
+        over = definition.falls_back(torch.from_numpy(before), torch.from_numpy(after)).numpy() & ~moved.terminated
+        arrived = np.where((moved.terminated | over)[:, None], np.nan, after[:, :size])
+        q_next[begin : begin + ROWS] = arrived.reshape(-1, count, size)
         reward[begin : begin + ROWS] = (moved.reward + terminal_reward * moved.terminated).reshape(-1, count)
         left[begin : begin + ROWS] = over.reshape(-1, count)
         if limits is not None and beyond is not None and unit is not None:
-            far = (limits.margin - limits.room(torch.from_numpy(moved.q_next))) / unit
+            far = (limits.margin - limits.room(torch.from_numpy(after))) / unit
             beyond[begin : begin + ROWS] = far.amax(-1).clamp(min=0).numpy().reshape(-1, count)
     lost = reward.min(where=~left, initial=0.0) / (1 - discount_of(definition.time_limit))
     return q_next, np.where(left, np.float32(lost), reward), beyond

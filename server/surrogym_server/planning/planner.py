@@ -17,6 +17,8 @@ from surrogym_server.errors import InvalidInput
 from surrogym_server.models.abilities import ArraySteps, CompiledSteps, GridPolicy, PlannedActions, offers
 from surrogym_server.models.port import DynamicsModel, with_set_points
 from surrogym_server.planning.grid import at_nearest_node, solve, unfit
+from surrogym_server.planning.pending import PendingActions
+from surrogym_server.planning.state_filter import StateFilter
 from surrogym_shared.spec import BoxAction, Limit
 
 Floats = NDArray[np.float64]
@@ -43,6 +45,7 @@ def planner_of(
     seed: int = 0,
     set_points: Mapping[str, float] | None = None,
     limits: Sequence[Limit] = (),
+    sensor_noise: Mapping[str, float] | None = None,
 ) -> Planner:
     """Return a planner on a model, after value iteration on a grid, which takes some seconds.
 
@@ -52,18 +55,22 @@ def planner_of(
         seed: seed of the changes of actions that the planner tries.
         set_points: values of coordinates, in the place of those that the declared reward measures errors from.
         limits: limits that the planner keeps besides those of the specification.
+        sensor_noise: standard deviations of measurements, by coordinate. The planner then filters what it measures.
 
     Raises:
-        InvalidInput: the horizon is out of its range, the reward or the model does not support a set point, or the
-            model or its environment does not allow planning.
+        InvalidInput: the horizon is out of its range, the reward or the model does not support a set point, the model
+            does not move a coordinate with sensor noise, or the model or its environment does not allow planning.
     """
     if type(horizon) is not int or not 1 <= horizon <= MOST_HORIZON:
         raise InvalidInput(f"horizon: expected a whole number of steps from 1 to {MOST_HORIZON}, got {horizon!r}")
     model = with_set_points(model, tuple((set_points or {}).items()))
     inverse, able, steps = _requirements(model)
     kept = LimitSet.of(limits, model.definition.coordinate_names) if limits else None
-    policy = solve(steps, model.terminal_reward, model.definition.time_limit, kept)
-    return Planner(model.definition, inverse, able, policy, horizon, seed)
+    pending = PendingActions.of(steps)
+    policy = solve(pending, model.terminal_reward, model.definition.time_limit, kept)
+    noise = {name: std for name, std in (sensor_noise or {}).items() if std > 0}
+    state_filter = StateFilter.of(model, steps, noise) if noise else None
+    return Planner(model.definition, inverse, able, policy, horizon, seed, pending, state_filter)
 
 
 def allows_planning(model: DynamicsModel) -> bool:
@@ -102,7 +109,7 @@ def _inverse(definition: EnvironmentDefinition) -> ObservationInverse:
     for expected, holds in asked.items():
         if not holds:
             raise InvalidInput(f"a planner needs {expected}: train a policy")
-    inverse = ObservationInverse.of(definition)
+    inverse = ObservationInverse.of(definition, lags=True)
     found = {index for index, _ in inverse.sources}
     missing = [name for i, name in enumerate(names) if i not in found]
     if missing:
@@ -121,7 +128,8 @@ class Planner:
     begins anew. So episodes need no names, and a planner may serve several at once.
 
     It also keeps an estimate of the lasting error of the predicted change of each coordinate, and adds it to the steps
-    of the rollouts.
+    of the rollouts. If sensors are noisy, a Kalman filter estimates the state from the measurements since the plan
+    began. If actions take effect after a dead time, a plan begins at the state that is predicted for then.
     """
 
     definition: EnvironmentDefinition
@@ -130,15 +138,18 @@ class Planner:
     policy: GridPolicy
     horizon: int
     seed: int
+    pending: PendingActions
+    state_filter: StateFilter | None = None
     _calls: int = field(default=0, init=False)
 
     def __post_init__(self) -> None:
         low, high = (ends.cpu().numpy() for ends in self.definition.sampled)
         self._span = high - low
-        self._cyclic = self.policy.grid[3]
+        self._cyclic = np.array([c.kind == "angle" for c in self.definition.coordinates])
         self._changes = _changes(self.policy, self.horizon, self.seed)
-        self._arrived, self._plans = np.empty((0, len(low))), np.empty((0, self.horizon, len(self.policy.least)))
-        self._states, self._offsets = self._arrived, self._arrived
+        # A measurement this far from the predicted state, or nearer, continues a plan, (C,).
+        self._near = NEAR * self._span + (0.0 if self.state_filter is None else self.state_filter.errors)
+        self._last = Decisions.none(len(low), self.horizon, len(self.policy.least))
 
     def __call__(self, observations: NDArray[np.floating[Any]]) -> NDArray[Any]:
         actions = self.from_states(self.states(observations))
@@ -155,37 +166,79 @@ class Planner:
         If limits are declared, these are the actions of the policy on the grid, which keeps away from the limits. The
         rollouts do not know the limits.
         """
+        now, pending = self._continued(q), self.pending
         if self.definition.limits is not None:
-            return at_nearest_node(self.policy, q)
-        (plans, offsets), arrived = self._continued(q), np.empty_like(q)
-        actions = np.empty((len(q), plans.shape[2]))
-        changes = self._changes[self._calls % SETS]
-        for i in range(len(q)):
-            actions[i], arrived[i] = self.model.planned(self.policy, q[i], offsets[i], changes, ELITE, plans[i])
+            actions = at_nearest_node(self.policy, pending.seen(now.states))
+            now.arrived = pending.after(now.states, actions, now.offsets)
+        else:
+            actions = np.empty((len(q), now.plans.shape[2]))
+            changes, starts = self._changes[self._calls % SETS], pending.forecast(now.states, now.offsets)
+            for i in range(len(q)):
+                actions[i], now.arrived[i] = self.model.planned(
+                    self.policy, starts[i], now.offsets[i], pending.early, pending.late, changes, ELITE, now.plans[i]
+                )
+            if pending.dead:
+                now.arrived = pending.after(now.states, actions, now.offsets)
+        if self.state_filter is not None:
+            now.covariances = self.state_filter.predicted(now.states, now.covariances, actions)
         self._calls += 1
-        self._states, self._arrived, self._plans, self._offsets = q, arrived, plans, offsets
+        self._last = now
         return actions
 
-    def _continued(self, q: Floats) -> tuple[Floats, Floats]:
-        """Return the plan (T, F) to continue at each of the states q (N, C), and the estimated error (C,) of the
-        predicted change: those of the call before for the same row, or else for the row whose predicted state is
-        nearest. If no predicted state is near, return the policy's plan and 0."""
-        plans = np.full((len(q), *self._plans.shape[1:]), -1.0 if self.policy.choices else 0.0)
-        offsets = np.zeros_like(q)
-        for i in range(len(q) if len(self._arrived) else 0):
-            error = self._apart(q[i], self._arrived)
-            share = (np.abs(error) / self._span).max(1)
-            last = i if i < len(share) and share[i] <= NEAR else int(np.argmin(share))
-            if share[last] <= NEAR:
-                plans[i, :-1] = self._plans[last, 1:]
-                moved = np.abs(self._apart(q[i], self._states[last])) / self._span
-                offsets[i] = self._offsets[last] + (GAIN * error[last] if moved.max() <= STILL else 0.0)
-        return plans, offsets
+    def _continued(self, q: Floats) -> Decisions:
+        """Return what is known before the decisions at measured states q (N, C): the plans to continue, and the
+        estimated errors of the predicted changes. They are those of the call before for the same row, or else for the
+        row whose predicted state is nearest. If no predicted state is near, return the policy's plan and 0."""
+        last, count = self._last, len(q)
+        now = Decisions.none(len(self._span), self.horizon, len(self.policy.least), count)
+        now.states, rows = q.copy(), np.full(count, -1)
+        now.plans[:] = -1.0 if self.policy.choices else 0.0
+        for i in range(count if len(last.states) else 0):
+            share = (np.abs(self._apart(q[i], last.arrived)) / self._near).max(1)
+            row = i if i < len(share) and share[i] <= 1 else int(np.argmin(share))
+            if share[row] <= 1:
+                rows[i] = row
+        some = np.flatnonzero(rows >= 0)
+        before = rows[some]
+        if self.state_filter is not None:
+            now.covariances[:] = self.state_filter.measured
+            now.states[some], now.covariances[some] = self.state_filter.corrected(
+                q[some], last.arrived[before], last.covariances[before]
+            )
+        now.plans[some, :-1] = last.plans[before, 1:]
+        moved = np.abs(self._apart(now.states[some], last.states[before])) / self._span
+        still = moved.max(1, keepdims=True) <= STILL
+        error = self._apart(q[some], last.arrived[before])
+        now.offsets[some] = last.offsets[before] + np.where(still, GAIN * error, 0.0)
+        return now
 
     def _apart(self, q: Floats, others: Floats) -> Floats:
-        """Return q (C,) minus other states (..., C); differences of angles lie between -pi and pi."""
+        """Return q (..., C) minus other states (..., C); differences of angles lie between -pi and pi."""
         apart = q - others
         return np.where(self._cyclic, (apart + np.pi) % (2 * np.pi) - np.pi, apart)
+
+
+@dataclass(eq=False)
+class Decisions:
+    """What a planner keeps of a call with N states."""
+
+    states: Floats  # (N, C) measured or estimated states
+    arrived: Floats  # (N, C) predicted states after the first action
+    covariances: Floats  # (N, C, C) covariances of the estimated states; later those of the predicted ones
+    plans: Floats  # (N, T, F)
+    offsets: Floats  # (N, C) estimated lasting errors of the predicted changes
+
+    @classmethod
+    def none(cls, coordinates: int, horizon: int, entries: int, count: int = 0) -> Decisions:
+        """Return plans, states and errors of 0 for ``count`` states."""
+        shape = (count, coordinates)
+        return cls(
+            np.zeros(shape),
+            np.zeros(shape),
+            np.zeros((*shape, coordinates)),
+            np.zeros((count, horizon, entries)),
+            np.zeros(shape),
+        )
 
 
 def _changes(policy: GridPolicy, horizon: int, seed: int) -> Floats:

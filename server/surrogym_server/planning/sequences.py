@@ -16,6 +16,7 @@ from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.models.abilities import CompiledSteps, GridPolicy, offers
 from surrogym_server.models.port import DynamicsModel
 from surrogym_server.planning.grid import GridModel, at_nearest_node, discount_of, unfit
+from surrogym_server.planning.pending import PendingActions
 
 Floats = NDArray[np.float64]
 
@@ -35,19 +36,20 @@ def policy_sequences(model: DynamicsModel, starts: Tensor, length: int, *, seek_
     steps = None if compiled is None or unfit(definition) is not None else compiled.compiled()
     if steps is None:
         return None
-    on_grid = GridModel.of(steps, model.terminal_reward, NODES)
+    pending = PendingActions.of(steps)
+    on_grid = GridModel.of(pending, model.terminal_reward, NODES)
     policies = [on_grid.policy(discount_of(definition.time_limit))]
     if seek_end:
         ends = np.isnan(on_grid.q_next[:, :, 0]).astype(np.float32)
         policies.insert(0, on_grid.policy(SEEKING, ends))
-    return np.concatenate([_actions(model, policy, starts, length) for policy in policies])
+    return np.concatenate([_actions(model, pending, policy, starts, length) for policy in policies])
 
 
-def _actions(model: DynamicsModel, policy: GridPolicy, q: Tensor, length: int) -> Floats:
+def _actions(model: DynamicsModel, pending: PendingActions, policy: GridPolicy, q: Tensor, length: int) -> Floats:
     """Return the actions (s, T, F) of a policy along the mean paths from q (s, C). They go on after a termination."""
     taken = []
     for _ in range(length):
-        u = at_nearest_node(policy, q.numpy())
+        u = at_nearest_node(policy, pending.seen(q.numpy()))
         taken.append(u)
         q = _bounded(model.definition, model.transition(q, torch.from_numpy(u)).q_next)
     return np.stack(taken, 1)

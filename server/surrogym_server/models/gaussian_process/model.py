@@ -255,7 +255,15 @@ class GaussianProcessModel(
         return self._compiled is not None and self.prior is None
 
     def planned(
-        self, policy: GridPolicy, start: Array, offset: Array, changes: Array, elite: int, best: Array
+        self,
+        policy: GridPolicy,
+        start: Array,
+        offset: Array,
+        early: NDArray[np.int64],
+        late: bool,
+        changes: Array,
+        elite: int,
+        best: Array,
     ) -> tuple[Array, Array]:
         from surrogym_server.models.gaussian_process.prediction.compiled.plan import plan
 
@@ -264,7 +272,7 @@ class GaussianProcessModel(
         known = np.zeros((0, 0))
         if offset.any() and not self.definition.moves_observation:
             known = np.zeros((changes.shape[1], len(steps.uses)))
-            known[:, : len(offset)] = offset
+            known[:, : len(self.definition.moving)] = offset[list(self.definition.moving)]
         low, cell, count, cyclic = policy.grid
         plan(
             *steps.tables,
@@ -286,6 +294,8 @@ class GaussianProcessModel(
             policy.avoided.price,
             start,
             known,
+            early,
+            late,
             changes,
             elite,
             best,

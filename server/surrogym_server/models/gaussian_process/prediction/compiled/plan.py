@@ -10,13 +10,41 @@ from surrogym_server.compiled.grid import GRID, interpolated, locate, policy_act
 from surrogym_server.environment.compiled.limits import beyond
 from surrogym_server.models.gaussian_process.prediction.compiled.regions import judge
 from surrogym_server.models.gaussian_process.prediction.compiled.step import step
-from surrogym_shared.compiled.jit import entry
+from surrogym_shared.compiled.jit import compiled, entry
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
 KEEP = -2.0  # in the changes of a discrete action: the action of the best plan so far, -1 being the policy's
+
+
+@compiled
+def end_without_action(
+    numbers: Floats,
+    places: Ints,
+    outputs: int,
+    q: Floats,
+    known: Floats,
+    early: Ints,
+    choices: int,
+    least: Floats,
+    most: Floats,
+    without: Floats,
+    u: Floats,
+    end: Floats,
+) -> None:
+    """Write the states (N, C) at the end of a step from q (N, C) without a new action to ``end``. ``without`` (N, C)
+    and ``u`` (N, F) are overwritten; ``plan`` explains the other arguments."""
+    none = np.zeros((0, 0))
+    for i in range(len(q)):
+        without[i] = q[i]
+        for f in range(u.shape[1]):
+            u[i, f] = 0.0 if choices else min(max(0.0, least[f]), most[f])
+        for e in range(len(early)):
+            without[i, early[e, 0]] = u[i, early[e, 1]]
+    reward, std, over = np.empty(len(q)), np.empty((len(q), outputs)), np.empty(len(q), np.bool_)
+    step(numbers, places, without, u, none, none, none, known, False, False, end, reward, std, over, none)
 
 
 @entry(
@@ -37,6 +65,8 @@ KEEP = -2.0  # in the changes of a discrete action: the action of the best plan 
     types.float64,
     types.float64[::1],
     types.float64[:, ::1],
+    types.int64[:, ::1],
+    types.boolean,
     types.float64[:, :, :, ::1],
     types.int64,
     types.float64[:, ::1],
@@ -64,6 +94,8 @@ def plan(
     price: float,
     start: Floats,
     known: Floats,
+    early: Ints,
+    late: bool,
     changes: Floats,
     elite: int,
     best: Floats,
@@ -90,6 +122,8 @@ def plan(
         price: cost of a step beyond limits, in addition to as much for each unit of the distance beyond them.
         start: (C,) state.
         known: (N, columns) numbers to add to the model's outputs at each step, or (0, 0), as in ``step.step``.
+        early: (E, 2) index and action entry of the coordinates that take each step's action before the step.
+        late: whether the policy and the values are functions of the end of a step without the new action.
         changes: (R, N, T, F) changes to try. Continuous ones are added to the mean of the ``elite`` best plans of the
             round before. A discrete one is an action, -1 for the policy's, or ``KEEP``. Rollout 0 of the first round
             follows the policy, rollout 1 the plan ``best``, whatever their changes are.
@@ -104,7 +138,8 @@ def plan(
     reward, std, over = np.empty(lanes), np.empty((lanes, outputs)), np.empty(lanes, np.bool_)
     running, total = np.empty(lanes, np.bool_), np.empty(lanes)
     plans, first, reached = np.empty((lanes, steps, entries)), np.empty((lanes, entries)), np.empty((lanes, size))
-    ends, share, votes = np.empty((size, 2), np.int64), np.empty(size), np.empty(choices)
+    ends, share, votes = np.empty((len(low), 2), np.int64), np.empty(len(low)), np.empty(choices)
+    without, seen = np.empty((lanes, size)), np.empty((lanes, size))
     centre, highest = best.copy(), -np.inf
     for k in range(rounds):
         for i in range(lanes):
@@ -122,13 +157,19 @@ def plan(
             q[i], running[i], total[i] = start, True, 0.0
         weight = 1.0
         for t in range(steps):
+            if late:
+                end_without_action(numbers, places, outputs, q, known, early, choices, least, most, without, u, seen)
+            else:
+                seen = q
             for i in range(lanes):
-                policy_action(low, cell, count, cyclic, table, choices, q[i], ends, share, votes, u[i])
+                policy_action(low, cell, count, cyclic, table, choices, seen[i], ends, share, votes, u[i])
                 for f in range(entries):
                     if choices and plans[i, t, f] >= 0:
                         u[i, f] = plans[i, t, f]
                     elif not choices:
                         u[i, f] = min(max(u[i, f] + plans[i, t, f], least[f]), most[f])
+                for e in range(len(early)):
+                    q[i, early[e, 0]] = u[i, early[e, 1]]
             step(numbers, places, q, u, none, none, none, known, False, False, q_next, reward, std, over, none)
             if has_regions:
                 judge(numbers, places, q, q_next, entries, False, reward, std, over)
@@ -145,9 +186,13 @@ def plan(
                     running[i] = not over[i]
             q, q_next = q_next, q
             weight *= discount
+        if late:
+            end_without_action(numbers, places, outputs, q, known, early, choices, least, most, without, u, seen)
+        else:
+            seen = q
         for i in range(lanes):
             if running[i]:
-                locate(low, cell, count, cyclic, q[i], ends, share)
+                locate(low, cell, count, cyclic, seen[i], ends, share)
                 total[i] += weight * interpolated(values, ends, share)
         order = np.argsort(-total)
         if total[order[0]] > highest:
