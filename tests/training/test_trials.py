@@ -92,13 +92,13 @@ class Edged(Late):
         edges = Limit(name="edges", term=Term.linear(level=1), low=-1.9, high=1.9, margin=0.3)
         limits = Limits(keep=(edges,), fallback=(Term.linear(level=-1),))
         own = super().spec()
-        start = {**own.start, "level": Uniform(low=0.5, high=1.5)}
+        start = {**own.start, "level": Uniform(low=1.0, high=1.5)}
         changes = {"limits": limits.model_dump(), "sampling_period": 0.1, "start": start}
         return EnvironmentSpec.model_validate({**own.model_dump(), **changes})
 
     def reset(self, *, seed=None):
         super().reset(seed=seed)
-        self.level = 1 + self.level / 3
+        self.level = 1.25 + self.level / 6
         return self.level, {}
 
 
@@ -261,7 +261,7 @@ def test_the_sampler_keeps_declared_limits_in_the_trial_of_a_policy_that_pushes_
     assert (before.phase, before.budget_left > 0) == ("unsure", True)
     assert allows_trials(before.spec, SETTINGS)
     assert trials._try(idle(1.0), EPISODE, 0) is True
-    tried = [sample for sample in trials.api.samples(waiting) if sample.id > before.samples]
+    tried = list(trials.api.samples(waiting))[before.samples :]
     reached = np.array([sample.next_coordinates for sample in tried])
     assert len(tried) == EPISODE
     assert not past(before.spec, reached).any()
