@@ -173,7 +173,7 @@ def run(
         calibrated = [f"{one}={own[one] * (1 - off) / 2}..{own[one] * (1 + off) * 2}" for one in calibrated]
     prior = None if arm == "cold" else surrogym.Prior(simulator, spec, calibrated)
     if arm == "alone" and prior is not None:
-        model, phase, steps = LocalSurrogate.from_bytes(spec, prior.learned().model), "alone", 0
+        model, phase, steps = LocalSurrogate.from_bytes(spec, prior.learned()[0].model), "alone", 0
     else:
         design, machine = surrogym.Design(spec, budget=budget, prior=prior, threads=2), plant(access)
         while (query := design.ask()) is not None:

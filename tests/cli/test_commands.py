@@ -305,6 +305,18 @@ def test_the_evaluate_command_reports_returns_for_the_set_points_of_the_card(sur
     assert "the promise for the set point x = 0.25 is not judged" in surrogym(*arguments).out
 
 
+def test_the_evaluate_command_says_how_episodes_kept_the_limits_of_a_planner(surrogym, monkeypatch, tmp_path):
+    (tmp_path / "policy.zip").write_bytes(stored({}))
+    card = PolicyCard(spec=DECLARED, settings={"limits": ["x<=0.6", "x<=0.9", "y<=1"]})
+    (tmp_path / "policy.json").write_text(card.model_dump_json())
+    monkeypatch.setattr("surrogym_trainer.policies.files.load_policy", lambda *_, **__: lambda o: np.ones((len(o), 1)))
+    said = surrogym("evaluate", "policy.zip", "--env", "support.moody:Alike", "--episodes", "2")
+    assert said.code == 0, said.err  # x is 0.25, 0.35, ..., 0.75
+    assert "limit x<=0.6: 2 of 2 episodes left it; least distance -0.15" in said.out
+    assert "limit x<=0.9: 0 of 2 episodes left it; least distance 0.15" in said.out
+    assert "limit 'y<=1': expected a sum of coordinates" in said.out
+
+
 def test_the_evaluate_command_shows_a_policy_the_integrals_of_its_card(surrogym, monkeypatch, tmp_path):
     shown = []
 

@@ -84,6 +84,11 @@ def test_an_uncertain_model_of_a_simulator_is_learned_from_more_steps_on_the_ser
     assert said.json["prior"]["about"]["simulated_steps"] == 80
 
 
+def test_the_command_prior_says_that_the_model_of_the_simulator_is_not_certain(on_server, sampled):
+    said = on_server("prior", sampled, "support.hinge:Stiff", *PARAMETERS, "--steps", "15")
+    assert "a model of 15 of its steps is not certain (confidence index 0." in said.out
+
+
 def test_a_prior_in_other_units_is_said_to_have_too_large_errors_and_the_design_goes_without_it(on_server, sampled):
     said = on_server("prior", sampled, "support.hinge:Degrees", "-p", "mass", "--steps", "60")
     assert said.code == 0

@@ -128,10 +128,11 @@ def test_the_report_of_an_evaluated_policy_has_every_section(modelled: Known):
     assert "What could not be read" not in parts
 
 
-def test_the_report_names_the_set_points_of_the_returns(modelled: Known):
-    aimed = policy(settings={"session": {"set_points": {"speed": 1.5}}})
+def test_the_report_names_the_set_points_of_the_returns_and_the_limits_of_a_planner(modelled: Known):
+    aimed = policy(settings={"session": {"set_points": {"speed": 1.5}}, "limits": ["speed<=2", "speed>=0"]})
     parts = told(replace(modelled, policy=aimed, real=evaluation()))
     assert "set points of the returns speed = 1.5" in parts["What it gives"]
+    assert "limits at run time speed<=2, speed>=0" in parts["What it gives"]
     assert "set points" not in told(replace(modelled, policy=policy(), real=evaluation()))["What it gives"]
 
 

@@ -166,18 +166,20 @@ class SimulatorPrior(ABC):
         self.calibration = found
         self._set(found.values)
         self._seconds = step.seconds
-        self.file = replace(self.learned(progress), about=self._about(found))
+        file, confidence = self.learned(progress)
+        self.file = replace(file, about=self._about(found, confidence))
         return True
 
-    def learned(self, progress: Progress = silent) -> SurrogateFile:
-        """Learn a model of the simulator with its current parameters, and return it. If no number of simulated steps
-        was given, the simulator is not slow, and the model is not certain, learn it from more steps."""
+    def learned(self, progress: Progress = silent) -> tuple[SurrogateFile, float]:
+        """Learn a model of the simulator with its current parameters, and return it and its confidence index. If no
+        number of simulated steps was given, the simulator is not slow, and the model is not certain, learn it from more
+        steps."""
         file, confidence = self.learn(progress)
         if self._may_extend and confidence < self.spec.design.target and self._seconds < SLOW:
             self._may_extend, self.steps = False, FURTHER
             self.spec = _of_steps(self.spec, self.steps)
-            file, _ = self.learn(progress)
-        return file
+            file, confidence = self.learn(progress)
+        return file, confidence
 
     def close(self) -> None:
         """Close the simulator."""
@@ -198,7 +200,7 @@ class SimulatorPrior(ABC):
         values = np.array([by.values[parameter.name] for parameter in self.parameters])
         return calibrate(self.spec, steps, (), values, self._step).error
 
-    def _about(self, found: Calibration) -> dict[str, Any]:
+    def _about(self, found: Calibration, confidence: float) -> dict[str, Any]:
         return PriorAbout(
             source=self.source,
             parameters=[CalibratedParameter(**vars(parameter)) for parameter in found.parameters],
@@ -206,6 +208,7 @@ class SimulatorPrior(ABC):
             error_before=found.error_before,
             error=found.error,
             simulated_steps=self.steps,
+            confidence_index=confidence,
         ).model_dump(mode="json")
 
 

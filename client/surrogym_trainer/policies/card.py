@@ -79,13 +79,19 @@ class PolicyCard(BaseModel):
     @property
     def limits(self) -> tuple[str, ...]:
         """Limits that a planner keeps besides those of the specification, such as ``level<=11``."""
-        return tuple(self.settings.get("limits") or ())
+        return limits_in(self.settings)
 
 
 def set_points_in(settings: Mapping[str, Any]) -> dict[str, float]:
     """Return the set points, by coordinate, in the settings of a training, as a card and the server have them."""
     session = settings.get("session")
     return dict(session.get("set_points") or {}) if isinstance(session, dict) else {}
+
+
+def limits_in(settings: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the limits that a planner got at run time, from the settings of a training."""
+    limits = settings.get("limits")
+    return tuple(map(str, limits)) if isinstance(limits, list | tuple) else ()
 
 
 def words_of_set_points(points: Mapping[str, float]) -> str:

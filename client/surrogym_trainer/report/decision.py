@@ -47,7 +47,7 @@ from surrogym_shared.wire import (
 from surrogym_shared.words import counted
 from surrogym_trainer.coverage import Cut
 from surrogym_trainer.figures import WIDTH, svg, with_unit
-from surrogym_trainer.policies.card import set_points_in, words_of_set_points
+from surrogym_trainer.policies.card import limits_in, set_points_in, words_of_set_points
 from surrogym_trainer.report.html import bullets, moving, on_screen, paragraph, picture, section, table
 from surrogym_trainer.report.known import PREFERRED, Known
 
@@ -110,9 +110,11 @@ def _result(known: Known) -> str:
         why = "There is no controller yet." if known.policy is None else "It has not been tested in reality."
         return section("What it gives", paragraph(why) + _further(known))
     points = words_of_set_points(set_points_in(known.policy.settings)) if known.policy is not None else ""
+    limits = limits_in(known.policy.settings) if known.policy is not None else ()
     rows = [
         ("average return", mean(real)),
         *([("set points of the returns", points)] if points else []),
+        *([("limits at run time", ", ".join(limits))] if limits else []),
         ("episodes that succeeded", "no criterion was declared" if real.success_rate is None else successes(real)),
         ("best, median and worst return", " / ".join(number(one) for one in (real.most, real.median, real.least))),
         ("real episodes", f"{real.episodes} ({starts_of(real)})"),

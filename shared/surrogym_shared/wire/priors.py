@@ -39,6 +39,9 @@ class PriorAbout(Request):
     simulated_steps: int = Field(
         default=0, ge=0, description="number of simulated steps that the prior was learned from"
     )
+    confidence_index: Share | None = Field(
+        default=None, le=1, description="confidence index of the model that was learned from these simulated steps"
+    )
 
 
 class PriorView(Reply):

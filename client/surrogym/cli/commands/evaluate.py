@@ -228,7 +228,11 @@ def _planned_limits(card: PolicyCard, result: Evaluation) -> list[str]:
         return []
     lines = []
     for text in card.limits:
-        keep = [limit_of(card.spec, text)]
+        try:
+            keep = [limit_of(card.spec, text)]
+        except ValueError as error:  # the card was changed
+            lines.append(str(error))
+            continue
         least = [float(distances(card.spec, keep, trace.coordinates).min()) for trace in result.traces]
         left, nearest = sum(one < 0 for one in least), min(least)
         lines.append(f"limit {text}: {left} of {counted(len(least), 'episode')} left it; least distance {nearest:.4g}")

@@ -223,7 +223,7 @@ def _from_zip(content: bytes, form: str, algorithm: str) -> bytes:
 
 def _words(name: str, policy: PolicyDetail) -> str:
     from surrogym_shared.limits import words_of_fallbacks
-    from surrogym_trainer.policies.card import set_points_in, words_of_set_points
+    from surrogym_trainer.policies.card import limits_in, set_points_in, words_of_set_points
 
     aliases = f", {', '.join(policy.aliases)}" if policy.aliases else ""
     lines = [f"{name}@{policy.version}{aliases}: {policy.algorithm or 'unknown algorithm'}"]
@@ -235,6 +235,8 @@ def _words(name: str, policy: PolicyDetail) -> str:
         lines.append(f"training: {policy.virtual_steps} virtual steps")
     if points := words_of_set_points(set_points_in(policy.settings)):
         lines.append(f"set points: {points}")
+    if limits := limits_in(policy.settings):
+        lines.append(f"limits at run time: {', '.join(limits)}")
     if policy.promise is None:
         lines.append("promise: none was made")
     else:

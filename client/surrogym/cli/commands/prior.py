@@ -32,6 +32,8 @@ LEAST = 2  # a prior is calibrated on at least this number of real steps
 LACKING = 0.01
 # if it exceeds this share, a model that predicts no change at all is better
 USELESS = 1.0
+# a model of a simulator with a smaller confidence index is said not to be certain
+CERTAIN = 0.999
 
 
 def command(
@@ -251,6 +253,11 @@ def words_of_prior(about: PriorAbout) -> list[str]:
         steps = f"on {about.real_steps} real steps"
         lines.append(
             f"  error {about.error_before:.2%} of the changes as it was, {about.error:.2%} calibrated, {steps}"
+        )
+    if about.confidence_index is not None and about.confidence_index < CERTAIN:
+        lines.append(
+            f"  a model of {about.simulated_steps} of its steps is not certain (confidence index "
+            f"{about.confidence_index:.4g}), so the design takes more real steps: --steps learns it from more"
         )
     return lines
 

@@ -282,7 +282,7 @@ class _Renewal:
         """
         from surrogym_client.surrogates.waiting import share_of_design, wait_for_design, words_of_design
         from surrogym_client.transport import HttpSurrogate
-        from surrogym_trainer.policies.card import write_card
+        from surrogym_trainer.policies.card import limits_in, write_card
         from surrogym_trainer.policies.integrals import with_integrals
         from surrogym_trainer.policies.pushing import push
         from surrogym_trainer.training.audited import AuditedTraining
@@ -304,7 +304,7 @@ class _Renewal:
         with TemporaryDirectory() as folder, HttpSurrogate(self.api.url, self.target, self.token) as http:
             port = with_integrals(http, integral, self._aimed().get("set_points", {}))
             start = self._network(Path(folder) / "old.zip", port)
-            limits = self.old.settings.get("limits")  # of a planner
+            limits = limits_in(self.old.settings)
             settings = TrainSettings(
                 algorithm=self._algorithm(),
                 start_from=start,
