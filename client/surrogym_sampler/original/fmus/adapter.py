@@ -68,11 +68,11 @@ class Fmu(Simulator):
             )
         outputs = archive.of_causality("output") or state
         self._state, self._size = state, len(state)
-        given = {v: choices.start.get(v.name, v.start) for v in archive.of_causality("parameter") if v.can_start}
-        self._parameters = {v: float(value) for v, value in given.items() if value is not None}
         self._has_snapshots = archive.snapshots
         step = self.period = step_of(archive, choices)
         self._process = Process(archive, inputs, [*state, *outputs], step, start_values(archive, choices))
+        given = {v: choices.start.get(v.name, v.start) for v in archive.of_causality("parameter") if v.can_start}
+        self._parameters = {v: float(value) for v, value in given.items() if value is not None}
         try:
             self.variables = _variables(state)
             limits = [choices.limits.get(v.name) or _limits(v) or UNKNOWN_LIMITS for v in inputs]
