@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surrogym_server.models.abilities import ArraySteps
-from surrogym_shared.spec import BoxAction
+from surrogym_shared.spec import BoxAction, DiscreteAction
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -29,6 +29,9 @@ POINTS = 512  # random states and actions at which effects of actions are compar
 # An action of one age has an effect on a coordinate if it changes the next value by at least this share of what the
 # action of the strongest age does.
 EFFECT = 0.05
+# Effects on a coordinate are compared with at least this share of the largest effect on any coordinate, so that
+# rounding errors are none.
+SLIGHT = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +88,11 @@ def _felt(steps: ArraySteps, repeated: Ints) -> NDArray[np.bool_]:
     rng, columns = np.random.default_rng(0), list(steps.definition.moving)
     q, other = (rng.uniform(low, high, (POINTS, len(low))) for _ in range(2))
     u, instead = (np.array([rng.uniform(*ends, POINTS) for ends in steps.definition.action.ranges]).T for _ in range(2))
+    if isinstance(steps.definition.action, DiscreteAction):
+        for numbers in (u, instead):
+            np.rint(numbers, out=numbers)
+        for states in (q, other):
+            states[:, repeated[:, 0]] = np.rint(states[:, repeated[:, 0]])
 
     def predicted(age: int) -> Floats:
         """Predict the states (POINTS, M) with another action of this age; of -1: of none."""
@@ -95,7 +103,9 @@ def _felt(steps: ArraySteps, repeated: Ints) -> NDArray[np.bool_]:
         return found.q_next[:, columns]
 
     unchanged = predicted(-1)
-    # change of each coordinate of the next state by another action of each age, as root mean square
-    effect = np.array([np.sqrt(np.square(predicted(age) - unchanged).mean(0)) for age in range(oldest + 1)])
-    felt = np.asarray((effect >= EFFECT * effect.max(0).clip(1e-12)).any(1))
+    # Change of each coordinate of the next state by another action of each age: root mean square, as a share of the
+    # sampling range.
+    span = (high - low)[columns]
+    effect = np.array([np.sqrt(np.square((predicted(age) - unchanged) / span).mean(0)) for age in range(oldest + 1)])
+    felt = np.asarray((effect >= EFFECT * effect.max(0).clip(SLIGHT * effect.max())).any(1))
     return felt if felt.any() else np.arange(oldest + 1) == 0

@@ -55,6 +55,16 @@ def test_the_dead_time_is_found(shares: tuple[float, ...], dead: int, late: bool
     assert found.early.tolist() == [[2 + age, 0] for age in range(dead)]
 
 
+def test_rounding_errors_are_no_effect():
+    class Rounding(Late):
+        def __call__(self, q, u, **options):
+            found = super().__call__(q, u, **options)
+            found.q_next[:, 0] = q[:, 0] + 1e-12 * u[:, 0]
+            return found
+
+    assert PendingActions.of(Rounding(0.0, 1.0)).dead == 1  # type: ignore[arg-type]
+
+
 def test_the_state_is_predicted_for_when_an_action_takes_effect():
     steps = Late(0.0, 0.0, 0.5, 0.5)
     pending, q = PendingActions.of(steps), np.array([[1.0, 0.5, 0.7, -0.3, 0.4]])  # type: ignore[arg-type]
