@@ -105,7 +105,9 @@ class Design:
         self.budget = default_budget(spec) if budget is None else checks.whole("budget", budget, 2, checks.MOST_STEPS)
         self.target = spec.design.target if target is None else checks.share("target", target)
         self._threads = checks.whole("threads", threads, 1, checks.MOST_THREADS)
-        self._definition = definition_from_spec(spec)
+        # Here no policy tries episodes, so the design leaves no steps to them.
+        own = spec.model_copy(update={"design": spec.design.model_copy(update={"trials": False})})
+        self._definition = definition_from_spec(own)
         self._prior = prior
         self._name = uuid4().hex
         self._ids = itertools.count(1)

@@ -60,7 +60,6 @@ class DesignJob:
     threads: int = 1
     previous: bytes | None = None  # file of the previous round's model, which predicts the samples that came since
     prior: bytes | None = None  # file of a prior model, such as one learned from a simulator; None without a prior
-    trials: bool = False  # whether policies may try episodes later, with the rest of the budget
 
 
 @dataclass(frozen=True)
@@ -196,7 +195,6 @@ def _request(job: DesignJob) -> Request:
         unlearned=int((~_is_known(job)).sum()),
         open=job.open_steps,
         prior=None if job.prior is None else from_bytes(job.definition, job.prior),
-        trials=job.trials,
     )
 
 

@@ -98,7 +98,6 @@ class Request:
     unlearned: int = 0  # number of real steps that are not among the samples, because lags (past values) were not known
     open: int = 0  # number of real steps of the pending queries that may still be answered, without those set aside
     prior: DynamicsModel | None = None  # model of what is known beforehand, such as a model of a simulator
-    trials: bool = False  # whether policies may try episodes later, with the rest of the budget
     surprises: Predictions = ()  # predictions of this round's new samples by the previous model
 
     def cost(self, samples: int) -> int:

@@ -336,7 +336,6 @@ class Designer:
             occupancy=None if visits is None else visits.states,
             threads=self._settings.threads,
             prior=self._storage.priors.blob(name),
-            trials=True,
             previous=self._previous(name) if set(samples.purpose).difference(UNCHOSEN) else None,
         )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,10 +20,11 @@ from surrogym_server.convert import definition_from_spec
 from surrogym_server.planning.planner import allows_planning
 from surrogym_server.sampling.judging import judge_model
 from surrogym_server.sampling.round import Round
+from surrogym_server.sampling.rules.left import leave_to_trials
 from surrogym_server.sampling.rules.trials import try_planner
 from surrogym_server.sampling.state import DesignState, Request
 from surrogym_shared.limits import past
-from surrogym_shared.spec import EnvironmentSpec
+from surrogym_shared.spec import EnvironmentSpec, with_history
 
 STEPS = 30
 
@@ -104,3 +106,14 @@ def test_the_actions_of_any_other_query_are_its_own():
     query = design.ask()
     assert query is not None
     assert [design.acting(query)(i, [0.0, 0.0]) for i in range(query.steps)] == list(query.actions)
+
+
+def test_a_design_without_trials_leaves_no_steps_to_them():
+    spec = with_history(cartpole().model_copy(update={"query": "rollout"}), actions=2)
+    alone = spec.model_copy(update={"design": spec.design.model_copy(update={"trials": False})})
+    assert (spec.needs_trials, alone.needs_trials) == (True, False)
+    left = []
+    for own in (spec, alone):
+        facts = SimpleNamespace(definition=definition_from_spec(own), continues=True, testing=False, cost=1_000)
+        left.append(leave_to_trials(facts))  # type: ignore[arg-type]
+    assert left == [(), None]

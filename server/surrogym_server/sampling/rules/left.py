@@ -18,7 +18,7 @@ def leave_to_trials(round: Round) -> tuple[Query, ...] | None:
     from them, and the sampler keeps them in its trial.
     """
     definition, size = round.definition, len(round.definition.coordinates)
-    if not round.request.trials or not round.continues or round.testing or definition.snapshots:
+    if not definition.design.trials or not round.continues or round.testing or definition.snapshots:
         return None
     if size <= MOST_PLANNED or round.cost < STEPS * (size + definition.action.size):
         return None
