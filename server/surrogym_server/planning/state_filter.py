@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from surrogym_server.errors import InvalidInput
 from surrogym_server.models.abilities import ArraySteps, LearnedNoise, offers
 from surrogym_server.models.port import DynamicsModel
+from surrogym_shared.spec import DiscreteAction
 
 Floats = NDArray[np.float64]
 
@@ -41,9 +42,15 @@ class StateFilter:
         """Return the filter of a model, for sensors with the standard deviations ``noise``, by coordinate.
 
         Raises:
-            InvalidInput: a name is not that of a coordinate that the model moves.
+            InvalidInput: a name is not that of a coordinate that the model moves, or the model predicts changes of the
+                observation.
         """
         definition = model.definition
+        if definition.moves_observation:
+            raise InvalidInput(
+                "sensor_noise: expected a model that predicts changes of coordinates, got one of the observation "
+                "(preset 'paper')"
+            )
         names, moving = definition.coordinate_names, np.array(definition.moving)
         low, high = (ends.cpu().numpy() for ends in definition.sampled)
         for name in noise:
@@ -65,7 +72,10 @@ class StateFilter:
         over the sampling range from ``low`` to ``high`` (C,)."""
         rng = np.random.default_rng(0)
         q = rng.uniform(low, high, (POINTS, len(low)))
-        u = np.array([rng.uniform(*ends, POINTS) for ends in self.steps.definition.action.ranges]).T
+        action = self.steps.definition.action
+        u = np.array([rng.uniform(*ends, POINTS) for ends in action.ranges]).T
+        if isinstance(action, DiscreteAction):
+            u = np.rint(u)
         jacobian, _ = self._around(q, u)
         return np.asarray((jacobian**2 @ np.diag(self.measured)).mean(0))
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -78,3 +80,11 @@ def test_an_exact_sensor_is_believed_and_a_measurement_that_contradicts_the_pred
 def test_noise_of_an_unknown_coordinate_is_refused():
     with pytest.raises(InvalidInput, match="expected names of coordinates that change in steps, got 'heat'"):
         StateFilter.of(Model(), Linear(), {"heat": 0.1})  # type: ignore[arg-type]
+
+
+def test_a_model_of_the_observation_is_refused():
+    class OfObservation:
+        definition = SimpleNamespace(moves_observation=True)
+
+    with pytest.raises(InvalidInput, match=r"expected a model that predicts changes of coordinates, got .*'paper'"):
+        StateFilter.of(OfObservation(), Linear(), {})  # type: ignore[arg-type]
