@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surrogym_server.models.abilities import ArraySteps
-from surrogym_shared.spec import BoxAction, DiscreteAction
+from surrogym_shared.spec import Action, BoxAction, DiscreteAction
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -78,6 +78,12 @@ class PendingActions:
         return self.after(q, np.tile(self.neutral, (len(q), 1)), none)
 
 
+def random_actions(action: Action, rng: np.random.Generator, count: int) -> Floats:
+    """Return random actions (count, F). One discrete action is its number."""
+    drawn = np.array([rng.uniform(*ends, count) for ends in action.ranges]).T
+    return np.rint(drawn) if isinstance(action, DiscreteAction) else drawn
+
+
 def _felt(steps: ArraySteps, repeated: Ints) -> NDArray[np.bool_]:
     """Return whether the action has an effect on the next step, and each earlier one up to the oldest that a coordinate
     repeats. At least one has."""
@@ -87,10 +93,8 @@ def _felt(steps: ArraySteps, repeated: Ints) -> NDArray[np.bool_]:
     low, high = (ends.cpu().numpy() for ends in steps.definition.sampled)
     rng, columns = np.random.default_rng(0), list(steps.definition.moving)
     q, other = (rng.uniform(low, high, (POINTS, len(low))) for _ in range(2))
-    u, instead = (np.array([rng.uniform(*ends, POINTS) for ends in steps.definition.action.ranges]).T for _ in range(2))
+    u, instead = (random_actions(steps.definition.action, rng, POINTS) for _ in range(2))
     if isinstance(steps.definition.action, DiscreteAction):
-        for numbers in (u, instead):
-            np.rint(numbers, out=numbers)
         for states in (q, other):
             states[:, repeated[:, 0]] = np.rint(states[:, repeated[:, 0]])
 

@@ -18,7 +18,7 @@ from surrogym_server.models.abilities import ArraySteps, CompiledSteps, GridPoli
 from surrogym_server.models.port import DynamicsModel, with_set_points
 from surrogym_server.planning.grid import at_nearest_node, solve, unfit
 from surrogym_server.planning.pending import PendingActions
-from surrogym_server.planning.state_filter import StateFilter
+from surrogym_server.planning.state_filter import StateFilter, apart
 from surrogym_shared.spec import BoxAction, Limit
 
 Floats = NDArray[np.float64]
@@ -194,7 +194,7 @@ class Planner:
         now.states, rows = q.copy(), np.full(count, -1)
         now.plans[:] = -1.0 if self.policy.choices else 0.0
         for i in range(count if len(last.states) else 0):
-            share = (np.abs(self._apart(q[i], last.arrived)) / self._near).max(1)
+            share = (np.abs(apart(q[i], last.arrived, self._cyclic)) / self._near).max(1)
             row = i if i < len(share) and share[i] <= 1 else int(np.argmin(share))
             if share[row] <= 1:
                 rows[i] = row
@@ -206,16 +206,11 @@ class Planner:
                 q[some], last.arrived[before], last.covariances[before]
             )
         now.plans[some, :-1] = last.plans[before, 1:]
-        moved = np.abs(self._apart(now.states[some], last.states[before])) / self._span
+        moved = np.abs(apart(now.states[some], last.states[before], self._cyclic)) / self._span
         still = moved.max(1, keepdims=True) <= STILL
-        error = self._apart(q[some], last.arrived[before])
+        error = apart(q[some], last.arrived[before], self._cyclic)
         now.offsets[some] = last.offsets[before] + np.where(still, GAIN * error, 0.0)
         return now
-
-    def _apart(self, q: Floats, others: Floats) -> Floats:
-        """Return q (..., C) minus other states (..., C); differences of angles lie between -pi and pi."""
-        apart = q - others
-        return np.where(self._cyclic, (apart + np.pi) % (2 * np.pi) - np.pi, apart)
 
 
 @dataclass(eq=False)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from surrogym_server.errors import InvalidInput
 from surrogym_server.models.abilities import ArraySteps, LearnedNoise, offers
 from surrogym_server.models.port import DynamicsModel
-from surrogym_shared.spec import DiscreteAction
+from surrogym_server.planning.pending import random_actions
 
 Floats = NDArray[np.float64]
 
@@ -72,10 +72,7 @@ class StateFilter:
         over the sampling range from ``low`` to ``high`` (C,)."""
         rng = np.random.default_rng(0)
         q = rng.uniform(low, high, (POINTS, len(low)))
-        action = self.steps.definition.action
-        u = np.array([rng.uniform(*ends, POINTS) for ends in action.ranges]).T
-        if isinstance(action, DiscreteAction):
-            u = np.rint(u)
+        u = random_actions(self.steps.definition.action, rng, POINTS)
         jacobian, _ = self._around(q, u)
         return np.asarray((jacobian**2 @ np.diag(self.measured)).mean(0))
 
@@ -83,11 +80,6 @@ class StateFilter:
     def errors(self) -> Floats:
         """Largest errors of measurements that are expected, (C,)."""
         return CONTRADICTION * self.span * np.sqrt(np.diagonal(self.measured))
-
-    def apart(self, q: Floats, others: Floats) -> Floats:
-        """Return q (..., C) minus other states (..., C); differences of angles lie between -pi and pi."""
-        apart = q - others
-        return np.where(self.cyclic, (apart + np.pi) % (2 * np.pi) - np.pi, apart)
 
     def predicted(self, q: Floats, covariance: Floats, u: Floats) -> Floats:
         """Return the covariances (N, C, C) of the states after a step from states q (N, C), which have the covariances
@@ -106,7 +98,7 @@ class StateFilter:
         acting = np.repeat(u, points, axis=0)
         found = self.steps(around, acting, noise=None, process=None, paths=None, stds=True, reward_std=False)
         after = found.q_next.reshape(count, points, size)
-        slopes = self.apart(after[:, :size], after[:, size:-1]) / self.span / (2 * DIFFERENCE)
+        slopes = apart(after[:, :size], after[:, size:-1], self.cyclic) / self.span / (2 * DIFFERENCE)
         uncertain = np.zeros((count, size))
         std = found.std.reshape(count, points, -1)[:, -1, : len(self.moving)]
         uncertain[:, self.moving] = (std / self.span[self.moving]) ** 2
@@ -118,7 +110,7 @@ class StateFilter:
 
         If a measurement contradicts the prediction, the state begins anew at what was measured.
         """
-        error = self.apart(measured, q) / self.span
+        error = apart(measured, q, self.cyclic) / self.span
         total = covariance + self.measured
         gain = np.linalg.solve(total, covariance).swapaxes(1, 2)
         state = q + self.span * (gain @ error[:, :, None])[:, :, 0]
@@ -128,3 +120,10 @@ class StateFilter:
         anew = np.flatnonzero(~within.all(1))
         state[anew], after[anew] = measured[anew], self.measured
         return state, after
+
+
+def apart(q: Floats, others: Floats, cyclic: NDArray[np.bool_]) -> Floats:
+    """Return q (..., C) minus other states (..., C); differences of coordinates that are ``cyclic`` (C,), angles, lie
+    between -pi and pi."""
+    difference = q - others
+    return np.where(cyclic, (difference + np.pi) % (2 * np.pi) - np.pi, difference)
