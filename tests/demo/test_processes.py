@@ -70,6 +70,33 @@ def test_the_demo_ends_child_processes_that_ignore_signals_and_their_descendants
     until(lambda: not any(map(lives, started)))
 
 
+SAVING = """
+import signal, sys, time
+from pathlib import Path
+
+def save(*_):
+    time.sleep(0.1)
+    Path(sys.argv[1] + ".saved").touch()
+    raise SystemExit
+
+signal.signal(signal.SIGTERM, save)
+Path(sys.argv[1]).write_text("ready")
+time.sleep(3600)
+"""
+
+
+def test_a_stubborn_child_process_takes_no_time_from_the_server_to_save(
+    tmp_path: Path, program: Callable[[str], str], monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr("surrogym.demo.processes.STOPPING_SECONDS", 1.5)
+    with Children(tmp_path) as children:
+        server = children.start("server", program(SAVING), [str(tmp_path / "server")])
+        await_file(server, tmp_path / "server")
+        sampler = children.start("sampler", program(STUBBORN), [str(tmp_path / "sampler")])
+        await_file(sampler, tmp_path / "sampler")
+    assert (tmp_path / "server.saved").exists()
+
+
 def failed(children: Children, child: Child) -> str:
     """Return the message of the error that a failed process causes."""
     until(lambda: child.process.poll() is not None)

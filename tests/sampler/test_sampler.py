@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from functools import partial
 
 import pytest
@@ -61,6 +62,41 @@ def test_the_sampler_waits_for_an_unavailable_storage_without_repeating_steps(se
         assert len(api.refused) == 7
         ledger = api.surrogate(line).ledger
     assert (report.answered, report.failed, ledger.total, ledger.unresolved) == (6, 0, 6, 0)
+
+
+class Waits(Api):
+    """Tells when a claim of a sampler begins and ends."""
+
+    def __init__(self, url: str) -> None:
+        super().__init__(url)
+        self.began, self.ended = threading.Event(), threading.Event()
+
+    def claim(self, name, sampler, **options):
+        self.began.set()
+        try:
+            return super().claim(name, sampler, **options)
+        finally:
+            self.ended.set()
+
+
+def test_a_sampler_that_is_stopped_while_it_waits_ends_at_once_and_gives_back_what_comes_later(server_process, line):
+    """It waited for up to 20 s, so the demo killed its server before it had saved."""
+    with Api(server_process.url) as other, Waits(server_process.url) as api:
+        *_, last = other.claim(line, "other", max_queries=6, wait_seconds=5.0).queries
+        sampler = Sampler(api, line, Line(), SamplerSettings(batch=1, wait_seconds=30.0))
+        thread = threading.Thread(target=sampler.run)
+        thread.start()
+        assert api.began.wait(30)
+        sampler.stop()
+        thread.join(10)
+        assert not thread.is_alive()
+        assert not api.ended.is_set()
+        other.fail(line, last.id, last.lease_token, "not begun", begun=False)
+        assert api.ended.wait(20)
+        deadline = time.monotonic() + 20
+        while other.surrogate(line).queries.pending == 0:
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
 
 
 class Away(Api):

@@ -82,12 +82,11 @@ class Children:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Stop all child processes, one after the other, the newest first, so that none loses the server while it saves
-        its work. Kill those that have not ended in time."""
-        deadline = time.monotonic() + STOPPING_SECONDS
+        its work. Kill those that have not ended in time, each in a time of its own."""
         for child in reversed(self._children):
             _signal(child, signal.SIGTERM)
             with suppress(subprocess.TimeoutExpired):
-                child.process.wait(max(0.0, deadline - time.monotonic()))
+                child.process.wait(STOPPING_SECONDS)
         for child in self._children:
             _signal(child, signal.SIGKILL)
             child.process.wait()

@@ -6,6 +6,7 @@ import time
 from base64 import b64decode
 from collections import deque
 from collections.abc import Callable
+from concurrent.futures import wait
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
@@ -28,7 +29,7 @@ from surrogym_sampler.original.rollouts import answering
 from surrogym_sampler.queries.acting import Acting, following, replanning
 from surrogym_sampler.queries.failures import Failures, Violations
 from surrogym_sampler.queries.leases import LeaseEnded, Leases
-from surrogym_sampler.queries.pipeline import Pipeline
+from surrogym_sampler.queries.pipeline import Pipeline, beside
 from surrogym_sampler.queries.query_limits import check_action, check_environment, check_query
 from surrogym_sampler.queries.returning import Returning, snapshots_of
 from surrogym_sampler.queries.sample_conversion import reset_seed, sample_of
@@ -151,8 +152,8 @@ class Sampler:
     def stop(self) -> None:
         """Let ``run`` end after the running step. Call this from another thread or a signal handler.
 
-        The sampler then no longer waits for a server that does not answer, except for ``LAST_SECONDS`` to send its last
-        real step. The time in which ``api`` retries a single request adds to this.
+        The sampler then no longer waits for queries, or for a server that does not answer, except for ``LAST_SECONDS``
+        to send its last real step. The time in which ``api`` retries a single request adds to this.
         """
         self._stopping = True
 
@@ -182,11 +183,13 @@ class Sampler:
     def _answer_all(self) -> None:
         while not self._stopped() and (limit := self._limit()) > 0:
             try:
-                claimed = self._pipeline.next() or self._patiently(partial(self._claim, limit, self._wait_seconds()))
+                claimed = self._pipeline.next() or self._patiently(partial(self._awaited, limit))
             except AWAY:
                 if self._stopped():
                     break
                 raise
+            if claimed is None:
+                break
             self._enter(claimed.phase)
             self._work(claimed.queries)
             if self._enough(claimed):
@@ -221,6 +224,21 @@ class Sampler:
         if s.until_done and (self._phase is None or self._phase in ENDED):
             return 0.0
         return self._within_time(min(s.wait_seconds, END_SECONDS) if s.until_done else s.wait_seconds)
+
+    def _awaited(self, limit: int) -> ClaimedQueries | None:
+        """Claim queries, and wait for them if there are none. None if the sampler was stopped while it waited."""
+
+        def claim(wait_seconds: float) -> ClaimedQueries:
+            claimed = self._claim(limit, wait_seconds)
+            if self._stopped():  # nobody waits for the queries
+                self._return(claimed)
+            return claimed
+
+        waiting = beside(partial(claim, self._wait_seconds()))
+        while not self._stopped():
+            if wait([waiting], LOOK_SECONDS).done:
+                return waiting.result()
+        return None
 
     def _claim(self, limit: int, wait_seconds: float, retries: Retries | None = None) -> ClaimedQueries:
         s, since = self._settings, self._leases.clock()
