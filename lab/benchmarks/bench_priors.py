@@ -148,7 +148,7 @@ def main() -> None:
 
 
 def run(
-    task: str, access: str, without: str, off: float, arm: str, seed: int, *, policy: bool, budget: int | None = None
+    task: str, access: str, without: str, off: float, arm: str, seed: int, *, policy: str, budget: int | None = None
 ) -> Row:
     name, names, usual = TASKS[task]
     budget = budget or usual
@@ -177,7 +177,7 @@ def run(
     else:
         design, machine = surrogym.Design(spec, budget=budget, prior=prior, threads=2), plant(access)
         while (query := design.ask()) is not None:
-            design.tell(query, answered(machine, query, seed))
+            design.tell(query, answered(machine, query, seed, design))
         model, phase, steps = design.surrogate(), design.phase, design.steps
     found = () if prior is None or prior.calibration is None else prior.calibration.parameters
     return Row(
@@ -185,7 +185,7 @@ def run(
         sum(one.startswith("prior + ") for one in model.model.structures),
         sum(one.low <= truth[one.name] <= one.high for one in found),
         len(found),
-        *(earned(model, plant, seed) if policy else (float("nan"), float("nan"))),
+        *(earned(model, plant, seed, policy) if policy else (float("nan"), float("nan"))),
     )
 
 
@@ -203,13 +203,13 @@ def scaled(environment: Any, names: tuple[str, ...], factors: Any) -> Any:
     return environment
 
 
-def answered(plant: Any, query: surrogym.Query, seed: int) -> list[RealStep]:
+def answered(plant: Any, query: surrogym.Query, seed: int, design: surrogym.Design) -> list[RealStep]:
     if query.coordinates:
         return [plant.step_from(np.array(query.coordinates), np.array(query.action))]
-    plant.begin(1_000 * seed + query.id)
-    taken = []
-    for action in query.actions:
-        taken.append(plant.act(np.array(action)))
+    acting, state, taken = design.acting(query), plant.begin(1_000 * seed + query.id), list[RealStep]()
+    for number in range(query.steps):
+        taken.append(plant.act(np.array(acting(number, state))))
+        state = np.asarray(taken[-1].next_coordinates)
         if taken[-1].terminated:
             break
     return taken
@@ -244,12 +244,13 @@ def _drawn(sampling: Any, rng: np.random.Generator) -> Any:
     return rng.uniform(sampling.low, sampling.high, TESTS)
 
 
-def earned(model: LocalSurrogate, plant: Callable[[], Any], seed: int) -> tuple[float, float]:
-    """Mean real return of a policy that was trained in the model, and the share of its episodes that succeed."""
+def earned(model: LocalSurrogate, plant: Callable[[], Any], seed: int, by: str) -> tuple[float, float]:
+    """Mean real return of a policy that was trained in the model, or of a planner on it (``by``), and the share of its
+    episodes that succeed."""
     with TemporaryDirectory() as folder:
         path = Path(folder) / "policy.zip"
-        train(model, path, TrainSettings(SEARCH, seed=seed))
-        predict = load_policy(path, SEARCH)
+        train(model, path, TrainSettings(by, seed=seed))
+        predict = load_policy(path, by)
     found = evaluate(predict, lambda: SteppedEpisode(plant()), EvaluationSettings(50, 10_000))
     return float(np.mean(found.returns)), float("nan") if found.success_rate is None else found.success_rate
 
@@ -264,7 +265,9 @@ def _options() -> argparse.Namespace:
     made.add_argument("--budget", type=int, help="real steps that a design may take [default: those of a cold one]")
     made.add_argument("--first-seed", type=int, default=0)
     made.add_argument("--seeds", type=int, default=1)
-    made.add_argument("--policy", action="store_true", help="train a policy, and measure its real return")
+    made.add_argument(
+        "--policy", nargs="?", const=SEARCH, default="", help="measure the real return of a policy by this search"
+    )
     made.add_argument("--out", type=Path, default=OUT)
     torch.set_num_threads(1)
     return made.parse_args()

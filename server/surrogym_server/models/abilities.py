@@ -374,7 +374,7 @@ class PlannedActions(ABC):
     @property
     @abstractmethod
     def plans(self) -> bool:
-        """Whether the model can plan. It can't without compiled steps, or if a prior model takes part."""
+        """Whether the model can plan. It can't without compiled steps, or if its prior model has a prior itself."""
 
     @abstractmethod
     def planned(

@@ -89,8 +89,8 @@ def _requirements(model: DynamicsModel) -> tuple[ObservationInverse, PlannedActi
     steps = None if compiled is None else compiled.compiled()
     if able is None or steps is None or not able.plans:
         raise InvalidInput(
-            "expected a model of Gaussian processes without a prior, with compiled steps, because a planner rolls it "
-            "out in compiled code: train a policy"
+            "expected a model of Gaussian processes with compiled steps, beside at most one prior, because a planner "
+            "rolls it out in compiled code: train a policy"
         )
     return inverse, able, steps
 

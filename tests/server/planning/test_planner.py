@@ -14,6 +14,7 @@ import pytest
 import torch
 
 from support import limited
+from support.hinge import Real, Textbook, hinge_spec, steps_of
 from support.models import learn
 from support.real_steps import random_steps
 from surrogym_sampler.original.classic import acrobot, cartpole, pendulum
@@ -23,10 +24,13 @@ from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.samples import Samples
 from surrogym_server.errors import InvalidInput
 from surrogym_server.local import LocalSurrogate
+from surrogym_server.models.gaussian_process.family import GaussianProcesses
+from surrogym_server.models.gaussian_process.model import GaussianProcessModel
 from surrogym_server.planning import planner_of
 from surrogym_server.planning.grid import GridModel, _nodes, solve
 from surrogym_server.planning.pending import PendingActions
 from surrogym_server.planning.planner import Decisions
+from surrogym_shared.nouns import RealSteps
 from surrogym_shared.spec import (
     DeclaredReward,
     EnvironmentSpec,
@@ -156,6 +160,44 @@ def test_rollouts_add_the_estimated_error_to_each_predicted_change(hanging: Loca
     ]
     # The angle moves by 0.05 times the next speed, which the error changes too.
     assert (arrivals[1] - arrivals[0]).tolist() == pytest.approx([0.02 - 0.05 * 0.3, -0.3], abs=1e-3)
+
+
+def hinge_samples(plant: Textbook, count: int) -> Samples:
+    return Samples.of(RealSteps.of(steps_of(plant, count), "manual"))
+
+
+def beside(*priors: Textbook) -> GaussianProcessModel:
+    """A hinge's model of ten steps beside a prior, which may have a prior itself."""
+    definition, family = definition_from_spec(hinge_spec()), GaussianProcesses()
+    model: Any = family.learn(definition, hinge_samples(priors[0], 60)).model
+    for plant in (*priors[1:], Real()):
+        model = family.learn_beside(model, definition, hinge_samples(plant, 10)).model
+    return model
+
+
+def test_rollouts_add_the_prediction_of_a_prior_model():
+    model, start, unchanged = beside(Textbook()), np.array([0.5, 1.0]), np.zeros((1, 2, 2, 1))
+    policy, offset = planner_of(model, 2).policy, np.array([0.01, 0.2])
+    action, arrival = model.planned(policy, start, offset, NONE, False, unchanged, 1, np.zeros((2, 1)))
+    assert model.prior is not None
+    at = torch.tensor(start[None]), torch.tensor(action[None])
+    beside_it, alone = (one.transition(*at).q_next[0].numpy() for one in (model, model.prior))
+    assert (arrival - beside_it).tolist() == pytest.approx(offset.tolist(), abs=1e-3)
+    assert abs(beside_it[1] - alone[1]) > 0.1
+
+
+def test_a_planner_beside_a_prior_model_earns_what_one_of_many_samples_does():
+    few, many = beside(Textbook()), learn(definition_from_spec(hinge_spec()), hinge_samples(Real(), 60)).model
+    returns = [
+        imagined_returns(LocalSurrogate(hinge_spec(), many), LocalSurrogate(hinge_spec(), one).planner(8), 8, 0).mean()
+        for one in (few, many)
+    ]
+    assert returns[0] == pytest.approx(returns[1], rel=0.1)
+
+
+def test_a_prior_model_with_a_prior_is_refused():
+    with pytest.raises(InvalidInput, match="beside at most one prior"):
+        planner_of(beside(Textbook(), Textbook()), 5)
 
 
 class Paying:

@@ -252,7 +252,7 @@ class GaussianProcessModel(
 
     @property
     def plans(self) -> bool:
-        return self._compiled is not None and self.prior is None
+        return self._compiled is not None and (self.prior is None or self.prior.prior is None)
 
     def planned(
         self,
@@ -274,10 +274,14 @@ class GaussianProcessModel(
             known = np.zeros((changes.shape[1], len(steps.uses)))
             known[:, : len(self.definition.moving)] = offset[list(self.definition.moving)]
         low, cell, count, cyclic = policy.grid
+        prior, uses = (steps, np.zeros(0)) if steps.prior is None else (steps.prior, steps.uses)
         plan(
             *steps.tables,
             steps.has_regions,
             steps.outputs,
+            *prior.tables,
+            prior.has_regions,
+            uses,
             self.terminal_reward,
             low,
             cell,

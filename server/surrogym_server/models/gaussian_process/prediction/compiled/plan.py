@@ -20,10 +20,45 @@ KEEP = -2.0  # in the changes of a discrete action: the action of the best plan 
 
 
 @compiled
+def predicted(
+    numbers: Floats,
+    places: Ints,
+    outputs: int,
+    prior_numbers: Floats,
+    prior_places: Ints,
+    prior_has_regions: bool,
+    uses: Floats,
+    q: Floats,
+    u: Floats,
+    known: Floats,
+    q_next: Floats,
+    reward: Floats,
+    over: Bools,
+) -> None:
+    """Write the states (N, C) after a step from q (N, C) with u (N, F), the rewards (N,) and whether a declared end is
+    reached (N,) to the last three arrays. ``plan`` explains the other arguments."""
+    none, std, added = np.zeros((0, 0)), np.empty((len(q), outputs)), known
+    if len(uses):
+        added = np.empty((len(q), len(uses)))
+        step(prior_numbers, prior_places, q, u, none, none, none, none, False, False, q_next, reward, std, over, added)
+        if prior_has_regions:
+            judge(prior_numbers, prior_places, q, q_next, u.shape[1], False, reward, std, over)
+        for i in range(len(q)):
+            added[i, len(uses) - 1] = reward[i]
+            for c in range(len(uses)):
+                added[i, c] = uses[c] * added[i, c] + (known[i, c] if len(known) else 0.0)
+    step(numbers, places, q, u, none, none, none, added, False, False, q_next, reward, std, over, none)
+
+
+@compiled
 def end_without_action(
     numbers: Floats,
     places: Ints,
     outputs: int,
+    prior_numbers: Floats,
+    prior_places: Ints,
+    prior_has_regions: bool,
+    uses: Floats,
     q: Floats,
     known: Floats,
     early: Ints,
@@ -36,15 +71,28 @@ def end_without_action(
 ) -> None:
     """Write the states (N, C) at the end of a step from q (N, C) without a new action to ``end``. ``without`` (N, C)
     and ``u`` (N, F) are overwritten; ``plan`` explains the other arguments."""
-    none = np.zeros((0, 0))
     for i in range(len(q)):
         without[i] = q[i]
         for f in range(u.shape[1]):
             u[i, f] = 0.0 if choices else min(max(0.0, least[f]), most[f])
         for e in range(len(early)):
             without[i, early[e, 0]] = u[i, early[e, 1]]
-    reward, std, over = np.empty(len(q)), np.empty((len(q), outputs)), np.empty(len(q), np.bool_)
-    step(numbers, places, without, u, none, none, none, known, False, False, end, reward, std, over, none)
+    reward, over = np.empty(len(q)), np.empty(len(q), np.bool_)
+    predicted(
+        numbers,
+        places,
+        outputs,
+        prior_numbers,
+        prior_places,
+        prior_has_regions,
+        uses,
+        without,
+        u,
+        known,
+        end,
+        reward,
+        over,
+    )
 
 
 @entry(
@@ -52,6 +100,10 @@ def end_without_action(
     types.int64[:, ::1],
     types.boolean,
     types.int64,
+    types.float64[::1],
+    types.int64[:, ::1],
+    types.boolean,
+    types.float64[::1],
     types.float64,
     *GRID,
     types.float64[::1],
@@ -78,6 +130,10 @@ def plan(
     places: Ints,
     has_regions: bool,
     outputs: int,
+    prior_numbers: Floats,
+    prior_places: Ints,
+    prior_has_regions: bool,
+    uses: Floats,
     terminal_reward: float,
     low: Floats,
     cell: Floats,
@@ -110,6 +166,8 @@ def plan(
 
     Args:
         numbers, places, has_regions, outputs: the model, as in ``step.StepsOfModel``.
+        prior_numbers, prior_places, prior_has_regions: the prior model.
+        uses: (columns,) where its predictions are added, as in ``step.StepsOfModel``; (0,) without a prior model.
         terminal_reward: reward that steps that end the episode pay in addition.
         low, cell, count, cyclic: the grid, as in ``compiled.grid``.
         values: (S,) value of each node.
@@ -133,7 +191,7 @@ def plan(
         arrival: (C,) state after its first step, written.
     """
     rounds, lanes, steps, size = changes.shape[0], changes.shape[1], changes.shape[2], len(start)
-    entries, none = changes.shape[3], np.zeros((0, 0))
+    entries = changes.shape[3]
     q, q_next, u = np.empty((lanes, size)), np.empty((lanes, size)), np.empty((lanes, entries))
     reward, std, over = np.empty(lanes), np.empty((lanes, outputs)), np.empty(lanes, np.bool_)
     running, total = np.empty(lanes, np.bool_), np.empty(lanes)
@@ -158,7 +216,24 @@ def plan(
         weight = 1.0
         for t in range(steps):
             if late:
-                end_without_action(numbers, places, outputs, q, known, early, choices, least, most, without, u, seen)
+                end_without_action(
+                    numbers,
+                    places,
+                    outputs,
+                    prior_numbers,
+                    prior_places,
+                    prior_has_regions,
+                    uses,
+                    q,
+                    known,
+                    early,
+                    choices,
+                    least,
+                    most,
+                    without,
+                    u,
+                    seen,
+                )
             else:
                 seen = q
             for i in range(lanes):
@@ -170,7 +245,21 @@ def plan(
                         u[i, f] = min(max(u[i, f] + plans[i, t, f], least[f]), most[f])
                 for e in range(len(early)):
                     q[i, early[e, 0]] = u[i, early[e, 1]]
-            step(numbers, places, q, u, none, none, none, known, False, False, q_next, reward, std, over, none)
+            predicted(
+                numbers,
+                places,
+                outputs,
+                prior_numbers,
+                prior_places,
+                prior_has_regions,
+                uses,
+                q,
+                u,
+                known,
+                q_next,
+                reward,
+                over,
+            )
             if has_regions:
                 judge(numbers, places, q, q_next, entries, False, reward, std, over)
             if len(limit_places):
@@ -187,7 +276,24 @@ def plan(
             q, q_next = q_next, q
             weight *= discount
         if late:
-            end_without_action(numbers, places, outputs, q, known, early, choices, least, most, without, u, seen)
+            end_without_action(
+                numbers,
+                places,
+                outputs,
+                prior_numbers,
+                prior_places,
+                prior_has_regions,
+                uses,
+                q,
+                known,
+                early,
+                choices,
+                least,
+                most,
+                without,
+                u,
+                seen,
+            )
         else:
             seen = q
         for i in range(lanes):
