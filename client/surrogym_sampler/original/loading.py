@@ -37,7 +37,7 @@ ACCESS: dict[Access, dict[str, Any]] = {  # Fields of a specification for each k
 PLACEHOLDER = "YOUR.MODULE:CLASS"  # stands in a suggested command for the name of an environment that is not known
 ATTRIBUTES = (
     *("step_from", "reset", "step", "coordinates", "begin", "act", "save", "restore"),
-    *("picture", "close", "parallel"),
+    *("picture", "close", "parallel", "steps_from"),
 )
 
 
@@ -59,7 +59,8 @@ def make(
     """Make an original environment.
 
     Args:
-        name: a Gymnasium id, ``dm_control:DOMAIN-TASK``, ``pcgym:MODEL``, ``fmu:PLANT.fmu``, ``exec:COMMAND``, or
+        name: a Gymnasium id, ``dm_control:DOMAIN-TASK``, ``pcgym:MODEL``, ``fmu:PLANT.fmu``, ``mujoco:FILE.xml``,
+            ``exec:COMMAND``, or
             ``package.module:factory``.
         spec: a specification that replaces the adapter's own; most names have none until ``describe`` writes one.
         preset, budget, initial, target, acquisition, seed: settings of the design; None keeps the specification's.
@@ -162,7 +163,8 @@ def specification(name: str) -> EnvironmentSpec:
     if adapter_of(name) is None:
         raise UnknownEnvironment(
             f"no adapter knows the environment {name!r}: expected one of {known}, another Gymnasium id, "
-            f"dm_control:DOMAIN-TASK, pcgym:MODEL, fmu:PLANT.fmu, or package.module:factory{with_colon(name)}"
+            f"dm_control:DOMAIN-TASK, pcgym:MODEL, fmu:PLANT.fmu, mujoco:FILE.xml, or package.module:factory"
+            + with_colon(name)
         )
     open_simulator(name).close()
     raise UnknownEnvironment(
@@ -239,7 +241,7 @@ def _known(name: str, spec: EnvironmentSpec | None, choose: Choose, preset: str,
     simulator = open_simulator(name)
     try:
         require_same_action(name, base.action, simulator.action)
-        require_period(name, base, simulator.period)
+        simulator.require_period(name, base)
         return simulator.with_specification(base, shows_own=own, step_limit=step_limit)
     except UnknownEnvironment as error:
         simulator.close()

@@ -13,6 +13,7 @@ import numpy as np
 
 from surrogym_sampler.original.errors import NotPerturbable, StepFailed, UnknownEnvironment
 from surrogym_sampler.original.gymnasium import native_action, packed, unpacked, wrapped
+from surrogym_sampler.original.periods import require_period
 from surrogym_sampler.original.protocol import Array, RealStep
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.spec.actions import Action
@@ -162,6 +163,10 @@ class Simulator(ABC):
             "expected a MuJoCo model, or classic control with its built-in specification, for a perturbation, got "
             "another environment: write a class with changed physics, and give it with --env"
         )
+
+    def require_period(self, name: str, spec: EnvironmentSpec) -> None:
+        """Raise ``UnknownEnvironment`` if the simulator called ``name`` can't take steps of the declared period."""
+        require_period(name, spec, self.period)
 
     @abstractmethod
     def close(self) -> None:

@@ -119,7 +119,7 @@ def adjustable(simulator: Any) -> Adjustable:
     Raises:
         UnknownEnvironment: the environment runs in another process, so that its parameters can't be reached.
     """
-    for plant in _layers(simulator):
+    for plant in layers(simulator):
         if isinstance(plant, Adjustable):
             return plant
     if getattr(simulator, "step_from", None) is None:
@@ -127,7 +127,7 @@ def adjustable(simulator: Any) -> Adjustable:
             "expected a simulator in this process, got a simulator in another process, whose parameters can't be "
             "changed from here: write a class that runs the simulator in this process (docs/how-to/priors.md)"
         )
-    return Attributes(_layers(simulator)[-1])
+    return Attributes(layers(simulator)[-1])
 
 
 def read_parameters(texts: Sequence[str], plant: Adjustable) -> tuple[Parameter, ...]:
@@ -143,7 +143,7 @@ def read_parameters(texts: Sequence[str], plant: Adjustable) -> tuple[Parameter,
     return read
 
 
-def _layers(simulator: Any) -> list[Any]:
+def layers(simulator: Any) -> list[Any]:
     """Return the environment and the environments inside it that it wraps, from the outermost to the innermost."""
     layers = [simulator]
     while (inner := getattr(layers[-1], "wrapped", None) or getattr(layers[-1], "simulator", None)) is not None:
@@ -164,6 +164,9 @@ FIT: dict[str, Any] = {"bounds": (0.0, 1.0), "x_scale": 0.3, "ftol": 1e-12, "xto
 # Function that takes a step of a simulator: it gets parameters (P,), coordinates (C,) and an action (F,), and returns
 # the next coordinates (C,).
 Step = Callable[[Array, Array, Array], Array]
+# The same for n steps at once: from coordinates (n, C) with actions (n, F) to the next coordinates (n, C). Those of a
+# step that failed are not numbers.
+Steps = Callable[[Array, Array, Array], Array]
 
 
 class NotCalibrated(OriginalError):
@@ -218,7 +221,12 @@ class Calibration:
 
 
 def calibrate(
-    spec: EnvironmentSpec, real: RealTransitions, parameters: Sequence[Parameter], own: Array, step: Step
+    spec: EnvironmentSpec,
+    real: RealTransitions,
+    parameters: Sequence[Parameter],
+    own: Array,
+    step: Step,
+    many: Steps | None = None,
 ) -> Calibration:
     """Calibrate the parameters of a simulator on real steps.
 
@@ -228,6 +236,7 @@ def calibrate(
         parameters: the P parameters and their ranges. If there are none, only the error is computed.
         own: the simulator's own values (P,) of the parameters.
         step: takes one step of the simulator; if it raises, the step counts as very wrong.
+        many: takes several steps at once, which is faster; None if the simulator can't.
 
     Raises:
         NotCalibrated: the steps measure no more numbers than there are parameters, or the simulator fails in more than
@@ -235,7 +244,7 @@ def calibrate(
     """
     if len(real) < FEWEST:
         raise NotCalibrated(f"expected at least {FEWEST} real steps for a calibration, got {len(real)}: take more")
-    errors = _Errors(spec, real, step)
+    errors = _Errors(spec, real, step, many)
     if errors.measured <= len(parameters):
         raise NotCalibrated(
             f"expected at least {len(parameters) // errors.moving + 1} real steps to calibrate {len(parameters)} "
@@ -259,8 +268,8 @@ class _Errors:
     """The errors (n, M) of a simulator's steps for given parameters, in standard deviations of the M coordinates that
     change."""
 
-    def __init__(self, spec: EnvironmentSpec, real: RealTransitions, step: Step) -> None:
-        self._real, self._step = real, step
+    def __init__(self, spec: EnvironmentSpec, real: RealTransitions, step: Step, many: Steps | None = None) -> None:
+        self._real, self._step, self._many = real, step, many or self._one_by_one
         self._angles = np.array([coordinate.kind == "angle" for coordinate in spec.coordinates])
         change = self._difference(real.next_coordinates, real.coordinates)
         scale = np.sqrt((change**2).mean(0))
@@ -286,9 +295,12 @@ class _Errors:
         return len(self._real) * int(self._moves.sum())
 
     def __call__(self, values: Array) -> Array:
-        rows = [self._one(values, *row) for row in zip(self._real.coordinates, self._real.action, strict=True)]
-        errors = self._difference(np.array(rows), self._real.next_coordinates)[:, self._moves] / self._scale
+        rows = self._many(values, self._real.coordinates, self._real.action)
+        errors = self._difference(rows, self._real.next_coordinates)[:, self._moves] / self._scale
         return np.where(np.isfinite(errors), np.clip(errors, -FAR, FAR), FAR)
+
+    def _one_by_one(self, values: Array, coordinates: Array, actions: Array) -> Array:
+        return np.array([self._one(values, *row) for row in zip(coordinates, actions, strict=True)])
 
     def _one(self, values: Array, coordinates: Array, action: Array) -> Array:
         try:

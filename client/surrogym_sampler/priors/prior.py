@@ -14,6 +14,7 @@ from typing import Any, Self
 import numpy as np
 
 from surrogym_sampler.original.actions import middle_action
+from surrogym_sampler.original.adapters import adapter_of
 from surrogym_sampler.original.episodes import draw
 from surrogym_sampler.original.errors import StepRefused, UnknownEnvironment
 from surrogym_sampler.original.loading import Respecified, is_own, make, with_choices
@@ -23,11 +24,13 @@ from surrogym_sampler.priors.calibration import (
     Calibration,
     RealTransitions,
     Step,
+    Steps,
     adjustable,
     calibrate,
+    layers,
     read_parameters,
 )
-from surrogym_shared.spec import EnvironmentSpec
+from surrogym_shared.spec import DeclaredReward, EnvironmentSpec, RewardTerm
 from surrogym_shared.surrogate_file import SurrogateFile
 from surrogym_shared.wire.priors import CalibratedParameter, PriorAbout
 
@@ -39,8 +42,11 @@ AGAIN = 2  # the parameters are calibrated again when there are this many times 
 TRIALS = 5  # number of steps that test whether a simulator works
 REPORT_SECONDS = 1.0  # time between two reports of a calibration's progress
 SLOW = 0.1  # seconds of a simulated step that counts as slow, if the seconds of a real step are not known
+LONGEST_SOURCE = 200  # largest number of characters in the description of a prior's source
+NOTHING = DeclaredReward(kind="declared", terms=(RewardTerm(weight=0.0, shape="one"),))
 RIGHT = 1e-3  # if the simulator's error is below this share of the coordinates' changes, its parameters are kept
 
+StepsFrom = Callable[[Array, Array], Array]  # from coordinates (n, C) with actions (n, F) to next coordinates (n, C)
 Progress = Callable[[float | None, str], None]
 
 
@@ -114,13 +120,15 @@ class SimulatorPrior(ABC):
             )
         size = len(spec.coordinates) + spec.action.size
         self.steps = min(MOST, max(FEWEST, BY_INPUT * size)) if steps is None else steps
-        self.source = simulator if isinstance(simulator, str) else type(simulator).__name__
         self.spec = _of_steps(spec, self.steps)
         self._may_extend, self._seconds = steps is None, 0.0  # the mean seconds of a simulated step, once measured
         self.simulator = _opened(simulator, self.spec)
+        self.source = self._words(simulator)
         plant = adjustable(self.simulator)
         self.parameters = read_parameters(parameters, plant)
         self._set, present = plant.set_parameters, plant.parameters()
+        # Takes many steps at once; None if the simulator can't.
+        self._steps_from: StepsFrom | None = getattr(self.simulator, "steps_from", None)
         self._own = np.array([present[parameter.name] for parameter in self.parameters])
         self.calibration: Calibration | None = None
         self._calibrated_on = 0  # number of real steps in the last calibration
@@ -158,8 +166,11 @@ class SimulatorPrior(ABC):
         names = ", ".join(parameter.name for parameter in self.parameters)
         words = f"{'calibrating ' + names if names else 'comparing'} on {len(real)} real steps"
         progress(0.0, words)
-        step = _Reported(self._step, self.spec.sampling_period or SLOW, lambda more: progress(0.0, f"{words}: {more}"))
-        found = calibrate(self.spec, steps, self.parameters, self._own, step)
+        step = _Reported(
+            self._step, self._steps, self.spec.sampling_period or SLOW, lambda more: progress(0.0, f"{words}: {more}")
+        )
+        many = None if self._steps_from is None else step.many
+        found = calibrate(self.spec, steps, self.parameters, self._own, step, many)
         self._calibrated_on = len(real)
         if present is not None and present <= max(RIGHT, WORSE * found.error):
             return False
@@ -191,14 +202,29 @@ class SimulatorPrior(ABC):
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _step(self, values: Array, coordinates: Array, action: Array) -> Array:
+    def _words(self, simulator: str | OriginalEnvironment) -> str:
+        """Return the name of the simulator, and which coordinates it matched to variables by their places."""
+        name = simulator if isinstance(simulator, str) else type(simulator).__name__
+        matched = ", ".join(getattr(layers(self.simulator)[-1], "matched", ()))
+        return (name + (f" ({matched})" if matched else ""))[:LONGEST_SOURCE]
+
+    def _set_all(self, values: Array) -> None:
         self._set({parameter.name: float(value) for parameter, value in zip(self.parameters, values, strict=True)})
+
+    def _steps(self, values: Array, coordinates: Array, actions: Array) -> Array:
+        assert self._steps_from is not None
+        self._set_all(values)
+        return self._steps_from(coordinates, actions)
+
+    def _step(self, values: Array, coordinates: Array, action: Array) -> Array:
+        self._set_all(values)
         return np.asarray(self.simulator.step_from(coordinates, action).next_coordinates, dtype=np.float64)
 
     def _error(self, steps: RealTransitions, by: Calibration) -> float:
         """Return the simulator's error on real steps, with the parameter values of the calibration ``by``."""
         values = np.array([by.values[parameter.name] for parameter in self.parameters])
-        return calibrate(self.spec, steps, (), values, self._step).error
+        many = None if self._steps_from is None else self._steps
+        return calibrate(self.spec, steps, (), values, self._step, many).error
 
     def _about(self, found: Calibration, confidence: float) -> dict[str, Any]:
         return PriorAbout(
@@ -222,12 +248,13 @@ class _Reported:
 
     Args:
         step: the function, as for ``calibrate``.
+        many: the function that takes many steps, as for ``calibrate``.
         most: seconds of a step beyond which the report says how fewer steps are needed.
         report: called about once in a second, with a few words.
     """
 
-    def __init__(self, step: Step, most: float, report: Callable[[str], None]) -> None:
-        self._step, self._most, self._report = step, most, report
+    def __init__(self, step: Step, many: Steps, most: float, report: Callable[[str], None]) -> None:
+        self._step, self._many, self._most, self._report = step, many, most, report
         self._taken, self._busy, self._due = 0, 0.0, time.monotonic() + REPORT_SECONDS
 
     @property
@@ -236,9 +263,16 @@ class _Reported:
         return self._busy / max(1, self._taken)
 
     def __call__(self, values: Array, coordinates: Array, action: Array) -> Array:
+        return self._timed(1, lambda: self._step(values, coordinates, action))
+
+    def many(self, values: Array, coordinates: Array, actions: Array) -> Array:
+        """Take n steps at once."""
+        return self._timed(len(coordinates), lambda: self._many(values, coordinates, actions))
+
+    def _timed(self, count: int, take: Callable[[], Array]) -> Array:
         began = time.monotonic()
-        reached = self._step(values, coordinates, action)
-        self._taken += 1
+        reached = take()
+        self._taken += count
         self._busy += (now := time.monotonic()) - began
         if now > self._due:
             self._due = now + REPORT_SECONDS
@@ -278,10 +312,14 @@ def _opened(simulator: str | OriginalEnvironment, spec: EnvironmentSpec) -> Orig
 
 def _respecified(simulator: str | OriginalEnvironment, opened: Any, spec: EnvironmentSpec) -> Any:
     """Return the simulator with the plant's specification. A simulator that is given by an adapter's name is opened
-    here, because such a name comes without a specification."""
-    if isinstance(simulator, str) and not is_own(simulator):
-        return make(simulator, spec=spec.model_copy(update={"environment": simulator}))
-    return Respecified(opened, spec)
+    here, because such a name comes without a specification. If it has no reward and the plant's is learned, its reward
+    is 0."""
+    if not isinstance(simulator, str) or (adapter := adapter_of(simulator)) is None:
+        return Respecified(opened, spec)
+    named = spec.model_copy(update={"environment": simulator})
+    if adapter.pays or spec.reward.kind == "declared":
+        return make(simulator, spec=named)
+    return Respecified(make(simulator, spec=named.model_copy(update={"reward": NOTHING})), spec)
 
 
 def _require_alike(spec: EnvironmentSpec, own: EnvironmentSpec) -> None:

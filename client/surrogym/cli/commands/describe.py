@@ -16,7 +16,7 @@ def command(
         str,
         typer.Argument(
             help="Environment: a Gymnasium id, package:Id-v0, dm_control:DOMAIN-TASK, pcgym:MODEL, pcgym:FILE.json, "
-            "fmu:PLANT.fmu or fmu:PLANT.json."
+            "fmu:PLANT.fmu, fmu:PLANT.json or mujoco:FILE.xml."
         ),
     ],
     steps: Annotated[

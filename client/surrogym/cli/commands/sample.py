@@ -312,7 +312,8 @@ def _words_of_consent(name: str) -> str:
         )
     return (
         f"the surrogate's environment {name!r} can't be opened by this name alone: expected --env "
-        "package.module:factory, --env pcgym:FILE.json, --env fmu:PLANT.fmu, or --exec COMMAND"
+        "package.module:factory, --env pcgym:FILE.json, --env fmu:PLANT.fmu, --env mujoco:FILE.xml, or "
+        "--exec COMMAND"
     )
 
 

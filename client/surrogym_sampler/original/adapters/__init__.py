@@ -1,5 +1,5 @@
 """Adapters that open a simulator by its name: any Gymnasium id, ``dm_control:DOMAIN-TASK``, ``pcgym:MODEL`` or
-``pcgym:FILE.json``, ``fmu:PLANT.fmu`` or ``fmu:PLANT.json``.
+``pcgym:FILE.json``, ``fmu:PLANT.fmu``, ``fmu:PLANT.json`` or ``mujoco:FILE.xml``.
 
 Each adapter opens one kind of simulator. Its packages are an optional extra, imported when a name needs them.
 """
@@ -31,6 +31,7 @@ class Adapter(NamedTuple):
             names can open nothing but the package's own environments.
         extra: pip extra that installs the package.
         separate: whether its simulators run in processes of their own.
+        pays: whether its simulators have rewards.
     """
 
     module: str
@@ -38,6 +39,7 @@ class Adapter(NamedTuple):
     trusted: re.Pattern[str]
     extra: str
     separate: bool = False
+    pays: bool = True
 
 
 NEVER = re.compile(r"(?!)")
@@ -51,7 +53,8 @@ ADAPTERS = (
     Adapter(
         "surrogym_sampler.original.adapters.pcgym.adapter", re.compile(r"pcgym:.*"), re.compile(r"pcgym:cstr"), "pcgym"
     ),
-    Adapter("surrogym_sampler.original.fmus.adapter", re.compile(r"fmu:.*"), NEVER, "fmu", separate=True),
+    Adapter("surrogym_sampler.original.fmus.adapter", re.compile(r"fmu:.*"), NEVER, "fmu", separate=True, pays=False),
+    Adapter("surrogym_sampler.original.adapters.mujoco_file", re.compile(r"mujoco:.*"), NEVER, "mujoco", pays=False),
     Adapter(
         "surrogym_sampler.original.adapters.gymnasium_ids",
         re.compile(r"gymnasium_robotics:.*"),
@@ -96,7 +99,8 @@ def open_simulator(name: str) -> Simulator:
     if adapter is None:
         raise UnknownEnvironment(
             f"no adapter knows the environment {name!r}: expected a Gymnasium id such as Pendulum-v1, package:Id-v0, "
-            f"dm_control:DOMAIN-TASK, pcgym:cstr, pcgym:FILE.json, fmu:PLANT.fmu or fmu:PLANT.json{with_colon(name)}"
+            f"dm_control:DOMAIN-TASK, pcgym:cstr, pcgym:FILE.json, fmu:PLANT.fmu, fmu:PLANT.json or mujoco:FILE.xml"
+            + with_colon(name)
         )
     try:
         opened: Simulator = import_module(adapter.module).open_simulator(name)

@@ -11,11 +11,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 
-from surrogym_sampler.original.episodes import draw
 from surrogym_sampler.original.errors import StepFailed, UnknownEnvironment
 from surrogym_sampler.original.fmus.archive import Archive, Declared, read_archive
 from surrogym_sampler.original.fmus.choices import (
@@ -27,12 +25,11 @@ from surrogym_sampler.original.fmus.choices import (
     step_of,
 )
 from surrogym_sampler.original.fmus.process import Process
-from surrogym_sampler.original.protocol import Array, RealStep
+from surrogym_sampler.original.protocol import Array
 from surrogym_sampler.original.simulator import Motion, Simulated, Simulator, Taken, Variable
-from surrogym_shared.logs.rewards import declared_reward
+from surrogym_sampler.original.unrewarded import Unrewarded
 from surrogym_shared.spec import MAX_DIMENSIONS, BoxAction, EnvironmentSpec
 from surrogym_shared.spec.base import REWARD
-from surrogym_shared.terms import terminates
 
 UNKNOWN_LIMITS = (-1.0, 1.0)  # assumed limits of an input that declares none
 SAME = 1e-9  # a variable counts as set if it is read back with at most this relative error
@@ -184,18 +181,12 @@ class Fmu(Simulator):
         ]
 
 
-class FmuEnvironment(Simulated):
+class FmuEnvironment(Unrewarded):
     """An FMU as an original environment, with one instance at a time, because each is a process."""
 
     parallel = False
 
     def __init__(self, simulator: Simulator, spec: EnvironmentSpec) -> None:
-        if spec.reward.kind != "declared":
-            raise UnknownEnvironment(
-                f"expected a declared reward for {spec.environment or 'an FMU'}, which has no reward of its own, got a "
-                f"{spec.reward.kind} reward: declare it in the specification that surrogym describe writes "
-                "(docs/how-to/fmus.md)"
-            )
         if spec.action.kind != "box" or spec.action.size != simulator.action.size:
             raise UnknownEnvironment(
                 f"expected a continuous action of {simulator.action.size} entries, one for each input of the FMU that "
@@ -203,24 +194,6 @@ class FmuEnvironment(Simulated):
                 "action"
             )
         super().__init__(simulator, spec)
-
-    def begin(self, seed: int | None = None) -> Array:
-        """Begin an episode: at a declared start if the state can be set, else at the FMU's own start values. Returns
-        the coordinates (C,)."""
-        if self._spec.query == "rollout":
-            return super().begin(seed)
-        self.place(draw(self._spec, np.random.default_rng(seed), wide=False))
-        return self.coordinates()
-
-    def act(self, action: Array) -> RealStep:
-        """Apply an action (F,) in the current state. Reward and termination are computed as declared."""
-        step = super().act(action)
-        before, taken, after = (
-            np.atleast_2d(np.asarray(x)) for x in (step.coordinates, step.action, step.next_coordinates)
-        )
-        ended = terminates(self._spec, after)
-        paid = declared_reward(self._spec, before, taken, after, ended)
-        return replace(step, reward=float(paid[0]), terminated=bool(ended[0]))
 
 
 def _variables(state: Sequence[Declared]) -> tuple[Variable, ...]:

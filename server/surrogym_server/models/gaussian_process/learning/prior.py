@@ -35,14 +35,17 @@ class Known:
     """Predictions of a prior model at n samples."""
 
     change: Tensor  # (n, M) predicted value of each transition output
-    reward: Tensor  # (n,) predicted reward, without the terminal reward
+    # (n,) predicted reward, without the terminal reward; None if the prior model's reward never varied, because most
+    # simulators know of no reward
+    reward: Tensor | None
     terminal: float  # terminal reward of the prior model: what steps that end an episode give in addition
 
     @classmethod
     def of(cls, prior: GaussianProcessModel, samples: Samples) -> Self:
         """Compute the predictions of a prior model at the samples."""
         means = prior.means_before_end(samples.q, samples.u)
-        return cls(means[:, :-1], means[:, -1], prior.terminal_reward)
+        varies = prior.reward.posterior is not None or bool(prior.jumps)
+        return cls(means[:, :-1], means[:, -1] if varies else None, prior.terminal_reward)
 
 
 def better_of(learn: Learn, name: str, target: Tensor, known: Tensor | None, keep: Tensor) -> OutputModel:

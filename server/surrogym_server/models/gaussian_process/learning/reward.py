@@ -48,7 +48,7 @@ def learn_reward(
     if learner.settings.reward_jumps and output.warp is None:
         output, jumps = with_jumps(learner, samples, inputs, going, output)
     by_prior = torch.zeros_like(samples.reward)
-    if prior is not None:
+    if prior is not None and prior.reward is not None:
         found = beside(partial(_plain, learner, inputs, going), REWARD, samples.reward, prior.reward, going)
         if not _contradicted(found, output, jumps, int(going.sum())):
             output, jumps, by_prior = found, (), prior.reward
