@@ -264,9 +264,12 @@ def words_of_prior(about: PriorAbout) -> list[str]:
 
 def words_of_use(view: SurrogateView) -> list[str]:
     """Return a line that lists the outputs whose model uses the prior; empty if there is no model yet."""
+    from surrogym_shared.spec import REWARD
+
     if view.fidelity is None:
         return []
     uses = [one.name for one in view.fidelity.outputs if one.structure.startswith("prior + ")]
-    others = [one.name for one in view.fidelity.outputs if one.name not in uses]
+    declared = REWARD if view.spec.reward.kind == "declared" else ""
+    others = [one.name for one in view.fidelity.outputs if one.name not in (*uses, declared)]
     said = f"outputs that use it: {', '.join(uses) or 'none'}"
     return [said + (f"; without it {', '.join(others)} are predicted better" if others else "")]
