@@ -11,6 +11,7 @@ import torch
 from support.hinge import Backwards, Real, Stiff, Textbook, hinge_spec, steps_of
 from support.predictions import WAYS, check_compiled
 from surrogym_server.convert import definition_from_spec
+from surrogym_server.environment.points import Points
 from surrogym_server.environment.samples import Samples
 from surrogym_server.errors import InvalidInput
 from surrogym_server.models.files import from_bytes, to_bytes
@@ -160,3 +161,33 @@ def test_a_stored_model_with_an_invalid_prior_size_is_refused(textbook, size):
 def test_gaussian_processes_refuse_a_prior_that_is_not_a_gaussian_process_model():
     with pytest.raises(TypeError, match="Gaussian processes"):
         GaussianProcesses().learn_beside(object(), HINGE, samples(Real(), 4))  # type: ignore[arg-type]
+
+
+class Bumped(Textbook):
+    """A hinge that a magnet pushes near an angle of 1.5 rad, of which the textbook knows nothing."""
+
+    def step_from(self, coordinates, action):
+        step, force = (
+            super().step_from(coordinates, action),
+            0.3 * math.exp(-(((float(coordinates[0]) - 1.5) / 0.4) ** 2)),
+        )
+        angle, speed = step.next_coordinates
+        angle = (angle + 0.1 * force + math.pi) % (2 * math.pi) - math.pi
+        return replace(step, next_coordinates=(angle, speed + force))
+
+
+def test_queries_go_where_the_plant_differs_from_the_prior_model(textbook):
+    """The uncertainty alone is the same on both sides of the hinge."""
+    known = samples(Bumped(), 20, seed=3)
+    beside, places = learned(known, textbook), samples(Textbook(), 400, seed=5)
+    points, near = Points(places.q, places.u), (places.q[:, 0] - 1.5).abs() < 0.8
+
+    def value_near(model: GaussianProcessModel) -> float:
+        """Value of a query near the magnet, as a multiple of that of a query anywhere."""
+        outlook = model.outlook(points, points, points[:0])[1]
+        assert outlook is not None
+        value = outlook.reduction(torch.ones(400, dtype=torch.float64))
+        return float(value[near].mean() / value.mean())
+
+    plain = replace(beside, transitions=tuple(replace(one, size_with_prior=None) for one in beside.transitions))
+    assert value_near(beside) > 1.2 * value_near(plain)

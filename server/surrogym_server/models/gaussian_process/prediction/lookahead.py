@@ -28,6 +28,9 @@ from surrogym_server.models.gaussian_process.prediction.output_model import Outp
 
 BLOCK = 4_000_000  # greatest number of covariances computed at once
 SMALLEST = 1e-300  # slopes are divided by the largest slope, or by this if all are 0
+# A reference point where an output's difference from its prior model has the root mean square slope counts as so many
+# points more.
+DIFFERENCE = 4.0
 
 
 @dataclass(frozen=True)
@@ -41,6 +44,8 @@ class ProcessOutlook(OutputOutlook):
     scale: float
     # (m + r,) derivative of the output with respect to its process, divided by ``scale``; None if it is 1 everywhere.
     slope: Tensor | None = None
+    # (r,) further weight of each reference point of an output that is added to a prior model's prediction; None without
+    further: Tensor | None = None
 
     @classmethod
     def of(cls, output: OutputModel, x: Tensor, learns: Tensor, spans: tuple[int, int]) -> ProcessOutlook:
@@ -57,7 +62,8 @@ class ProcessOutlook(OutputOutlook):
         for index in range(spans[1], len(x)):
             joint = joint.observe(index) if learns[index] else joint
         shared = joint.between(slice(*spans), slice(spans[0]))
-        return cls(joint, learns[: spans[0]], shared, output.scale, slope_at(output, x[: spans[1]]))
+        further = _weight_of_difference(output, x[slice(*spans)])
+        return cls(joint, learns[: spans[0]], shared, output.scale, slope_at(output, x[: spans[1]]), further)
 
     @property
     def std(self) -> Tensor:
@@ -73,7 +79,11 @@ class ProcessOutlook(OutputOutlook):
         This is Cohn's criterion (NIPS 1993) in closed form for a Gaussian process. If the output is a nonlinear
         function of its process, each reference point is also weighted by the squared derivative of this function,
         divided by the largest. Only the order of the results matters.
+
+        An output beside a prior model also weighs reference points by how steep the difference from the prior is there.
+        What a simulator lacks is often local, and the process is equally steep everywhere before any sample.
         """
+        weights = weights if self.further is None else weights * self.further
         if self.slope is not None:
             steep = self.slope[len(self.learns) :]
             weights = weights * (steep / steep.max().clamp_min(SMALLEST)).square()
@@ -127,6 +137,18 @@ def slope_at(output: OutputModel, x: Tensor) -> Tensor | None:
     if output.warp is not None:
         return output.warp.slope(*output.target(x))
     return output.amplitude(x) if output.feature_map.rates else None
+
+
+def _weight_of_difference(output: OutputModel, x: Tensor) -> Tensor | None:
+    """Return the weights (r,) of reference points x (r, d) that grow with the squared slope of the output's mean, which
+    is the difference from the prior model to which it is added; None if it is added to none."""
+    if output.size_with_prior is None or not len(x):
+        return None
+    with torch.inference_mode(False), torch.enable_grad():
+        at = x.clone().requires_grad_(True)
+        (slope,) = torch.autograd.grad(output.mean(at).sum(), at)
+    square = slope.square().sum(-1)
+    return 1 + DIFFERENCE * square / square.mean().clamp_min(SMALLEST)
 
 
 def as_if_answered(output: OutputModel, x: Tensor) -> OutputModel:
