@@ -235,7 +235,7 @@ def _transitions(
         """Predict the step from q (m, K) with the actions u (m, F) and, where those act late, ``past`` (m, F). Return
         the whole states (m, C) before it, too."""
         acting = np.where(repeated[:, 2] <= pending.dead, u[:, repeated[:, 1]], past[:, repeated[:, 1]])
-        whole = np.concatenate([q, acting], 1)
+        whole = np.ascontiguousarray(np.concatenate([q, acting], 1))  # in the order of columns if q has one alone
         return whole, pending.steps(whole, u, noise=None, process=None, paths=None, stds=False, reward_std=False)
 
     for begin in range(0, len(nodes), ROWS):
