@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from surrogym_server.compiled.threads import side_by_side
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.observation_inverse import ObservationInverse
 from surrogym_server.environment.safety import LimitSet
@@ -28,6 +29,7 @@ ROUNDS, ROLLOUTS, ELITE = 3, 24, 4
 SPREAD = 0.3  # standard deviation of the changes of a continuous action, as a share of half its range
 NARROWING = 0.5  # factor of this standard deviation from one round to the next
 COLOUR = 0.8  # correlation of the changes of two steps in a row
+STATES = 4  # smallest number of states for which a thread plans
 SETS = 64  # number of sets of changes, which the decisions take in turns
 LENGTHS, BEGINNINGS = (1, 1, 2, 3, 5), (0, 0, 0, 1, 2, 4, 7)  # changes of a discrete action: steps, and first step
 # A plan of an earlier decision is continued if the state lies within this share of each coordinate's sampling range
@@ -173,10 +175,21 @@ class Planner:
         else:
             actions = np.empty((len(q), now.plans.shape[2]))
             changes, starts = self._changes[self._calls % SETS], pending.forecast(now.states, now.offsets)
-            for i in range(len(q)):
-                actions[i], now.arrived[i] = self.model.planned(
-                    self.policy, starts[i], now.offsets[i], pending.early, pending.late, changes, ELITE, now.plans[i]
-                )
+
+            def plan(rows: slice) -> None:
+                for i in range(len(q))[rows]:
+                    actions[i], now.arrived[i] = self.model.planned(
+                        self.policy,
+                        starts[i],
+                        now.offsets[i],
+                        pending.early,
+                        pending.late,
+                        changes,
+                        ELITE,
+                        now.plans[i],
+                    )
+
+            side_by_side(plan, len(q), STATES, torch.get_num_threads())
             if pending.dead:
                 now.arrived = pending.after(now.states, actions, now.offsets)
         if self.state_filter is not None:

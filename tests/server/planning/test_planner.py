@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -241,6 +241,24 @@ def test_a_planner_keeps_away_from_declared_limits_and_passes_them_where_none_ar
         moment = episode.step(planner.from_states(moment.coordinates[None])[0])
         assert not moment.fell_back
     assert moment.coordinates[0] > 0.3
+
+
+@pytest.fixture
+def threads() -> Iterator[None]:
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.mark.usefixtures("threads")
+def test_a_planner_acts_alike_in_any_number_of_threads(hanging: LocalSurrogate):
+    states, found = np.random.default_rng(0).uniform(-1, 1, (30, 2)), []
+    for count in (1, 3):
+        torch.set_num_threads(count)
+        planner = hanging.planner(5, 0)
+        found += [planner.from_states(states), planner.from_states(states)]
+    for one, several in zip(found[:2], found[2:], strict=True):
+        np.testing.assert_array_equal(one, several)
 
 
 def test_equal_planners_act_alike_and_other_seeds_try_other_changes(hanging: LocalSurrogate):
