@@ -29,7 +29,7 @@ from surrogym_server.local import LocalSurrogate
 from surrogym_server.sampling.design import initial_queries
 from surrogym_shared import nouns
 from surrogym_shared.nouns import RealStep
-from surrogym_shared.port import HORIZON
+from surrogym_shared.port import horizon_of
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.states import Phase
 from surrogym_shared.surrogate_file import RealSamples, SurrogateFile
@@ -187,7 +187,7 @@ class Design:
         if not query.replan:
             return lambda number, _: query.actions[number]
         noise = {output["name"]: output["sensor_noise"] for output in self.fidelity["outputs"]}
-        planner = self.surrogate().planner(HORIZON, query.id, sensor_noise=noise)
+        planner = self.surrogate().planner(horizon_of(self.spec), query.id, sensor_noise=noise)
         return lambda _, state: tuple(planner.from_states(np.array([state], dtype=np.float64))[0].tolist())
 
     def tell(

@@ -36,9 +36,9 @@ from surrogym_sampler import original
 from surrogym_sampler.original.episodes import Episode, RolloutEpisode, open_episode
 from surrogym_sampler.original.protocol import RolloutEnvironment
 from surrogym_sampler.original.rollouts import answering
+from surrogym_shared.port import horizon_of
 from surrogym_shared.spec import with_history
 from surrogym_trainer.evaluation.evaluator import EvaluationSettings, evaluate
-from surrogym_trainer.training.planner import Planner
 
 # largest number of real steps of a design, by task
 BUDGETS = {
@@ -62,7 +62,7 @@ def main() -> None:
     made.add_argument("--budget", type=int, help="largest number of real steps, instead of the task's")
     made.add_argument("--dirt", default="", choices=("", *KINDS), help="kind of dirt of the swing-up")
     made.add_argument("--acting-with", choices=KINDS, help="dirt of the swing-up on which the planner acts")
-    made.add_argument("--horizon", type=int, default=Planner.horizon, help="steps of each rollout of the planner")
+    made.add_argument("--horizon", type=int, help="steps of each rollout of the planner")
     made.add_argument("--rounds", action="store_true", help="returns after each round of a design")
     made.add_argument("--out", type=Path, default=OUT)
     options = made.parse_args()
@@ -118,11 +118,13 @@ def _run(task: str, seed: int, options: argparse.Namespace) -> list[dict[str, ob
     return [*rows, row(10 if rounds else options.episodes)]
 
 
-def _earned(task: str, dirt: str, design: surrogym.Design, seed: int, episodes: int, horizon: int) -> dict[str, object]:
+def _earned(
+    task: str, dirt: str, design: surrogym.Design, seed: int, episodes: int, horizon: int | None
+) -> dict[str, object]:
     """Return what a planner earns in the original environment, and whether this reaches the task's target."""
     surrogate, noise = design.surrogate(), {o["name"]: o["sensor_noise"] for o in design.fidelity["outputs"]}
     spec, settings = surrogate.spec(), EvaluationSettings(episodes)
-    planner = surrogate.planner(horizon, seed, sensor_noise=noise)
+    planner = surrogate.planner(horizon or horizon_of(spec), seed, sensor_noise=noise)
     name = MACHINES[task].name.format(seed=seed) if task in MACHINES else spec.environment or task
     judged = InProcess(dirt or "clean", seed, spec)
 

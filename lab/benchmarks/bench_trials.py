@@ -1,10 +1,10 @@
 """From a cold machine that can only be reset to a policy: real steps, return, success and promise, by the commands that
 a person gives.
 
-Each run starts a server and a sampler, registers the machine within a budget of real steps, and trains with
-``surrogym train``, whose policies try episodes with what the design leaves of the budget. A policy that is not trusted
-then is audited with whole episodes. It is evaluated in
-real episodes, from which nothing is learned. The machines of ``examples/machines`` are programs whose seed draws the
+Each run starts a server and a sampler, registers the machine within a budget of real steps, and runs
+``surrogym train``: it makes a planner, or policies that try episodes with what the design leaves of the budget. A
+policy that is not trusted then is audited with whole episodes. It is evaluated in real episodes, from which nothing is
+learned. The machines of ``examples/machines`` are programs whose seed draws the
 parameters; their lags are those that ``surrogym doctor --history 60`` proposes, with larger ranges. Prints one line for
 each run, and appends it to ``trials.csv``; a run that is there is not repeated.
 
@@ -46,7 +46,7 @@ from surrogym_trainer.evaluation.evaluator import EvaluationSettings, evaluate
 from surrogym_trainer.policies import load_policy
 
 ROOT = Path(__file__).parents[2]
-MINUTES = 30.0  # longest time of one command
+MINUTES = 60.0  # longest time of one command
 PATIENT_SECONDS = 5.0  # without an action for this time, the fallback of limits acts
 
 
@@ -93,9 +93,9 @@ STOPS = Limits(
 
 MACHINES = {
     "belt": Machine(_program("belt"), 450, 2, 1, (0.12, 0.6)),
-    "furuta": Machine(_program("furuta"), 2_000, 1, 2, (0.6, 0.8)),
-    "furuta-limits": Machine(_program("furuta"), 2_000, 1, 2, (0.6, 0.8), STOPS),
-    "double_pendulum": Machine(_program("double_pendulum"), 2_000, 1, 2, (0.6, 0.9)),
+    "furuta": Machine(_program("furuta"), 400, 1, 2, (0.6, 0.8)),
+    "furuta-limits": Machine(_program("furuta"), 400, 1, 2, (0.6, 0.8), STOPS),
+    "double_pendulum": Machine(_program("double_pendulum"), 600, 1, 2, (0.6, 0.9)),
     "invertedpendulum2": Machine("InvertedDoublePendulum-v5", 120),
     "reacher": Machine("Reacher-v5", 200),
     **{f"swingup-{kind.replace(' ', '-')}": _swing_up(kind, actions) for kind, actions in SWING_UPS.items()},
@@ -143,7 +143,9 @@ def _run(machine: str, seed: int, budget: int | None, episodes: int, folder: Pat
         where = ("--env", name, "--spec", str(spec))
         surrogym("register", name, "--spec", str(spec), "--name", machine)
         with _sampling([sys.executable, "-m", "surrogym", "sample", machine, *where], environment):
-            trained = surrogym("train", machine, "--wait", "900", "--seed", str(seed), "--out", str(policy))
+            trained = surrogym(
+                "train", machine, "--wait", f"{60 * MINUTES:.0f}", "--seed", str(seed), "--out", str(policy)
+            )
         # As the reason says then: one rollout from a reset left states untested, which whole episodes test.
         audited = trained if trained["trusted"] else surrogym("audit", str(policy), *where)
         minutes = (time.monotonic() - begun) / 60

@@ -189,7 +189,15 @@ class ModelPort(SurrogatePort, Protocol):
         ...
 
 
-HORIZON = 12  # default number of steps of each rollout of a planner
+HORIZONS = (12, 25)  # smallest and largest default number of steps of each rollout of a planner
+
+
+def horizon_of(spec: EnvironmentSpec) -> int:
+    """Return the default number of steps of each rollout of a planner: a tenth of an episode, within ``HORIZONS``.
+
+    An episode shows how fast a system is for its sampling period: a rotary pendulum at 50 Hz needs 25 steps."""
+    least, most = HORIZONS
+    return min(max((spec.time_limit or 0) // 10, least), most)
 
 
 @runtime_checkable

@@ -7,7 +7,8 @@ import pytest
 import scipy.stats
 
 from surrogym_sampler.original.classic import pendulum
-from surrogym_trainer.evaluation.audit import Compared, chi_squared, differences, gaps, judge, places
+from surrogym_shared.spec import with_history
+from surrogym_trainer.evaluation.audit import Compared, chi_squared, differences, gaps, judge, places, untested
 from surrogym_trainer.policies.evidence import Promise
 
 PROMISE = Promise(median=-150.0, low=-160.0, high=-140.0, functions=32, episodes=256)
@@ -120,6 +121,16 @@ def test_audit_points_in_gaps_between_samples_are_within_the_sampling_range_and_
     assert gaps(pendulum(), q, u, samples, 1) == [1]
     assert sorted(gaps(pendulum(), q, u, samples, 2)) == [0, 1]
     assert len(gaps(pendulum(), q, u, samples, 0)) == 0
+
+
+def test_states_far_from_an_audit_are_untested_whatever_actions_they_repeat():
+    late = with_history(pendulum().model_copy(update={"query": "rollout"}), actions=2)
+    rng = np.random.default_rng(0)
+    actions = rng.uniform(-2, 2, (2, 400, 2))
+    way, audited = (np.concatenate([rng.normal(0, 0.1, (400, 2)), u], 1) for u in actions)
+    assert untested(late, way, audited) < 0.05
+    fast = np.concatenate([way[:300], way[300:] + np.array([0.0, 5.0, 0.0, 0.0])])
+    assert untested(late, fast, audited) == pytest.approx(0.25, abs=0.02)
 
 
 def test_audit_errors_of_angles_take_the_shorter_direction():

@@ -256,11 +256,13 @@ def test_the_message_of_a_design_that_ended_unsure_names_confidence_index_and_ta
 
 def test_where_only_policies_can_steer_the_next_step_is_a_training_with_trials():
     plain = pendulum().model_copy(update={"query": "rollout"})
-    lagging = with_history(plain, changes=1, actions=1, largest={"theta": 1.0, "speed": 4.0})
+    lagging = with_history(plain, changes=2, actions=1, largest={"theta": 1.0, "speed": 4.0})
+    late = with_history(plain, changes=1, actions=2, largest={"theta": 1.0, "speed": 4.0})
     left = {"phase": "unsure", "budget": 100, "budget_left": 60}
     waiting = view(output("theta", 0.5)).model_copy(update={"spec": lagging, **left})
     assert advice(waiting, []) == (
         "trials of policies take the other 60 real steps of the budget, while a sampler runs: surrogym train rig"
     )
-    assert "surrogym train" not in advice(waiting.model_copy(update={"spec": plain}), []), "a planner can steer"
+    for spec in (plain, late):
+        assert "surrogym train" not in advice(waiting.model_copy(update={"spec": spec}), []), "a planner can steer"
     assert "surrogym train" not in advice(waiting.model_copy(update={"budget_left": 0}), [])

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from surrogym_sampler.original.classic import pendulum
-from surrogym_shared.spec import Design
+from surrogym_shared.spec import BoxAction, Design, EnvironmentSpec, with_history
 from surrogym_trainer.training import TrainSettings
 from surrogym_trainer.training.search import search_for, with_algorithm
 
@@ -26,6 +26,47 @@ PAPER = pendulum().model_copy(update={"design": Design(preset="paper", budget=40
 )
 def test_fastppo_is_the_default_policy_search_unless_settings_need_stable_baselines3(chosen: dict, spec, name: str):
     assert with_algorithm(TrainSettings(**chosen), spec).algorithm == name
+
+
+LATE = with_history(pendulum().model_copy(update={"query": "rollout"}), actions=3)
+
+
+def changed(spec: EnvironmentSpec, **fields: object) -> EnvironmentSpec:
+    return spec.model_copy(update=fields)
+
+
+@pytest.mark.parametrize(
+    ("chosen", "spec", "name"),
+    [
+        ({}, LATE, "PLANNER"),
+        ({"hyperparameters": {"horizon": 20}}, LATE, "PLANNER"),
+        ({"session": {"set_points": {"theta": 0.1}}, "seed": 3, "threads": 2}, LATE, "PLANNER"),
+        ({"total_steps": 20_000}, LATE, "FASTPPO"),
+        ({"integral": ("theta",)}, LATE, "FASTPPO"),
+        ({"hyperparameters": {"n_epochs": 3}}, LATE, "FASTPPO"),
+        ({}, changed(pendulum(), query="rollout"), "FASTPPO"),
+        ({}, changed(LATE, snapshots=True), "FASTPPO"),
+        ({}, changed(LATE, design=Design(model="ensemble")), "FASTPPO"),
+        ({}, changed(LATE, action=BoxAction(low=(-2,), high=(2,), bins=(5,))), "FASTPPO"),
+        ({}, with_history(LATE, changes=2, largest={"theta": 1.0, "speed": 4.0}), "FASTPPO"),
+    ],
+    ids=[
+        "a dead time",
+        "a planner's hyperparameter",
+        "what a planner has, too",
+        "virtual steps",
+        "an integral",
+        "a network's hyperparameter",
+        "no dead time",
+        "saved states",
+        "another family",
+        "bins",
+        "too many coordinates besides the actions",
+    ],
+)
+def test_a_planner_is_the_default_for_a_machine_with_a_dead_time(chosen: dict, spec: EnvironmentSpec, name: str):
+    assert with_algorithm(TrainSettings(**chosen), spec).algorithm == name
+    assert spec.needs_trials == (len(spec.coordinates) > 4 and not spec.fits_planner and spec.access == "reset")
 
 
 def test_continuing_a_stable_baselines3_policy_selects_stable_baselines3_ppo(tmp_path: Path):

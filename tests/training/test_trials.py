@@ -46,7 +46,7 @@ from surrogym_trainer.training.settings import TrainingInterrupted
 from surrogym_trainer.training.trials import Trials, allows_trials, encoded, is_waiting_for_trials
 from surrogym_trainer.training.words import words_of_result
 
-BUDGET, FIRST, EPISODE = 100, 60, 15
+BUDGET, FIRST, EPISODE = 110, 70, 15
 SETTINGS = TrainSettings(algorithm="FASTPPO", total_steps=4_096, num_envs=16, seed=0)
 
 
@@ -67,7 +67,7 @@ class Late:
             tolerances={"level": 1e-9},
             design=Design(budget=BUDGET, initial=FIRST, seed=0),
         )
-        return with_history(plain, actions=4)
+        return with_history(plain, changes=4, actions=1, largest={"level": 0.5})  # too many for a planner
 
     def reset(self, *, seed=None):
         self.level, self.late = float(np.random.default_rng(seed).uniform(-1.5, 1.5)), 0.0
@@ -100,6 +100,17 @@ class Edged(Late):
         super().reset(seed=seed)
         self.level = 1.25 + self.level / 6
         return self.level, {}
+
+
+class Planned(Late):
+    """The same level, with earlier actions alone as further coordinates, so that a planner can steer it."""
+
+    def spec(self) -> EnvironmentSpec:
+        plain = super().spec()
+        own = {name: getattr(plain, name) for name in EnvironmentSpec.model_fields}
+        lags = {"coordinates": plain.coordinates[:1], "observation": plain.observation[:1]}
+        start, design = {"level": plain.start["level"]}, Design(budget=30, initial=15, seed=0)
+        return with_history(EnvironmentSpec(**own | lags | {"start": start, "design": design}), actions=4)
 
 
 @pytest.fixture(scope="module")
@@ -204,6 +215,26 @@ def test_a_policy_that_sees_an_integral_acts_in_audits(trials_server: ServerProc
     assert np.ptp(sums) > 0.1
     chosen = policy(np.concatenate([observe(Late().spec(), states), sums], axis=1))
     assert [sample.action for sample in samples] == [pytest.approx(action, abs=1e-6) for action in chosen.tolist()]
+
+
+@pytest.mark.parametrize("waiting", [Planned], indirect=True)
+def test_a_machine_with_a_dead_time_gets_a_planner_that_acts_in_its_audit(
+    trials_server: ServerProcess, waiting: str, tmp_path: Path
+) -> None:
+    with Api(trials_server.url) as api, HttpSurrogate(trials_server.url, waiting) as port:
+        training = AuditedTraining(api, waiting, port, tmp_path / "p.zip", TrainSettings(), audit=AuditSettings())
+        result, handover = training.train()
+        view = api.surrogate(waiting)
+        (query,) = [query for query in api.queries(waiting) if query.purpose == "audit"]
+        samples = [sample for sample in api.samples(waiting) if sample.query_id == query.id]
+    assert result.algorithm == "PLANNER"
+    assert view.phase == "over_budget", "nothing of the budget is left to trials"
+    assert handover.audit is not None
+    assert handover.audit.passed
+    assert query.replan
+    assert len(samples) == handover.audit.steps == EPISODE
+    taken = np.array([sample.action for sample in samples])
+    assert not np.array_equal(taken, np.array(query.actions)), "planned from what was measured"
 
 
 @pytest.mark.parametrize(

@@ -443,6 +443,7 @@ class Api:
         *,
         rollouts: Sequence[Sequence[Sequence[float]]] = (),
         policy: str | None = None,
+        replan: bool = False,
         audit: bool = False,
         idempotency_key: str | None = None,
     ) -> list[wire.QueryView]:
@@ -450,13 +451,15 @@ class Api:
 
         Give n queries of one step by their states, ``coordinates`` (n, C), and their actions, ``action`` (n, F); or
         give ``rollouts``, each T actions (T, F) from a reset, which are only expected if a ``policy`` (its file in
-        base64) chooses them. Queries of an audit don't count towards the budget.
+        base64) chooses them, or if the sampler plans each action anew (``replan``). Queries of an audit don't count
+        towards the budget.
         """
         body = (wire.AuditModel if audit else wire.AddQueries)(
             coordinates=[list(row) for row in coordinates] or None,
             action=[list(row) for row in action] or None,
             rollouts=[[list(row) for row in actions] for actions in rollouts] or None,
             policy=policy,
+            replan=replan,
             idempotency_key=idempotency_key or new_key(),
         )
         return self._post(wire.QueryList, f"{routes.surrogate(name)}/{'audit' if audit else 'queries'}", body).queries

@@ -11,7 +11,7 @@ from surrogym_client.environments.file_factories import planner_of
 from surrogym_client.transport.api import Api
 from surrogym_shared.integrals import Floats, Integrals, joined
 from surrogym_shared.network import Network, bounds_of
-from surrogym_shared.port import HORIZON
+from surrogym_shared.port import horizon_of
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.surrogate_file import RealSamples, SurrogateFile
 from surrogym_shared.terms import observe
@@ -32,7 +32,7 @@ def replanning(api: Api, surrogate: str, spec: EnvironmentSpec) -> Acting:
     samples = RealSamples.none(len(spec.coordinates), spec.action.size)
     file, fidelity = SurrogateFile(surrogate, spec, model, samples).to_bytes(), api.surrogate(surrogate).fidelity
     noise = {} if fidelity is None else {output.name: output.sensor_noise for output in fidelity.outputs}
-    planner = planner_of(file, HORIZON, spec.design.seed, {}, sensor_noise=noise)
+    planner = planner_of(file, horizon_of(spec), spec.design.seed, {}, sensor_noise=noise)
     return lambda state: planner.from_states(np.asarray(state, dtype=np.float64)[None])[0].tolist()
 
 

@@ -263,7 +263,9 @@ def untested(spec: EnvironmentSpec, q: Array, audited: Array) -> float:
     """Of the states q (m, C) that a policy visits, return the share that is far from every audited state (n, C).
 
     Two states are far apart if a coordinate differs by more than ``FAR`` standard deviations over the visited states.
+    Actions don't count, so coordinates that repeat earlier ones don't count either.
     """
+    q, audited = (np.where(spec.repeats_actions, 0.0, states) for states in (q, audited))
     none = np.zeros((len(q) + len(audited), 0))
     at = on_one_scale(spec, np.concatenate([q, audited]), none, len(q))
     way, known = at[: len(q)], at[len(q) :]

@@ -16,7 +16,7 @@ from surrogym_trainer.policies.files import load_policy
 from surrogym_trainer.policies.integrals import with_integrals
 from surrogym_trainer.training.closed_loop import Candidates, ClosedLoop, LoopSettings, visit
 from surrogym_trainer.training.handover import MOST_AUDITS, AuditSettings, Handover, Subject, hand_over
-from surrogym_trainer.training.search import search_for, with_algorithm
+from surrogym_trainer.training.search import PLANNING, search_for, with_algorithm
 from surrogym_trainer.training.settings import (
     TrainingInterrupted,
     TrainProgress,
@@ -132,7 +132,9 @@ class AuditedTraining:
     def _subject(self, result: TrainResult) -> Subject:
         predict, settings = load_policy(result.path, result.algorithm), self.settings
         session = chosen_for(self.api.surrogate(self.name), settings).judging
-        return Subject(self.api, self.name, self.port, predict, dict(session), result.untrained, settings.seed)
+        usual = {*settings.hyperparameters} <= {"horizon"} and not settings.set_points
+        plans = result.algorithm == PLANNING and usual
+        return Subject(self.api, self.name, self.port, predict, dict(session), result.untrained, settings.seed, plans)
 
     def _to_be_trained_on(self, audit: Audit | None, result: TrainResult, taken: int, number: int) -> bool:
         if audit is None or audit.undeclared:

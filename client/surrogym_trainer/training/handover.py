@@ -106,6 +106,7 @@ class Subject:
     session: dict[str, Any] = field(default_factory=dict)
     floor: float | None = None  # imagined return of an untrained policy
     seed: int = 0
+    plans: bool = False  # whether the policy is the planner of the latest model, which samplers can make
 
     def promise(self) -> Promise:
         """Compute the policy's promise in the latest model."""
@@ -337,17 +338,17 @@ def _asked(subject: Subject, settings: AuditSettings, q: Array, u: Array, *, cla
     If the design ``claims`` to know the whole sampling range, one of every ``ELSEWHERE`` queries is in a gap
     between its samples instead, because an error of the model in the gap may have kept the policy away. If the
     environment can't be set to a state, there is one query: the actions of one virtual episode, or the policy
-    itself where only policies can steer. The episode is whole if the surrogate's audits may take that many steps.
-    Returns the queries' ids, and the ids of those in gaps.
+    itself where only policies can steer, or if it is a planner. The episode is whole if the surrogate's audits may take
+    that many steps. Returns the queries' ids, and the ids of those in gaps.
     """
     spec, rng = subject.port.spec(), np.random.default_rng(settings.seed)
     if spec.query == "rollout":
         policy = subject.predict
         acting = encoded(policy, subject.port) if spec.needs_trials and isinstance(policy, Network) else None
-        view = subject.api.surrogate(subject.name)
-        steps = length_of_rollout(view, settings.steps, LONGEST_EPISODE if acting else LONGEST_ROLLOUT)
-        _, actions = way_of(subject, 1, steps)
-        queries = subject.api.add_queries(subject.name, rollouts=[actions.tolist()], policy=acting, audit=True)
+        view, replan = subject.api.surrogate(subject.name), subject.plans
+        steps = length_of_rollout(view, settings.steps, LONGEST_EPISODE if acting or replan else LONGEST_ROLLOUT)
+        rollouts = [way_of(subject, 1, steps)[1].tolist()]
+        queries = subject.api.add_queries(subject.name, rollouts=rollouts, policy=acting, replan=replan, audit=True)
         return {query.id for query in queries}, set()
     elsewhere = settings.steps // ELSEWHERE if claims else 0
     chosen = places(spec, q, u, settings.steps - elsewhere, rng)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
-from surrogym_shared.port import HORIZON, ModelPort, SurrogatePort
+from surrogym_shared.port import ModelPort, SurrogatePort, horizon_of
 from surrogym_shared.spec.base import MAX_INEQUALITIES
 from surrogym_shared.surrogate_file import RealSamples, SurrogateFile
 from surrogym_trainer.policies.card import UnusablePolicy
@@ -19,7 +19,7 @@ from surrogym_trainer.training.settings import TrainProgress
 class Planner(PolicySearch):
     """A policy that plans each action by rollouts of the model. Nothing is trained."""
 
-    horizon: int = HORIZON  # number of steps of each planned rollout
+    horizon: int | None = None  # number of steps of each planned rollout; None: ``horizon_of`` the specification
     limits: Sequence[str] = ()  # limits that the plans keep, as ``surrogym_shared.limits.limit_of`` reads them
 
     suggested_steps = 1
@@ -38,8 +38,8 @@ class Planner(PolicySearch):
                 f"{self.limits!r:.80}"
             )
         file, noise = _file_of(task.port).to_bytes(), dict(settings.session.get("sensor_noise", {}))
-        limits = tuple(self.limits)
-        planner = PlannerFile(file, self.horizon, settings.seed, settings.set_points, limits, noise)
+        limits, own = tuple(self.limits), horizon_of(task.port.spec()) if self.horizon is None else self.horizon
+        planner = PlannerFile(file, own, settings.seed, settings.set_points, limits, noise)
         task.progress(TrainProgress(0, 0, None, 0.0, stage="computes values on a grid"))
         try:
             predict = planner.acting()
@@ -51,7 +51,7 @@ class Planner(PolicySearch):
             task.progress(TrainProgress(0, 0, imagined, 0.0, stage="computed values on a grid"))
         except KeyboardInterrupt:
             whole = False
-        return Found(planner, 0, imagined, asdict(self), whole=whole)
+        return Found(planner, 0, imagined, asdict(replace(self, horizon=own)), whole=whole)
 
 
 def _file_of(port: SurrogatePort) -> SurrogateFile:

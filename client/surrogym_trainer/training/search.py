@@ -19,13 +19,14 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, ClassVar, Protocol, cast
 
 from surrogym_shared.network import Network
 from surrogym_shared.plugins import Registry
 from surrogym_shared.port import SurrogatePort
-from surrogym_shared.spec import EnvironmentSpec
+from surrogym_shared.spec import MOST_PLANNED, EnvironmentSpec
 from surrogym_trainer.policies import load_policy
 from surrogym_trainer.policies.predict import Predict
 from surrogym_trainer.training.settings import TrainProgress, TrainSettings, prolongs
@@ -34,6 +35,8 @@ MAX_STEPS = 10_000_000  # largest number of virtual steps in a training, which t
 ALGORITHMS = ("A2C", "DDPG", "DQN", "PPO", "SAC", "TD3")  # names of searches by Stable-Baselines3
 FAST = "FASTPPO"  # name of the default search
 REFERENCE = "PPO"  # name of the search by Stable-Baselines3's PPO
+FAMILY = "gaussian_process"  # family of models on which planners act
+PLANNING = "PLANNER"  # name of the search that makes a planner
 
 Progress = Callable[[TrainProgress], None]
 
@@ -119,7 +122,7 @@ SEARCHES = Registry[PolicySearch](
         **{name: f"surrogym_trainer.training.stable_baselines.algorithms:{name}" for name in ALGORITHMS},
         FAST: "surrogym_trainer.training.fast_ppo.search:FastPpo",
         "CMAES": "surrogym_trainer.training.cma_es:CmaEs",
-        "PLANNER": "surrogym_trainer.training.planner:Planner",
+        PLANNING: "surrogym_trainer.training.planner:Planner",
     },
 )
 
@@ -135,13 +138,16 @@ def name_of(settings: TrainSettings) -> str:
 
 def with_algorithm(settings: TrainSettings, spec: EnvironmentSpec) -> TrainSettings:
     """Return the settings with the name of a search. If they name none, it is ``FAST`` (PPO in NumPy), or ``REFERENCE``
-    (PPO of Stable-Baselines3) if ``FAST`` does not support the settings.
+    (PPO of Stable-Baselines3) if ``FAST`` does not support the settings, or ``PLANNING`` for a machine with a dead time
+    (see ``_is_planned``).
 
     Only ``REFERENCE`` has trackers and some of the hyperparameters, and can continue a policy of Stable-Baselines3.
     ``REFERENCE`` is also the search of the preset ``paper``.
     """
     if settings.algorithm is not None:
         return settings
+    if _is_planned(settings, spec):
+        return replace(settings, algorithm=PLANNING)
     start, known = settings.start_from, {field.name for field in fields(cast("Any", SEARCHES.get(FAST)))}
     by_reference = (
         settings.tracker is not None
@@ -150,6 +156,28 @@ def with_algorithm(settings: TrainSettings, spec: EnvironmentSpec) -> TrainSetti
         or (start is not None and not Network.is_at(start))
     )
     return replace(settings, algorithm=REFERENCE if by_reference else FAST)
+
+
+def _is_planned(settings: TrainSettings, spec: EnvironmentSpec) -> bool:
+    """Whether a planner is the default: the environment can only be reset, and has so many coordinates because some
+    repeat actions, through which a planner looks. Networks stay at a local optimum there, or need two to three times
+    the real steps (decision 98). A setting that only a training has asks for a network."""
+    of_planner = {field.name for field in fields(cast("Any", SEARCHES.get(PLANNING)))}
+    plain = TrainSettings(
+        seed=settings.seed,
+        threads=settings.threads,
+        session=settings.session,
+        judge=settings.judge,
+        hyperparameters={name: value for name, value in settings.hyperparameters.items() if name in of_planner},
+    )
+    return (
+        spec.access == "reset"
+        and spec.fits_planner
+        and len(spec.coordinates) > MOST_PLANNED
+        and spec.design.model in (None, FAMILY)
+        and settings == plain
+        and find_spec("surrogym_server") is not None
+    )
 
 
 def search_for(settings: TrainSettings) -> PolicySearch:

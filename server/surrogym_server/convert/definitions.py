@@ -84,7 +84,7 @@ def _design(spec: wire.EnvironmentSpec) -> core.DesignDefinition:
         input_probability=preset.input_probability,
         stopping=preset.stopping,
         seed=design.seed,
-        trials=design.trials,
+        trials=spec.needs_trials,
     )
 
 

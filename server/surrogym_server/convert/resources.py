@@ -115,7 +115,8 @@ def requested(body: replies.AddQueries) -> list[Query]:
     steps = [Query.step(*step) for step in zip(q.tolist(), u.tolist(), strict=True)]
     policy = None if body.policy is None else _decoded(body.policy)
     return steps + [
-        Query.rollout(numbers("rollouts", actions).tolist(), policy=policy) for actions in body.rollouts or ()
+        Query.rollout(numbers("rollouts", actions).tolist(), replan=body.replan, policy=policy)
+        for actions in body.rollouts or ()
     ]
 
 

@@ -81,7 +81,7 @@ class DesignDefinition:
             ``tested_confidence`` also requires leave-one-out errors within the tolerances, and answers to adaptive
             queries, which could have disproved the model.
         seed: seed of all random choices of the design.
-        trials: whether the rest of the budget is left to trials of policies where only these can steer.
+        trials: whether the rest of the budget is left to trials of policies, because only these can steer.
     """
 
     initial: int
@@ -93,7 +93,7 @@ class DesignDefinition:
     input_probability: InputProbability
     stopping: Stopping
     seed: int
-    trials: bool = True
+    trials: bool = False
 
 
 @dataclass(frozen=True)

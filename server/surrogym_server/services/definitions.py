@@ -152,14 +152,15 @@ def check_rollouts(definition: EnvironmentDefinition, queries: Sequence[Query]) 
                 Network.load(query.policy).require_fit(len(definition.observation), definition.action)
             except ValueError as error:
                 raise InvalidInput(f"policy: {error}") from error
-        longest = definition.max_rollout or 0 if query.policy is None else definition.time_limit or MAX_ROLLOUT_QUERY
+        acted = query.replan or query.policy is not None
+        longest = (definition.time_limit or MAX_ROLLOUT_QUERY) if acted else definition.max_rollout or 0
         if query.steps > longest:
             raise InvalidInput(
                 f"rollouts: expected at most {longest} actions in a rollout, got {query.steps}: split the rollout"
             )
     actions = (model_actions(definition, np.array(query.actions)) for query in queries)
     return [
-        Query.rollout(u.tolist(), query.snapshot, policy=query.policy)
+        Query.rollout(u.tolist(), query.snapshot, replan=query.replan, policy=query.policy)
         for u, query in zip(actions, queries, strict=True)
     ]
 

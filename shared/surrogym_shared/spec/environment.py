@@ -12,12 +12,13 @@ from surrogym_shared.checks import SHOWN, Number, Positive, require, require_kno
 from surrogym_shared.kinds import Access
 from surrogym_shared.patterns import VISIBLE
 from surrogym_shared.presets import PRESETS, Preset, PresetName, Tolerance
-from surrogym_shared.spec.actions import Action, BoxAction
+from surrogym_shared.spec.actions import Action, BoxAction, DiscreteAction
 from surrogym_shared.spec.base import (
     MAX_DIMENSIONS,
     MAX_ROLLOUT_QUERY,
     MAX_STARTS,
     MOST_PLANNED,
+    MOST_PLANNED_ENTRIES,
     REWARD,
     Frozen,
     Name,
@@ -170,9 +171,30 @@ class EnvironmentSpec(Frozen):
     @property
     def needs_trials(self) -> bool:
         """Whether trained policies try episodes: the environment can only be reset, has more coordinates than most
-        planners can steer through, and its design leaves steps to trials. Declared limits hold in a trial, too, because
-        the sampler keeps them."""
-        return self.access == "reset" and self.design.trials and len(self.coordinates) > MOST_PLANNED
+        planners can steer through, no planner fits, and its design leaves steps to trials. Declared limits hold in a
+        trial, too, because the sampler keeps them."""
+        many = len(self.coordinates) > MOST_PLANNED and not self.fits_planner
+        return self.access == "reset" and self.design.trials and many
+
+    @property
+    def repeats_actions(self) -> tuple[bool, ...]:
+        """Whether each of the C coordinates repeats an earlier action."""
+        names: set[str] = set()
+        for c in self.coordinates:
+            if c.lag is not None and (c.lag.kind == "action" or c.lag.of in names):
+                names.add(c.name)
+        return tuple(c.name in names for c in self.coordinates)
+
+    @property
+    def fits_planner(self) -> bool:
+        """Whether a planner can act in the environment, as far as the specification says: with few coordinates besides
+        those that repeat actions, through which a planner looks, and with few entries of an action that may change at
+        once."""
+        kept = 1 + max(i for i, repeats in enumerate(self.repeats_actions) if not repeats)
+        action, fits = self.action, isinstance(self.action, DiscreteAction)
+        if isinstance(action, BoxAction):
+            fits = action.size <= MOST_PLANNED_ENTRIES and not action.bins and not any(action.rate or ())
+        return kept <= MOST_PLANNED and fits and self.outside_reward is None
 
     @property
     def access(self) -> Access:

@@ -193,6 +193,11 @@ class AddQueries(Request):
         description="file of the policy, in base64, that chooses each action of the rollouts, whose actions are then "
         "only expected; null: apply the actions",
     )
+    replan: bool = Field(
+        default=False,
+        description="whether the sampler plans each action of the rollouts anew on the latest model; the actions are "
+        "then only expected",
+    )
     idempotency_key: Key | None = Field(default=None, description="a repeat with the same key adds nothing")
 
 

@@ -109,7 +109,8 @@ def test_the_actions_of_any_other_query_are_its_own():
 
 
 def test_a_design_without_trials_leaves_no_steps_to_them():
-    spec = with_history(cartpole().model_copy(update={"query": "rollout"}), actions=2)
+    plain = cartpole().model_copy(update={"query": "rollout"})
+    spec = with_history(plain, changes=1, largest=dict.fromkeys(plain.coordinate_names, 1.0))
     alone = spec.model_copy(update={"design": spec.design.model_copy(update={"trials": False})})
     assert (spec.needs_trials, alone.needs_trials) == (True, False)
     left = []

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from surrogym_server.sampling.round import Round
 from surrogym_shared.nouns import Query
-from surrogym_shared.spec import MOST_PLANNED
 
 STEPS = 10  # real steps before trials, for each coordinate and each action entry
 
@@ -18,8 +17,8 @@ def leave_to_trials(round: Round) -> tuple[Query, ...] | None:
     from them, and the sampler keeps them in its trial.
     """
     definition, size = round.definition, len(round.definition.coordinates)
-    if not definition.design.trials or not round.continues or round.testing or definition.snapshots:
+    if not definition.design.trials or not round.continues or round.testing:
         return None
-    if size <= MOST_PLANNED or round.cost < STEPS * (size + definition.action.size):
+    if round.cost < STEPS * (size + definition.action.size):
         return None
     return ()
