@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from ipaddress import ip_address
 from pathlib import Path
+from ssl import SSLContext
 from typing import Any, Self, TypeVar
 from urllib.request import getproxies, proxy_bypass
 
@@ -110,14 +111,18 @@ class Connection:
         self.timeouts = timeouts or Timeouts()
         self.retries = retries or Retries()
         self._token = _sendable(token if token is not None else _token_of_environment())
-        self._client = _new_client(self.url, self._token)
+        self._connect()
 
     def __getstate__(self) -> dict[str, Any]:
-        return {key: value for key, value in self.__dict__.items() if key != "_client"}
+        return {key: value for key, value in self.__dict__.items() if key not in ("_client", "_trusted")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
-        self._client = _new_client(self.url, self._token)
+        self._connect()
+
+    def _connect(self) -> None:
+        self._trusted = _trusted_certificates()  # kept for later clients, because it takes 20 ms to read
+        self._client = _new_client(self.url, self._token, self._trusted)
 
     def __enter__(self) -> Self:
         return self
@@ -248,7 +253,7 @@ class Connection:
 
     def _open_client(self) -> httpx.Client:
         if self._client.is_closed:
-            self._client = _new_client(self.url, self._token)
+            self._client = _new_client(self.url, self._token, self._trusted)
         return self._client
 
     def _timeout(self, seconds: float | None) -> httpx.Timeout:
@@ -304,17 +309,20 @@ def _checked(url: str) -> str:
     return url.rstrip("/")
 
 
-def _new_client(url: str, token: str | None) -> httpx.Client:
-    headers = {"Authorization": f"Bearer {token}"} if token else {}
-    limits = httpx.Limits(keepalive_expiry=_KEEPALIVE_SECONDS)
+def _trusted_certificates() -> SSLContext:
     try:
         # reads SSL_CERT_FILE also for loopback hosts, for which trust_env is false
-        trusted = httpx.create_ssl_context()
+        return httpx.create_ssl_context()
     except OSError as error:
         file = os.environ.get("SSL_CERT_FILE")
         raise UnusableCertificates(
             f"SSL_CERT_FILE: expected a file of trusted certificates in PEM, got {file!r}: {error.strerror or error}"
         ) from error
+
+
+def _new_client(url: str, token: str | None, trusted: SSLContext) -> httpx.Client:
+    headers = {"Authorization": f"Bearer {token}"} if token else {}
+    limits = httpx.Limits(keepalive_expiry=_KEEPALIVE_SECONDS)
     return httpx.Client(headers=headers, limits=limits, verify=trusted, trust_env=not _is_loopback(url))
 
 
