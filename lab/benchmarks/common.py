@@ -38,6 +38,8 @@ def started(made: argparse.ArgumentParser) -> argparse.Namespace:
     """Options as given; from here on lines are printed as they come, and torch has one thread."""
     sys.stdout.reconfigure(line_buffering=True)  # type: ignore[union-attr]
     torch.set_num_threads(1)
+    # Otherwise each program that a benchmark starts would compile all that it imports, for half of its start.
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
     return made.parse_args()
 
 
