@@ -7,12 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 import surrogym
 from surrogym_sampler import original
 from surrogym_sampler.original.describing import describe
 from surrogym_sampler.original.errors import StepFailed, UnknownEnvironment
 from surrogym_sampler.original.loading import is_known
+from surrogym_server.errors import InvalidInput
 from surrogym_shared.spec import (
     BoxAction,
     Coordinate,
@@ -23,6 +25,7 @@ from surrogym_shared.spec import (
     Term,
     Uniform,
 )
+from surrogym_trainer.evaluation import imagined_returns
 
 mujoco = pytest.importorskip("mujoco")
 
@@ -176,3 +179,29 @@ def test_the_parameters_of_a_file_are_calibrated_as_a_prior_and_the_reward_is_le
     structures = design.surrogate().model.structures
     assert all(one.startswith("prior + ") for one in structures[:4])
     assert not structures[4].startswith("prior + ")
+
+
+def test_a_surrogate_may_step_the_calibrated_file_itself(tmp_path):
+    spec = spec_of(reward=DeclaredReward(kind="declared", terms=(RewardTerm(weight=2.0, shape="one"),)))
+    prior = surrogym.Prior(pole(tmp_path), spec, ["mass.pole"])
+    (other := tmp_path / "other").mkdir()
+    real, (q, u) = original.make(pole(other, mass=0.3), spec=spec), drawn(5)
+    prior.calibrate([real.step_from(*row) for row in zip(q, u, strict=True)])
+    moved = prior.stepped().model.transition(torch.from_numpy(q), torch.from_numpy(u), stds=True, reward_std=True)
+    np.testing.assert_allclose(
+        moved.q_next, [real.step_from(*row).next_coordinates for row in zip(q, u, strict=True)], atol=1e-7
+    )
+    assert moved.reward.tolist() == [2.0] * 5
+    assert moved.std is not None
+    assert not moved.std.any()
+    returns = imagined_returns(prior.stepped(), lambda shown: np.zeros((len(shown), 1)), 3, seed=0)
+    assert returns.tolist() == [2.0 * spec.time_limit] * 3
+
+
+def test_a_stepped_simulator_needs_a_reward_and_a_declared_termination(tmp_path):
+    for fields, words in (
+        ({"reward": {"timing": "after"}}, "a declared reward"),
+        ({"termination": "learned"}, "termin"),
+    ):
+        with pytest.raises(InvalidInput, match=words):
+            surrogym.Prior(pole(tmp_path), spec_of(**fields)).stepped()

@@ -124,6 +124,8 @@ class SimulatorPrior(ABC):
         self._may_extend, self._seconds = steps is None, 0.0  # the mean seconds of a simulated step, once measured
         self.simulator = _opened(simulator, self.spec)
         self.source = self._words(simulator)
+        adapter = adapter_of(simulator) if isinstance(simulator, str) else None
+        self.pays = adapter is None or adapter.pays  # whether the simulator has a reward
         plant = adjustable(self.simulator)
         self.parameters = read_parameters(parameters, plant)
         self._set, present = plant.set_parameters, plant.parameters()
@@ -143,19 +145,32 @@ class SimulatorPrior(ABC):
         """
 
     def update(self, real: Sequence[RealStep], progress: Progress = silent) -> bool:
-        """Calibrate the parameters on all real steps so far, and learn the simulator's model again if their values
-        changed.
+        """Calibrate the parameters as ``calibrate`` does, and learn the simulator's model again if their values
+        changed. Returns whether there is a new model in ``file``.
+
+        Raises:
+            NotCalibrated: there are too few real steps for the parameters, or the simulator can't take most of them.
+            InvalidInput, NumericalFailure: the simulator's model can't be learned.
+        """
+        if not self.calibrate(real, progress):
+            return False
+        assert self.calibration is not None
+        file, confidence = self.learned(progress)
+        self.file = replace(file, about=self._about(self.calibration, confidence))
+        return True
+
+    def calibrate(self, real: Sequence[RealStep], progress: Progress = silent) -> bool:
+        """Calibrate the parameters on all real steps so far, unless the present values are right for them.
 
         Args:
             real: the real steps, at least two.
             progress: called with the share of the work that is done, and a few words.
 
         Returns:
-            Whether there is a new model in ``file``.
+            Whether the values changed.
 
         Raises:
             NotCalibrated: there are too few real steps for the parameters, or the simulator can't take most of them.
-            InvalidInput, NumericalFailure: the simulator's model can't be learned.
         """
         steps = _transitions(real)
         present = None if self.calibration is None else self._error(steps, self.calibration)
@@ -177,8 +192,6 @@ class SimulatorPrior(ABC):
         self.calibration = found
         self._set(found.values)
         self._seconds = step.seconds
-        file, confidence = self.learned(progress)
-        self.file = replace(file, about=self._about(found, confidence))
         return True
 
     def learned(self, progress: Progress = silent) -> tuple[SurrogateFile, float]:
