@@ -11,8 +11,9 @@ whose arm must stay within +-1.5 rad and is only seen by an encoder, one step la
 with limits or without:
 
 - real steps and rollouts of the design, and how many rollouts left a limit;
-- the mean real return of 50 episodes of a policy trained in the model, how many of them left a limit, and the share of
-  steps in which the fallback acted; how many episodes had a fallback, and the share that the promise expected;
+- the mean real return of ``--episodes`` episodes of a policy on the model (a network that is trained, or with
+  ``--planner`` a planner), how many of them left a limit, and the share of steps in which the fallback acted; how many
+  episodes had a fallback, and the share that the promise expected;
 - the same policy in a changed machine (a ball and a quadrotor 30 % heavier, a pump 20 % stronger, 10 % more heat of
   reaction), of which neither model nor policy nor fallback knows.
 
@@ -57,15 +58,15 @@ from surrogym_sampler.original.loading import Respecified
 from surrogym_sampler.original.rollouts import answering, keeping_limits
 from surrogym_server.local import LocalSurrogate
 from surrogym_shared.limits import clipped_action, falls_back, past
+from surrogym_shared.port import HORIZON
 from surrogym_shared.spec import EnvironmentSpec, Limit, Limits, Term, limits
 from surrogym_shared.terms import evaluate as value_of
-from surrogym_trainer.evaluation.evaluator import Evaluation, EvaluationSettings, evaluate
+from surrogym_trainer.evaluation.evaluator import FIRST_SEED
 from surrogym_trainer.evaluation.promise import promise_of
 from surrogym_trainer.policies import load_policy
 from surrogym_trainer.policies.predict import Predict
 from surrogym_trainer.training import TrainSettings, train
 
-EPISODES = 50
 REFERENCE_EPISODES = 500
 SEARCH = "FASTPPO"
 # The levitated ball, linearised about its middle: the direction in which it runs away, and a state feedback (LQR).
@@ -212,8 +213,8 @@ PLANTS = {
     ),
     "tanks": Plant(
         _with(TANKS),
-        _limits(Term.constant(-1.0), Limit(name="brim", term=Term.linear(upper=1.0), high=4.0, margin=0.7)),
-        Limit(name="brim", term=Term.linear(upper=1.0), high=4.0),
+        _limits(Term.constant(-1.0), Limit(name="brim", term=Term.linear(upper=1.0), high=3.0, margin=0.7)),
+        Limit(name="brim", term=Term.linear(upper=1.0), high=3.0),
         _with(TANKS, pump=1.2),
         budget=60,
         period=0.5,
@@ -300,8 +301,11 @@ def main() -> None:
         return
     if options.reference:
         for machine in options.machines:
-            found = reference(machine, options.first_seed, options.reference)
-            print(machine, "PPO in the plant: mean return {:.4g}, {} of {} episodes left".format(*found))
+            found = reference(machine, options.first_seed, options.reference, unpaid=options.unpaid)
+            words = (
+                "PPO in the plant: mean return {:.4g}, {} of {} episodes left, fallback in {} and {:.1%} of the steps"
+            )
+            print(machine, words.format(*found))
         return
     if options.random:
         for machine in options.machines:
@@ -316,41 +320,47 @@ def main() -> None:
         for machine in options.machines:
             for limited in (True,) if options.with_limits_only else (True, False):
                 if (machine, limited, seed) not in done:
-                    rows.append(run(machine, seed, limited=limited, policy=not options.no_policy))
+                    rows.append(run(machine, seed, options, limited=limited))
                     write_records(path, Row, rows)
                     print(rows[-1])
     print(table(rows))
 
 
 class Guarded(VecEnv):
-    """Episodes of a formula's machine in N lanes, in which the guard of the sampler keeps the limits."""
+    """Episodes of a formula's machine, or of the changed one, in N lanes. The guard of the sampler keeps the limits if
+    it is on. If ``unpaid``, an episode earns nothing from its first fallback on, as in virtual episodes."""
 
-    def __init__(self, machine: str, lanes: int, seed: int) -> None:
-        self.spec, _ = specifications(PLANTS[machine], 0)
-        self.judged = _judging(PLANTS[machine], self.spec)
-        self.plant: Machine = PLANTS[machine].make(0)._machine
+    def __init__(
+        self, machine: str, lanes: int, seed: int, *, guard: bool = True, changed: bool = False, unpaid: bool = False
+    ) -> None:
+        plant = PLANTS[machine]
+        self.spec, _ = specifications(plant, 0)
+        self.judged, self.guard, self.unpaid = _judging(plant, self.spec), guard, unpaid
+        self.plant: Machine = (plant.changed if changed else plant.make)(0)._machine
         size = len(self.plant.ranges)
         low, high = np.array(self.spec.action.ranges, dtype=np.float32).T
         super().__init__(lanes, spaces.Box(-np.inf, np.inf, (size,)), spaces.Box(low, high))
-        self.rng, self.steps, self.earned = np.random.default_rng([seed, 6]), 0, np.zeros(lanes)
-        self.left = np.zeros(lanes, dtype=bool)
+        self.rng = np.random.default_rng([seed, 6])
 
     def reset(self) -> Array:
         low, high = np.array(list(self.plant.start.values())).T
         self.q = self.before = self.rng.uniform(low, high, (self.num_envs, len(low)))
         self.steps, self.earned, self.left = 0, np.zeros(self.num_envs), np.zeros(self.num_envs, dtype=bool)
+        self.fallbacks = np.zeros(self.num_envs, dtype=int)
         return self.q.astype(np.float32)
 
     def step_async(self, actions: Array) -> None:
         self.asked = actions
 
     def step_wait(self) -> tuple[Array, Array, Array, list[dict[str, Any]]]:
-        near = falls_back(self.spec, self.before, self.q)
+        near = falls_back(self.spec, self.before, self.q) & self.guard
         (term,) = self.spec.limits.fallback
         applied = np.where(near, clipped_action(self.spec, value_of(self.spec, term, self.q)), self.asked[:, 0])
         self.before = self.q
         self.q, reward, _ = self.plant.step(self.q, applied[:, None], self.plant.real, self.rng)
         self.steps += 1
+        self.fallbacks += near
+        reward = np.where(self.unpaid & (self.fallbacks > 0), 0.0, reward)
         self.earned += reward
         self.left |= past(self.judged, self.q)
         ends, infos = self.steps == self.plant.time_limit, [{} for _ in range(self.num_envs)]
@@ -376,18 +386,28 @@ class Guarded(VecEnv):
         return [False] * self.num_envs
 
 
-def reference(machine: str, seed: int, steps: int) -> tuple[float, int, int]:
+def reference(machine: str, seed: int, steps: int, *, unpaid: bool) -> tuple[float, int, int, int, float]:
     """Train a policy by PPO in the plant itself with its guard. Return the mean return of ``REFERENCE_EPISODES``
-    episodes, how many of them left a limit, and their number."""
-    trained = VecNormalize(Guarded(machine, 64, seed), gamma=0.99)
+    episodes, how many of them left a limit, their number, how many had a fallback, and its share of the steps."""
+    trained = VecNormalize(Guarded(machine, 64, seed, unpaid=unpaid), gamma=0.99)
     falling = lambda left: 1e-3 * left  # noqa: E731
     model = PPO("MlpPolicy", trained, falling, 64, 1024, gae_lambda=0.97, seed=seed, device="cpu").learn(steps)
+    acts = lambda seen: model.predict(trained.normalize_obs(seen), deterministic=True)[0]  # noqa: E731
     plant = Guarded(machine, REFERENCE_EPISODES, seed + 1)
-    seen, earned, left = plant.reset(), plant.earned, plant.left
+    earned, left, fallbacks = _in_lanes(plant, acts)
+    share = float(fallbacks.mean()) / plant.plant.time_limit
+    return float(earned.mean()), int(left.sum()), REFERENCE_EPISODES, int((fallbacks > 0).sum()), share
+
+
+def _in_lanes(plant: Guarded, acts: Predict) -> tuple[Array, Array, Array]:
+    """Return the return, whether a limit was left, and the number of fallbacks of one episode in each lane, (N,)
+    each."""
+    seen = plant.reset()
+    found = plant.earned, plant.left, plant.fallbacks
     for _ in range(plant.plant.time_limit):
-        plant.step_async(model.predict(trained.normalize_obs(seen), deterministic=True)[0])
+        plant.step_async(acts(seen))
         seen, *_ = plant.step_wait()
-    return float(earned.mean()), int(left.sum()), REFERENCE_EPISODES
+    return found
 
 
 def random_episodes(machine: str, seed: int, episodes: int, *, limited: bool) -> tuple[int, int, float]:
@@ -447,7 +467,7 @@ def _judging(plant: Plant, spec: EnvironmentSpec) -> EnvironmentSpec:
     return judging
 
 
-def run(machine: str, seed: int, *, limited: bool, policy: bool) -> Row:
+def run(machine: str, seed: int, options: argparse.Namespace, *, limited: bool) -> Row:
     plant = PLANTS[machine]
     kept, free = specifications(plant, seed)
     spec = kept if limited else free
@@ -471,40 +491,53 @@ def run(machine: str, seed: int, *, limited: bool, policy: bool) -> Row:
         rollouts += 1
         left += bool(past(judged, np.array([step.next_coordinates for step in steps])).any())
     so_far = machine, limited, seed, design.phase, design.steps, rollouts, left
-    if not policy:
+    if options.no_policy:
         return Row(*so_far, float("nan"), 0, 0, float("nan"), 0, float("nan"), 0)
     model = design.surrogate()
-    acts = _trained(model, seed)
-    result = _evaluated(acts, spec, made)
-    share = 0.0 if result.limits is None else result.limits.fallbacks / result.limits.steps
-    fell_back = 0 if result.limits is None else result.limits.fallback_episodes
+    acts = model.planner(options.horizon, seed) if options.planner else _trained(model, seed)
+    earned, violated, fallbacks = _episodes(machine, spec, acts, seed, options.episodes)
     fallback = promise_of(model, acts, seed).fallback
-    elsewhere = _evaluated(acts, spec, lambda: Respecified(plant.changed(seed), spec))
+    elsewhere = _episodes(machine, spec, acts, seed, options.episodes, changed=True)[1]
     return Row(
         *so_far,
-        float(result.returns.mean()),
-        EPISODES,
-        _left(judged, result),
-        share,
-        fell_back,
+        float(earned.mean()),
+        len(earned),
+        int(violated.sum()),
+        float(fallbacks.mean()) / (spec.time_limit or 1),
+        int((fallbacks > 0).sum()),
         float("nan") if fallback is None or fallback.mean is None else fallback.mean,
-        _left(judged, elsewhere),
+        int(elsewhere.sum()),
     )
 
 
-def _left(judged: EnvironmentSpec, result: Evaluation) -> int:
-    """Return the number of episodes that left the physical limit."""
-    return sum(bool(past(judged, trace.coordinates).any()) for trace in result.traces)
+def _episodes(
+    machine: str, spec: EnvironmentSpec, acts: Predict, seed: int, episodes: int, *, changed: bool = False
+) -> tuple[Array, Array, Array]:
+    """Return the return, whether the physical limit was left, and the number of fallbacks of each real episode. Those
+    of formulas run side by side."""
+    plant = PLANTS[machine]
+    made = plant.changed if changed else plant.make
+    if isinstance(made(seed), Formula):
+        return _in_lanes(Guarded(machine, episodes, seed, guard=spec.limits is not None, changed=changed), acts)
+    environment = open_episode("plant:Plant", spec, lambda: Respecified(made(seed), spec))
+    judged, found = _judging(plant, specifications(plant, seed)[0]), np.zeros((episodes, 3))
+    for number in range(episodes):
+        moment = environment.reset(FIRST_SEED + number)
+        path = [moment.coordinates]
+        for _ in range(spec.time_limit or 0):
+            moment = environment.step(acts(moment.observation[None].astype(np.float32))[0])
+            path.append(moment.coordinates)
+            found[number] += moment.reward, 0, moment.fell_back
+            if moment.terminated or moment.truncated:
+                break
+        found[number, 1] = past(judged, np.array(path)).any()
+    return found[:, 0], found[:, 1] > 0, found[:, 2]
 
 
 def _trained(model: LocalSurrogate, seed: int) -> Predict:
     with TemporaryDirectory() as folder:
         trained = train(model, Path(folder) / "policy", TrainSettings(algorithm=SEARCH, seed=seed))
         return load_policy(trained.path, SEARCH)
-
-
-def _evaluated(acts: Predict, spec: EnvironmentSpec, made: Callable[[], Any]) -> Evaluation:
-    return evaluate(acts, lambda: open_episode("plant:Plant", spec, made), EvaluationSettings(EPISODES, parallel=1))
 
 
 def table(rows: Sequence[Row]) -> str:
@@ -541,8 +574,12 @@ def _options() -> argparse.Namespace:
     made.add_argument("--machines", nargs="+", choices=list(PLANTS), default=list(PLANTS))
     made.add_argument("--first-seed", type=int, default=0)
     made.add_argument("--seeds", type=int, default=1)
+    made.add_argument("--episodes", type=int, default=2_000, help="real episodes of each policy")
+    made.add_argument("--planner", action="store_true", help="policies are planners")
+    made.add_argument("--horizon", type=int, default=HORIZON, help="steps of each rollout of the planner")
     made.add_argument("--random", type=int, metavar="EPISODES", help="only take episodes of random actions")
     made.add_argument("--reference", type=int, metavar="STEPS", help="only train by PPO in the plant for these steps")
+    made.add_argument("--unpaid", action="store_true", help="its episodes earn nothing from a fallback on")
     made.add_argument("--time", action="store_true", help="only measure the time that the guard takes in a step")
     made.add_argument("--no-policy", action="store_true", help="designs alone")
     made.add_argument("--with-limits-only", action="store_true", help="no rows without limits")

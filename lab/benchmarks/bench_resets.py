@@ -12,7 +12,9 @@ targets are those of the demo, without its second evaluation. Prints one line fo
 ``--dirt`` gives the swing-up one kind of dirt, and sizes that each seed draws (``dirty_swingup.py``). A rod that is up
 is judged by its own angle then, not by what is read of it. ``--acting-with`` is the dirt of the machine on which the
 planner acts, if it is another one than the machine that was learned. The other tasks are the dirty machines that a
-planner can steer (``bench_trials.py``), which have no target here.
+planner can steer (``bench_trials.py``), which have no target here. If such a machine has a stop, a row says how many
+rollouts of the design and how many real episodes were beyond it: ``furuta-limits`` has declared limits that keep the
+arm inside, ``furuta`` has none.
 """
 
 from __future__ import annotations
@@ -29,13 +31,14 @@ from bench_dirt import KINDS
 from bench_trials import MACHINES, SWING_UPS, specification
 from common import OUT, append_row
 from dirty_swingup import InProcess
+from numpy.typing import NDArray
 
 import surrogym
 from surrogym.demo.tasks import TASKS, Outcome
 from surrogym_sampler import original
 from surrogym_sampler.original.episodes import Episode, RolloutEpisode, open_episode
 from surrogym_sampler.original.protocol import RolloutEnvironment
-from surrogym_sampler.original.rollouts import answering
+from surrogym_sampler.original.rollouts import answering, keeping_limits
 from surrogym_shared.port import horizon_of
 from surrogym_shared.spec import with_history
 from surrogym_trainer.evaluation.evaluator import EvaluationSettings, evaluate
@@ -50,6 +53,7 @@ BUDGETS = {
     "acrobot": 120,
     "invertedpendulum": 30,
     "furuta": 400,
+    "furuta-limits": 400,
     "double_pendulum": 1_000,
 }
 
@@ -85,8 +89,10 @@ def _run(task: str, seed: int, options: argparse.Namespace) -> list[dict[str, ob
         spec = with_history(spec, actions=SWING_UPS[dirt]) if dirt in SWING_UPS else spec
         machine = answering(InProcess(dirt, seed, spec))
     assert isinstance(machine, RolloutEnvironment)
+    machine = keeping_limits(machine)
+    assert isinstance(machine, RolloutEnvironment)
     design, starts, rows = surrogym.Design(machine.spec()), np.random.default_rng(seed), []
-    resets, known = 0, 0
+    resets, known, left = 0, 0, 0
 
     def row(count: int) -> dict[str, object]:
         taken = time.process_time() - begun
@@ -96,6 +102,7 @@ def _run(task: str, seed: int, options: argparse.Namespace) -> list[dict[str, ob
             "seed": seed,
             "steps": design.steps,
             "resets": resets,
+            "left": left,
             "phase": design.phase,
         }
         index = round(design.fidelity["confidence_index"], 4)
@@ -114,8 +121,15 @@ def _run(task: str, seed: int, options: argparse.Namespace) -> list[dict[str, ob
             if steps[-1].terminated or steps[-1].truncated:
                 break
         design.tell(query, steps)
+        left += _is_beyond(task, np.array([step.next_coordinates for step in steps]))
     machine.close()
     return [*rows, row(10 if rounds else options.episodes)]
+
+
+def _is_beyond(task: str, states: NDArray[np.float64]) -> bool:
+    """Return whether any of the states (n, C) is beyond the stop of the task's machine, if it has one."""
+    stop = MACHINES[task].stop if task in MACHINES else None
+    return stop is not None and bool((np.abs(states[:, 0]) > stop).any())
 
 
 def _earned(
@@ -140,7 +154,15 @@ def _earned(
     reached = None
     if task in TASKS:
         reached = replace(TASKS[task].target, also_success=None).reached(Outcome(mean, least, success))
-    return {"mean": round(mean, 2), "least": round(least, 2), "success": success, "reached": reached}
+    return {
+        "mean": round(mean, 2),
+        "least": round(least, 2),
+        "success": success,
+        "reached": reached,
+        "violations": sum(_is_beyond(task, trace.coordinates) for trace in real.traces),
+        "fallback_episodes": None if real.limits is None else real.limits.fallback_episodes,
+        "fallbacks": None if real.limits is None else real.limits.fallbacks,
+    }
 
 
 if __name__ == "__main__":

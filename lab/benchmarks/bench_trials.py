@@ -61,6 +61,7 @@ class Machine:
         actions: number of earlier actions that are declared.
         largest: largest change of each coordinate in one step.
         limits: limits that hold from the first real step on.
+        stop: largest absolute value of the first coordinate, by which episodes with and without limits are judged.
     """
 
     name: str
@@ -69,6 +70,7 @@ class Machine:
     actions: int = 0
     largest: tuple[float, ...] = ()
     limits: Limits | None = None
+    stop: float | None = None
 
 
 def _program(name: str, folder: str = "examples/machines") -> str:
@@ -93,8 +95,8 @@ STOPS = Limits(
 
 MACHINES = {
     "belt": Machine(_program("belt"), 450, 2, 1, (0.12, 0.6)),
-    "furuta": Machine(_program("furuta"), 400, 1, 2, (0.6, 0.8)),
-    "furuta-limits": Machine(_program("furuta"), 400, 1, 2, (0.6, 0.8), STOPS),
+    "furuta": Machine(_program("furuta"), 400, 1, 2, (0.6, 0.8), stop=1.8),
+    "furuta-limits": Machine(_program("furuta"), 400, 1, 2, (0.6, 0.8), STOPS, stop=1.8),
     "double_pendulum": Machine(_program("double_pendulum"), 600, 1, 2, (0.6, 0.9)),
     "invertedpendulum2": Machine("InvertedDoublePendulum-v5", 120),
     "reacher": Machine("Reacher-v5", 200),
