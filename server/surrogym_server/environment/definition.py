@@ -361,6 +361,15 @@ class EnvironmentDefinition:
             return torch.zeros(q_next.shape[:-1], dtype=torch.bool, device=q_next.device)
         return self._limits.falls_back(q, q_next)
 
+    def with_fallback(self, q: Tensor, u: Tensor) -> Tensor:
+        """Return the actions (n, F) at states q (n, C): those of the declared fallback within the margin of a limit;
+        elsewhere, or if the fallback is a program, u (n, F)."""
+        if self.limits is None or not isinstance(self.limits.fallback, tuple):
+            return u
+        low, high = (torch.as_tensor(ends, dtype=u.dtype) for ends in self.action_limits)
+        chosen = compile_terms(self.limits.fallback, self.coordinate_names)(q).clamp(low, high)
+        return torch.where(self.falls_back(q, q)[:, None], chosen, u)
+
     def room(self, q: Tensor) -> Tensor:
         """Return for L declared limits, each a range of a function of the state, how far states q (..., C) are from the
         nearer end of the range, (..., L). The distance is negative outside the range."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -15,7 +16,7 @@ from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.safety import LimitSet
 from surrogym_server.models.abilities import ArrayTransition, Avoided, GridPolicy
 from surrogym_server.planning.pending import PendingActions
-from surrogym_shared.spec import MOST_PLANNED, BoxAction, DiscreteAction
+from surrogym_shared.spec import MOST_PLANNED, BoxAction, DiscreteAction, Limit
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
@@ -45,8 +46,7 @@ class GridModel:
     grid: tuple[Floats, Floats, NDArray[np.int64], NDArray[np.bool_]]  # low, cell, count, cyclic, (K,) each
     actions: Floats  # (A, F)
     levels: Floats  # (F, L) values of each entry of a continuous action; (0, 0) for discrete ones
-    # (S, A, K) state after the step; not a number where the episode ended, or where the fallback of limits would act
-    q_next: Singles
+    q_next: Singles  # (S, A, K) state after the step; not a number where the episode ended
     reward: Singles  # (S, A) reward of the step
     # (S, A) how far the step leads beyond limits, as a share of the range of their terms; None without limits
     beyond: Singles | None = None
@@ -118,29 +118,34 @@ class GridModel:
 
 
 def solve(
-    pending: PendingActions, terminal_reward: float, time_limit: int | None, limits: LimitSet | None = None
+    pending: PendingActions, terminal_reward: float, time_limit: int | None, limits: Sequence[Limit] = ()
 ) -> GridPolicy:
-    """Return the policy with the highest return on a grid.
+    """Return the policy with the highest return on a grid, and the limits that rollouts around it avoid.
 
     Args:
         pending: the model's compiled steps, and what is known of actions that act later.
         terminal_reward: reward that steps that end the episode pay in addition.
         time_limit: largest number of steps of an episode, if there is one.
-        limits: limits that the policy keeps. A step beyond them costs as much as the rewards of a whole episode can
-            differ, and more with the distance, so no reward makes up for it.
+        limits: limits that the policy keeps besides the declared ones. A step beyond them costs as much as the rewards
+            of a whole episode can differ, and more with the distance, so no reward makes up for it. In rollouts, a step
+            after which the declared fallback would act costs as much.
     """
-    on_grid, discount = GridModel.of(pending, terminal_reward, limits=limits), discount_of(time_limit)
-    plain = _solved(on_grid, discount)
-    if limits is None or on_grid.beyond is None:
-        return plain
+    kept = LimitSet.of(limits, pending.steps.definition.coordinate_names) if limits else None
+    on_grid, discount = GridModel.of(pending, terminal_reward, limits=kept), discount_of(time_limit)
+    policy, declared = _solved(on_grid, discount), pending.steps.definition.limits
+    every = [*limits, *(declared.keep if declared else ())]
+    if not every:
+        return policy
     least = on_grid.reward.min(where=~np.isnan(on_grid.q_next[:, :, 0]), initial=0.0)  # of steps that go on
     price = float(on_grid.reward.max() - least or 1.0) * (time_limit or LONGEST_EPISODE)
-    kept = on_grid.within(plain, price)
+    policy = on_grid.within(policy, price) if limits else policy
     from surrogym_server.environment.compiled.limits import tables_of
 
-    return replace(
-        kept, avoided=Avoided(*tables_of(limits, _range_of(limits, pending, _nodes(*on_grid.grid[:3]))), price)
-    )
+    avoided = LimitSet.of(every, pending.steps.definition.coordinate_names)
+    unit = _range_of(avoided, pending, _nodes(*on_grid.grid[:3]))
+    # the fallback of declared limits also acts if one more step with the same change would lead within a margin
+    ahead = torch.arange(len(every)) >= len(limits)
+    return replace(policy, avoided=Avoided(*tables_of(avoided, unit, ahead), price))
 
 
 def _solved(on_grid: GridModel, discount: float) -> GridPolicy:
@@ -217,45 +222,46 @@ def _transitions(
     rewards (S, A), and how far it leads beyond ``limits`` (S, A), None without them. The states are not a number where
     the episode ended.
 
-    As in virtual episodes, an episode also ends where the fallback of declared limits would act, and gets the least
-    reward, or 0 if that is less, for each missing step.
+    At nodes within the margin of a declared limit, every action is that of the fallback, unless it is a program. A step
+    after which the fallback would act costs as much as the rewards of two steps can differ.
 
     With late actions, both states are what ``PendingActions.seen`` returns: the end of a step without the action.
     """
     count, size, definition = len(actions), nodes.shape[1], pending.steps.definition
     q_next = np.empty((len(nodes), count, size), dtype=np.float32)
     reward = np.empty((len(nodes), count), dtype=np.float32)
-    left = np.zeros((len(nodes), count), dtype=bool)
+    falling = np.empty((len(nodes), count), dtype=bool)
     beyond = None if limits is None else np.empty_like(reward)
     unit = None if limits is None else _range_of(limits, pending, nodes)
     repeated = definition.repeated_actions[definition.repeated_actions[:, 0] >= size]
     cyclic = [i for i, c in enumerate(definition.coordinates[:size]) if c.kind == "angle"]
 
-    def step(q: Floats, u: Floats, past: Floats) -> tuple[Floats, ArrayTransition]:
-        """Predict the step from q (m, K) with the actions u (m, F) and, where those act late, ``past`` (m, F). Return
-        the whole states (m, C) before it, too."""
+    def step(q: Floats, u: Floats, past: Floats) -> ArrayTransition:
+        """Predict the step from q (m, K) with the actions u (m, F) and, where those act late, ``past`` (m, F)."""
         acting = np.where(repeated[:, 2] <= pending.dead, u[:, repeated[:, 1]], past[:, repeated[:, 1]])
         whole = np.ascontiguousarray(np.concatenate([q, acting], 1))  # in the order of columns if q has one alone
-        return whole, pending.steps(whole, u, noise=None, process=None, paths=None, stds=False, reward_std=False)
+        return pending.steps(whole, u, noise=None, process=None, paths=None, stds=False, reward_std=False)
 
     for begin in range(0, len(nodes), ROWS):
         q = np.repeat(nodes[begin : begin + ROWS], count, axis=0)
-        u = np.tile(actions, (len(q) // count, 1))
-        none = np.tile(pending.neutral, (len(u), 1))
-        before, moved = step(q, u, none if pending.late else u)
+        none = np.tile(pending.neutral, (len(q), 1))
+        whole = torch.from_numpy(np.concatenate([q, none[:, repeated[:, 1]]], 1))
+        u = definition.with_fallback(whole, torch.from_numpy(np.tile(actions, (len(q) // count, 1)))).numpy()
+        moved = step(q, u, none if pending.late else u)
         after = moved.q_next
+        near = definition.falls_back(whole, torch.from_numpy(after)).numpy() & ~moved.terminated
         if pending.late:
             # The action moves the end of this step as it would move the end of a step from there.
-            begun = q + after[:, :size] - step(q, none, none)[1].q_next[:, :size]
+            begun = q + after[:, :size] - step(q, none, none).q_next[:, :size]
             begun[:, cyclic] = (begun[:, cyclic] + np.pi) % (2 * np.pi) - np.pi
-            after = step(begun, none, u)[1].q_next
-        over = definition.falls_back(torch.from_numpy(before), torch.from_numpy(after)).numpy() & ~moved.terminated
-        arrived = np.where((moved.terminated | over)[:, None], np.nan, after[:, :size])
+            after = step(begun, none, u).q_next
+        arrived = np.where(moved.terminated[:, None], np.nan, after[:, :size])
         q_next[begin : begin + ROWS] = arrived.reshape(-1, count, size)
         reward[begin : begin + ROWS] = (moved.reward + terminal_reward * moved.terminated).reshape(-1, count)
-        left[begin : begin + ROWS] = over.reshape(-1, count)
+        falling[begin : begin + ROWS] = near.reshape(-1, count)
         if limits is not None and beyond is not None and unit is not None:
             far = (limits.margin - limits.room(torch.from_numpy(after))) / unit
             beyond[begin : begin + ROWS] = far.amax(-1).clamp(min=0).numpy().reshape(-1, count)
-    lost = reward.min(where=~left, initial=0.0) / (1 - discount_of(definition.time_limit))
-    return q_next, np.where(left, np.float32(lost), reward), beyond
+    goes_on = ~np.isnan(q_next[:, :, 0])
+    differ = reward.max(where=goes_on, initial=0.0) - reward.min(where=goes_on, initial=0.0)
+    return q_next, np.where(falling, reward - differ, reward), beyond

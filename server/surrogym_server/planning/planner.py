@@ -13,11 +13,10 @@ from numpy.typing import NDArray
 from surrogym_server.compiled.threads import side_by_side
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.observation_inverse import ObservationInverse
-from surrogym_server.environment.safety import LimitSet
 from surrogym_server.errors import InvalidInput
 from surrogym_server.models.abilities import ArraySteps, CompiledSteps, GridPolicy, PlannedActions, offers
 from surrogym_server.models.port import DynamicsModel, with_set_points
-from surrogym_server.planning.grid import at_nearest_node, solve, unfit
+from surrogym_server.planning.grid import solve, unfit
 from surrogym_server.planning.pending import PendingActions
 from surrogym_server.planning.state_filter import StateFilter, apart
 from surrogym_shared.spec import BoxAction, Limit
@@ -67,9 +66,8 @@ def planner_of(
         raise InvalidInput(f"horizon: expected a whole number of steps from 1 to {MOST_HORIZON}, got {horizon!r}")
     model = with_set_points(model, tuple((set_points or {}).items()))
     inverse, able, steps = _requirements(model)
-    kept = LimitSet.of(limits, model.definition.coordinate_names) if limits else None
     pending = PendingActions.of(steps)
-    policy = solve(pending, model.terminal_reward, model.definition.time_limit, kept)
+    policy = solve(pending, model.terminal_reward, model.definition.time_limit, limits)
     noise = {name: std for name, std in (sensor_noise or {}).items() if std > 0}
     state_filter = StateFilter.of(model, steps, noise) if noise else None
     return Planner(model.definition, inverse, able, policy, horizon, seed, pending, state_filter)
@@ -163,35 +161,20 @@ class Planner:
         return self.inverse(shown, shown.new_zeros(len(shown), len(self._span))).numpy()
 
     def from_states(self, q: Floats) -> Floats:
-        """Return the actions (N, F) for states q (N, C). A discrete action is given by its number.
-
-        If limits are declared, these are the actions of the policy on the grid, which keeps away from the limits. The
-        rollouts do not know the limits.
-        """
+        """Return the actions (N, F) for states q (N, C). A discrete action is given by its number."""
         now, pending = self._continued(q), self.pending
-        if self.definition.limits is not None:
-            actions = at_nearest_node(self.policy, pending.seen(now.states))
+        actions = np.empty((len(q), now.plans.shape[2]))
+        changes, starts = self._changes[self._calls % SETS], pending.forecast(now.states, now.offsets)
+
+        def plan(rows: slice) -> None:
+            for i in range(len(q))[rows]:
+                actions[i], now.arrived[i] = self.model.planned(
+                    self.policy, starts[i], now.offsets[i], pending.early, pending.late, changes, ELITE, now.plans[i]
+                )
+
+        side_by_side(plan, len(q), STATES, torch.get_num_threads())
+        if pending.dead:
             now.arrived = pending.after(now.states, actions, now.offsets)
-        else:
-            actions = np.empty((len(q), now.plans.shape[2]))
-            changes, starts = self._changes[self._calls % SETS], pending.forecast(now.states, now.offsets)
-
-            def plan(rows: slice) -> None:
-                for i in range(len(q))[rows]:
-                    actions[i], now.arrived[i] = self.model.planned(
-                        self.policy,
-                        starts[i],
-                        now.offsets[i],
-                        pending.early,
-                        pending.late,
-                        changes,
-                        ELITE,
-                        now.plans[i],
-                    )
-
-            side_by_side(plan, len(q), STATES, torch.get_num_threads())
-            if pending.dead:
-                now.arrived = pending.after(now.states, actions, now.offsets)
         if self.state_filter is not None:
             now.covariances = self.state_filter.predicted(now.states, now.covariances, actions)
         self._calls += 1

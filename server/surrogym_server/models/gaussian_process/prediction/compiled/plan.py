@@ -263,7 +263,7 @@ def plan(
             if has_regions:
                 judge(numbers, places, q, q_next, entries, False, reward, std, over)
             if len(limit_places):
-                far = beyond(limit_numbers, limit_places, q_next)
+                far = beyond(limit_numbers, limit_places, q, q_next)
                 for i in range(lanes):
                     if far[i] > 0:
                         reward[i] -= price * (1 + far[i])
