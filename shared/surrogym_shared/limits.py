@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from itertools import product
 from typing import Protocol
 
@@ -150,20 +151,39 @@ class Step(Protocol):
     def next_coordinates(self) -> ArrayLike: ...
 
 
-def words_of_steps(spec: EnvironmentSpec, steps: Iterable[Step]) -> list[str]:
-    """Describe in sentences how well real steps kept each limit. Empty without limits or without steps."""
-    pairs = [] if spec.limits is None else [(step.coordinates, step.next_coordinates) for step in steps]
-    if not pairs:
-        return []
-    before, after = np.array(pairs, dtype=np.float64).transpose(1, 0, 2)
-    least, near = room(spec, after), falls_back(spec, before, after).sum()
-    lines = [
-        f"limit {limit.name}: {(least[:, i] < 0).sum()} of {len(after)} real steps beyond it, least room "
-        f"{least[:, i].min():.4g} {limit.unit}".rstrip()
-        + f", margin {limit.margin:g}"
-        for i, limit in enumerate(limits_of(spec).keep)
-    ]
-    return [*lines, f"limits: the fallback was due after {near} of {len(after)} real steps"]
+@dataclass(frozen=True)
+class KeptSteps:
+    """How well a number of real steps kept the limits of a specification."""
+
+    steps: int = 0
+    beyond: tuple[int, ...] = ()  # for each limit, the number of steps that ended beyond it
+    least: tuple[float, ...] = ()  # for each limit, the smallest distance to it after a step
+    near: int = 0  # number of steps after which the fallback was due
+
+    def with_steps(self, spec: EnvironmentSpec, steps: Iterable[Step]) -> KeptSteps:
+        """Count further real steps."""
+        pairs = [] if spec.limits is None else [(step.coordinates, step.next_coordinates) for step in steps]
+        if not pairs:
+            return self
+        before, after = np.array(pairs, dtype=np.float64).transpose(1, 0, 2)
+        rooms = room(spec, after)
+        beyond, least = (rooms < 0).sum(0), rooms.min(0)
+        if self.steps:
+            beyond, least = beyond + self.beyond, np.minimum(least, self.least)
+        near = self.near + int(falls_back(spec, before, after).sum())
+        return KeptSteps(self.steps + len(after), tuple(beyond.tolist()), tuple(least.tolist()), near)
+
+    def words(self, spec: EnvironmentSpec) -> list[str]:
+        """Describe in sentences how well the steps kept each limit. Empty without steps."""
+        if not self.steps:
+            return []
+        lines = [
+            f"limit {limit.name}: {beyond} of {self.steps} real steps beyond it, least room "
+            f"{least:.4g} {limit.unit}".rstrip()
+            + f", margin {limit.margin:g}"
+            for limit, beyond, least in zip(limits_of(spec).keep, self.beyond, self.least, strict=True)
+        ]
+        return [*lines, f"limits: the fallback was due after {self.near} of {self.steps} real steps"]
 
 
 def check_limits(spec: EnvironmentSpec) -> None:

@@ -17,7 +17,7 @@ import numpy as np
 from surrogym_client.errors import SurrogymClientError
 from surrogym_client.runtime.versions import versions
 from surrogym_client.surrogates.waiting import IN_WORDS
-from surrogym_shared.limits import words_of_steps
+from surrogym_shared.limits import KeptSteps
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import ModelView, OutputFidelity, Phase, SampleView, SurrogateView
 from surrogym_trainer.coverage import Cut, coverage_of
@@ -154,7 +154,7 @@ def _summary(view: SurrogateView, samples: Sequence[SampleView]) -> str:
         ("model", view.model_version),
         ("queries", ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in view.queries)),
         *([("last error", view.error)] if view.error else []),
-        *(("limits", words) for words in words_of_steps(view.spec, samples)),
+        *(("limits", words) for words in KeptSteps().with_steps(view.spec, samples).words(view.spec)),
     ]
     return section("State of the design", rows(facts))
 

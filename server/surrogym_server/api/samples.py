@@ -17,7 +17,6 @@ from surrogym_server.convert.exports import samples_as_csv, samples_as_npz
 from surrogym_server.convert.stored import read_stored
 from surrogym_server.storage.records import LogPart
 from surrogym_shared.codes import Code
-from surrogym_shared.limits import words_of_steps
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import (
     AddedSamples,
@@ -109,8 +108,9 @@ def dirt(name: str, use: Use) -> DirtList:
 def limits(name: str, use: Use) -> LimitsKept:
     """Count how many of all real steps ended beyond each limit of the specification, and after how many the fallback
     was due."""
-    spec = read_stored(EnvironmentSpec, "a stored specification", use.storage.surrogates.get(name).spec)
-    return LimitsKept(said=[] if spec.limits is None else words_of_steps(spec, use.samples.all(name)))
+    record = use.storage.surrogates.get(name)
+    spec = read_stored(EnvironmentSpec, "a stored specification", record.spec)
+    return LimitsKept(said=[] if spec.limits is None else use.samples.kept(record, spec).words(spec))
 
 
 @router.get(

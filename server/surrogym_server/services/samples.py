@@ -15,11 +15,21 @@ from surrogym_server.sampling.coverage import covered
 from surrogym_server.services.activity import Samplers
 from surrogym_server.services.definitions import Definitions, check_coordinates
 from surrogym_server.services.notices import Notices
-from surrogym_server.storage.records import AddedSamples, LedgerRecord, LogPart, NewSample, SampleRecord
+from surrogym_server.storage.records import (
+    AddedSamples,
+    LedgerRecord,
+    LogPart,
+    NewSample,
+    SampleRecord,
+    SurrogateRecord,
+)
 from surrogym_server.storage.sql import Storage
+from surrogym_shared.limits import KeptSteps
+from surrogym_shared.spec import EnvironmentSpec
 
 PAGE = 10_000
 BATCH = 500  # steps of a log are stored in batches of this size, each in one database transaction
+MOST_KEPT = 1_000  # largest number of surrogates of which it is kept how well the steps kept limits
 LOG = "log"  # steps of a log are stored with this name in place of a sampler's name
 
 
@@ -47,6 +57,7 @@ class SampleService:
         self._definitions = definitions
         self._notices = notices
         self._samplers = samplers or Samplers()
+        self._kept: dict[int, tuple[int, KeptSteps]] = {}  # id of the newest counted sample, by id of the surrogate
 
     def add(
         self,
@@ -141,6 +152,17 @@ class SampleService:
             page = self.page(name, page[-1].id, PAGE)
             records = records + page
         return records
+
+    def kept(self, record: SurrogateRecord, spec: EnvironmentSpec) -> KeptSteps:
+        """Return how well all real steps of a surrogate kept the limits of its specification. Only the samples since
+        the last call are read, because samples are never changed, and only deleted with their surrogate."""
+        newest, kept = self._kept.get(record.id, (0, KeptSteps()))
+        while page := self.page(record.name, newest, PAGE):
+            newest, kept = page[-1].id, kept.with_steps(spec, page)
+        if len(self._kept) > MOST_KEPT:
+            self._kept = {}
+        self._kept[record.id] = newest, kept
+        return kept
 
     def coordinate_names(self, name: str) -> tuple[str, ...]:
         """Return the names of a surrogate's coordinates, in their order in a sample."""
