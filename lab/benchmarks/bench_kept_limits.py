@@ -20,8 +20,10 @@ with limits or without:
 Each row is judged by the physical quantity that must stay in its range, such as the position of the cart. The declared
 limit may be of another term, such as the position plus the way of 0.2 s. Rows are saved in ``--out``/limits.csv, so
 that the same command continues after Ctrl-C. ``--reference`` trains a policy by PPO in the plant itself, with the same
-guard: a measure for the returns of policies that a model trained. ``--random`` takes episodes of random actions, each
-of which is held for some steps, with the guard and without.
+guard: a measure for the returns of policies that a model trained; with ``--unpaid`` its episodes earn nothing from the
+first fallback on. ``--shares`` prints the expected and the real share of the episodes of each policy with a fallback,
+for several sizes of the limit. ``--random`` takes episodes of random actions, each of which is held for some steps,
+with the guard and without.
 """
 
 from __future__ import annotations
@@ -68,6 +70,7 @@ from surrogym_trainer.policies.predict import Predict
 from surrogym_trainer.training import TrainSettings, train
 
 REFERENCE_EPISODES = 500
+SCALES = (0.8, 0.9, 1.0, 1.1, 1.2, 1.3, 1.4, 1.5, 1.6)  # factors of the physical limit for ``--shares``
 SEARCH = "FASTPPO"
 # The levitated ball, linearised about its middle: the direction in which it runs away, and a state feedback (LQR).
 # Beyond 2.1 in this direction no voltage holds it any more.
@@ -318,8 +321,9 @@ def main() -> None:
     done = {(row.machine, row.limits, row.seed) for row in rows}
     for seed in range(options.first_seed, options.first_seed + options.seeds):
         for machine in options.machines:
-            for limited in (True,) if options.with_limits_only else (True, False):
-                if (machine, limited, seed) not in done:
+            for limited in (True, False):
+                left_out = options.without_limits_only if limited else options.with_limits_only
+                if not left_out and (machine, limited, seed) not in done:
                     rows.append(run(machine, seed, options, limited=limited))
                     write_records(path, Row, rows)
                     print(rows[-1])
@@ -331,11 +335,19 @@ class Guarded(VecEnv):
     it is on. If ``unpaid``, an episode earns nothing from its first fallback on, as in virtual episodes."""
 
     def __init__(
-        self, machine: str, lanes: int, seed: int, *, guard: bool = True, changed: bool = False, unpaid: bool = False
+        self,
+        machine: str,
+        lanes: int,
+        seed: int,
+        *,
+        guard: bool = True,
+        changed: bool = False,
+        unpaid: bool = False,
+        spec: EnvironmentSpec | None = None,
     ) -> None:
         plant = PLANTS[machine]
-        self.spec, _ = specifications(plant, 0)
-        self.judged, self.guard, self.unpaid = _judging(plant, self.spec), guard, unpaid
+        self.spec, self.guard, self.unpaid = spec or specifications(plant, 0)[0], guard, unpaid
+        self.judged = spec or _judging(plant, self.spec)
         self.plant: Machine = (plant.changed if changed else plant.make)(0)._machine
         size = len(self.plant.ranges)
         low, high = np.array(self.spec.action.ranges, dtype=np.float32).T
@@ -495,6 +507,8 @@ def run(machine: str, seed: int, options: argparse.Namespace, *, limited: bool) 
         return Row(*so_far, float("nan"), 0, 0, float("nan"), 0, float("nan"), 0)
     model = design.surrogate()
     acts = model.planner(options.horizon, seed) if options.planner else _trained(model, seed)
+    if options.shares:
+        print_shares(machine, model, acts, seed, options.episodes)
     earned, violated, fallbacks = _episodes(machine, spec, acts, seed, options.episodes)
     fallback = promise_of(model, acts, seed).fallback
     elsewhere = _episodes(machine, spec, acts, seed, options.episodes, changed=True)[1]
@@ -508,6 +522,22 @@ def run(machine: str, seed: int, options: argparse.Namespace, *, limited: bool) 
         float("nan") if fallback is None or fallback.mean is None else fallback.mean,
         int(elsewhere.sum()),
     )
+
+
+def print_shares(machine: str, model: LocalSurrogate, acts: Predict, seed: int, episodes: int) -> None:
+    """Print for several sizes of the physical limit, without a margin, in how many episodes of a policy the fallback is
+    expected, in how many real ones it acts, and how many leave the limit without a guard."""
+    plant = PLANTS[machine]
+    for scale in SCALES:
+        moved = {end: scale * at for end in ("low", "high") if (at := getattr(plant.physical, end)) is not None}
+        limits = plant.limits.model_copy(update={"keep": (plant.physical.model_copy(update=moved),)})
+        spec = EnvironmentSpec.model_validate({**model.spec().model_dump(), "limits": limits.model_dump()})
+        found = promise_of(LocalSurrogate.from_bytes(spec, model.model_file()), acts, seed).fallback
+        left = _in_lanes(Guarded(machine, episodes, seed, guard=False, spec=spec), acts)[1].mean()
+        fell_back = (_in_lanes(Guarded(machine, episodes, seed, spec=spec), acts)[2] > 0).mean()
+        assert found is not None
+        words = f"expected {found.mean:.2%} ({found.low:.2%} to {found.high:.2%}), real {fell_back:.2%}"
+        print(f"{machine}, seed {seed}, limit times {scale:g}: fallback {words}; left without a guard {left:.2%}")
 
 
 def _episodes(
@@ -575,6 +605,8 @@ def _options() -> argparse.Namespace:
     made.add_argument("--first-seed", type=int, default=0)
     made.add_argument("--seeds", type=int, default=1)
     made.add_argument("--episodes", type=int, default=2_000, help="real episodes of each policy")
+    made.add_argument("--shares", action="store_true", help="print expected and real shares for several limits")
+    made.add_argument("--without-limits-only", action="store_true", help="no rows with limits")
     made.add_argument("--planner", action="store_true", help="policies are planners")
     made.add_argument("--horizon", type=int, default=HORIZON, help="steps of each rollout of the planner")
     made.add_argument("--random", type=int, metavar="EPISODES", help="only take episodes of random actions")
