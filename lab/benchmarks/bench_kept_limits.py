@@ -241,7 +241,7 @@ PLANTS = {
         ),
         Limit(name="temperature", term=Term.linear(temperature=1.0), high=20.0),
         _with(REACTOR, heat=1.1),
-        budget=120,
+        budget=300,
         period=3.0,
         changes={},
     ),
