@@ -3,18 +3,26 @@
 import csv
 import json
 import re
+import threading
+import time
 
 import numpy as np
 import pytest
 
 from support.machine import Machine, diary_in
 from support.moody import DECLARED
+from surrogym.cli.commands.train import _trainable
+from surrogym_client.surrogates.waiting import COMPLETED
 from surrogym_client.transport import Api
 from surrogym_sampler import original
+from surrogym_sampler.original.classic import pendulum as pendulum_spec
 from surrogym_sampler.original.loading import with_choices
+from surrogym_sampler.queries import Sampler, SamplerSettings
 from surrogym_shared.archives import stored
+from surrogym_shared.spec import Design
 from surrogym_trainer.policies import PolicyCard
 from surrogym_trainer.policies.evidence import Promise
+from surrogym_trainer.training import TrainSettings
 
 OWN = """
 from surrogym_sampler.original import RealStep
@@ -146,17 +154,32 @@ def test_exporting_a_surrogate_without_a_model_is_refused(on_server, pendulum):
 
 
 def test_training_without_a_model_recommends_sampling_or_waiting(on_server, pendulum):
-    """It told a person to start a sampler while one was running."""
+    """A person who starts the training a second after the sampler is told nothing: the training waits."""
     missing = f"error: '{pendulum}' has no model yet, its phase is "
     said = on_server("train", pendulum, "--quiet")
     assert said.err.startswith(missing)
     assert said.err.endswith(f"run surrogym sample {pendulum}, or give --wait SECONDS\n")
     assert on_server("sample", pendulum, "--max-queries", "1", "--quiet").code == 0
-    said = on_server("train", pendulum, "--quiet")
+    said = on_server("train", pendulum, "--quiet", "--wait", "0")
     assert said.err.startswith(missing)
-    assert said.err.endswith(
-        ", and a sampler is connected: give --wait 120, and the training begins after the design\n"
-    )
+    assert said.err.endswith(": leave --wait out, and the training begins after the design\n")
+
+
+def test_training_waits_for_a_design_on_which_a_sampler_is_at_work(server_process, name):
+    spec = pendulum_spec().model_copy(update={"design": Design(budget=12)})
+    with Api(server_process.url) as api, Api(server_process.url) as own:
+        api.create_surrogate(name, spec)
+        sampler = Sampler(own, name, original.make("Pendulum-v1"), SamplerSettings(name="thread", wait_seconds=0.5))
+        thread = threading.Thread(target=sampler.run)
+        thread.start()
+        try:
+            while not api.surrogate(name).samplers:
+                time.sleep(0.01)
+            _trainable(name, server_process.url, None, None, TrainSettings(), quiet=True)
+            assert api.surrogate(name).phase in COMPLETED, "it said that there is no model yet"
+        finally:
+            sampler.stop()
+            thread.join()
 
 
 def test_the_improve_command_adds_queries(on_server, pendulum):

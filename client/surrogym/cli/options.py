@@ -79,6 +79,15 @@ TrustPolicy = Annotated[
 Wait = Annotated[
     float, typer.Option("--wait", min=0, help="Seconds to wait for a server or surrogate that is not there yet.")
 ]
+TrainWait = Annotated[
+    float | None,
+    typer.Option(
+        "--wait",
+        min=0,
+        help="Seconds to wait for the server, the surrogate and the end of its design. Without it, training waits for "
+        "a design on which a sampler or a fit is at work; 0 does not wait.",
+    ),
+]
 ExitWithParent = Annotated[
     bool, typer.Option("--exit-with-parent", hidden=True, help="End when the process that started this one ends.")
 ]

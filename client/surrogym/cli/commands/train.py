@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -18,7 +18,7 @@ from surrogym.cli.groups import Output, Service
 from surrogym.cli.options import (
     ExitWithParent,
     Surrogate,
-    Wait,
+    TrainWait,
     awaited_surrogate,
     connect,
     given_here,
@@ -43,6 +43,7 @@ if TYPE_CHECKING:
 
     Record = Callable[[TrainProgress], None]
 
+LONGEST_SECONDS = 604_800.0  # a week: longest wait for a design on which a sampler is at work
 NOTHING_YET = "interrupted before there was a policy; nothing was saved; the same command starts from the beginning"
 
 
@@ -56,7 +57,7 @@ def command(
     start: StartOptions,
     loop: LoopOptions,
     log: LogOptions,
-    wait: Wait = 0.0,
+    wait: TrainWait = None,
     exit_with_parent: ExitWithParent = False,
     service: Service,
     output: Output,
@@ -175,12 +176,13 @@ def _words_of_sessions(view: SurrogateView) -> str:
 
 
 def _trainable(
-    surrogate: str, server: str | None, token: str | None, wait: float, settings: TrainSettings, *, quiet: bool
+    surrogate: str, server: str | None, token: str | None, wait: float | None, settings: TrainSettings, *, quiet: bool
 ) -> tuple[EnvironmentSpec, str]:
     """Return the specification of a surrogate that has a model, and the server's URL.
 
     If ``wait`` is above 0, wait at most that many seconds for the server, the surrogate and the end of its design, and
-    import the packages of the policy search in the meantime.
+    import the packages of the policy search in the meantime. If it is None, wait for the end of a design as long as a
+    sampler or a fit is at work.
 
     Raises:
         CommandError: the surrogate has no model yet, its reward lacks a set point or an integral of the settings, or
@@ -198,8 +200,8 @@ def _trainable(
     from surrogym_shared.set_points import with_set_points
     from surrogym_trainer.training.search import SEARCHES, name_of
 
-    with connect(server, token, wait, quiet=quiet) as api:
-        view = awaited_surrogate(api, surrogate, wait, quiet=quiet)
+    with connect(server, token, wait or 0.0, quiet=quiet) as api:
+        view = awaited_surrogate(api, surrogate, wait or 0.0, quiet=quiet)
         try:
             with_set_points(view.spec, settings.set_points)
             Integrals.of(view.spec, errors_of(view.spec, settings.integral, settings.set_points))
@@ -207,13 +209,19 @@ def _trainable(
                 limit_of(view.spec, str(limit))
         except ValueError as error:
             raise CommandError(str(error)) from error
-        if wait > 0:
+        if wait or (wait is None and _under_way(view)):
             SEARCHES.get(name_of(settings))
             stays = "interrupted; the design continues on the server; the same command waits again"
-            with working("design", stays, quiet=quiet) as update:
-                view = wait_for_design(
-                    api, surrogate, wait, lambda view: update(share_of_design(view), words_of_design(view))
-                )
+            with working("design", stays, quiet=quiet) as update, suppress(_NobodyWorks):
+
+                def look(now: SurrogateView) -> None:
+                    nonlocal view
+                    view = now
+                    update(share_of_design(now), words_of_design(now))
+                    if wait is None and now.phase not in COMPLETED and not _under_way(now):
+                        raise _NobodyWorks
+
+                view = wait_for_design(api, surrogate, wait or LONGEST_SECONDS, look)
         if view.model_version is None:
             raise CommandError(_words_without_model(view))
         if view.sessions:
@@ -231,6 +239,19 @@ def _trainable(
                 err=True,
             )
         return view.spec, api.url
+
+
+class _NobodyWorks(Exception):
+    """Neither a sampler nor a fit is at work for an unfinished design."""
+
+
+def _under_way(view: SurrogateView) -> bool:
+    """Whether a sampler or a fit is at work for the design."""
+    from surrogym_client.surrogates.waiting import COMPLETED
+
+    return (
+        view.phase not in (*COMPLETED, "failed") and not view.paused and bool(view.samplers or view.phase == "fitting")
+    )
 
 
 def _words_without_trials(view: SurrogateView, settings: TrainSettings) -> str:
@@ -267,10 +288,8 @@ def _words_without_model(view: SurrogateView) -> str:
     from surrogym_sampler.original.loading import sample_command
 
     missing = f"{view.name!r} has no model yet, its phase is {view.phase}"
-    if view.phase == "fitting":
-        return f"{missing}: give --wait 120, and the training begins after the design"
-    if view.samplers:
-        return f"{missing}, and a sampler is connected: give --wait 120, and the training begins after the design"
+    if _under_way(view):
+        return f"{missing}: leave --wait out, and the training begins after the design"
     learn = f"surrogym import LOG --to {view.name}" if view.budget == 0 else sample_command(view.name, view.environment)
     return f"{missing}: run {learn}, or give --wait SECONDS"
 
