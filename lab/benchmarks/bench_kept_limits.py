@@ -60,7 +60,7 @@ from surrogym_sampler.original.loading import Respecified
 from surrogym_sampler.original.rollouts import answering, keeping_limits
 from surrogym_server.local import LocalSurrogate
 from surrogym_shared.limits import clipped_action, falls_back, past
-from surrogym_shared.port import HORIZON
+from surrogym_shared.port import horizon_of
 from surrogym_shared.spec import EnvironmentSpec, Limit, Limits, Term, limits
 from surrogym_shared.terms import evaluate as value_of
 from surrogym_trainer.evaluation.evaluator import FIRST_SEED
@@ -506,7 +506,7 @@ def run(machine: str, seed: int, options: argparse.Namespace, *, limited: bool) 
     if options.no_policy:
         return Row(*so_far, float("nan"), 0, 0, float("nan"), 0, float("nan"), 0)
     model = design.surrogate()
-    acts = model.planner(options.horizon, seed) if options.planner else _trained(model, seed)
+    acts = model.planner(options.horizon or horizon_of(spec), seed) if options.planner else _trained(model, seed)
     if options.shares:
         print_shares(machine, model, acts, seed, options.episodes)
     earned, violated, fallbacks = _episodes(machine, spec, acts, seed, options.episodes)
@@ -608,7 +608,7 @@ def _options() -> argparse.Namespace:
     made.add_argument("--shares", action="store_true", help="print expected and real shares for several limits")
     made.add_argument("--without-limits-only", action="store_true", help="no rows with limits")
     made.add_argument("--planner", action="store_true", help="policies are planners")
-    made.add_argument("--horizon", type=int, default=HORIZON, help="steps of each rollout of the planner")
+    made.add_argument("--horizon", type=int, help="steps of each rollout of the planner")
     made.add_argument("--random", type=int, metavar="EPISODES", help="only take episodes of random actions")
     made.add_argument("--reference", type=int, metavar="STEPS", help="only train by PPO in the plant for these steps")
     made.add_argument("--unpaid", action="store_true", help="its episodes earn nothing from a fallback on")
