@@ -39,7 +39,7 @@ from surrogym_shared.wire import Trial
 from surrogym_trainer.policies.files import load_network
 from surrogym_trainer.policies.integrals import IntegralPort
 from surrogym_trainer.training import TrainSettings
-from surrogym_trainer.training.audited import AuditedTraining
+from surrogym_trainer.training.audited import PROMISING, AuditedTraining
 from surrogym_trainer.training.closed_loop import LoopSettings
 from surrogym_trainer.training.handover import AuditSettings, Subject, hand_over
 from surrogym_trainer.training.settings import TrainingInterrupted
@@ -222,12 +222,15 @@ def test_a_machine_with_a_dead_time_gets_a_planner_that_acts_in_its_audit(
     trials_server: ServerProcess, waiting: str, tmp_path: Path
 ) -> None:
     with Api(trials_server.url) as api, HttpSurrogate(trials_server.url, waiting) as port:
-        training = AuditedTraining(api, waiting, port, tmp_path / "p.zip", TrainSettings(), audit=AuditSettings())
+        said: list[str] = []
+        audit, out = AuditSettings(), tmp_path / "p.zip"
+        training = AuditedTraining(api, waiting, port, out, TrainSettings(), audit=audit, saying=said.append)
         result, handover = training.train()
         view = api.surrogate(waiting)
         (query,) = [query for query in api.queries(waiting) if query.purpose == "audit"]
         samples = [sample for sample in api.samples(waiting) if sample.query_id == query.id]
     assert result.algorithm == "PLANNER"
+    assert said == [PROMISING], "a planner's virtual episodes may take minutes"
     assert view.phase == "over_budget", "nothing of the budget is left to trials"
     assert handover.audit is not None
     assert handover.audit.passed

@@ -30,6 +30,8 @@ from surrogym_trainer.training.settings import (
 from surrogym_trainer.training.trainer import train
 from surrogym_trainer.training.trials import Trials, allows_trials, is_waiting_for_trials
 
+PROMISING = "computes the promise by whole virtual episodes, and audits it"
+
 
 @dataclass
 class AuditedTraining:
@@ -56,6 +58,7 @@ class AuditedTraining:
         audit: settings of the audit; None takes no audit.
         progress: called after every rollout.
         waiting: called each time the surrogate is polled, while a sampler answers queries.
+        saying: called with a few words before what takes no virtual step of a training, but may take minutes.
     """
 
     api: Api
@@ -67,6 +70,7 @@ class AuditedTraining:
     audit: AuditSettings | None = None
     progress: Callable[[TrainProgress], None] | None = None
     waiting: Callable[[SurrogateView], None] | None = None
+    saying: Callable[[str], None] | None = None
     candidates: Candidates = field(default_factory=Candidates, init=False)
     # Number of rounds (train a policy, then query where it goes) that took no real step.
     _unspent: int = field(default=0, init=False)
@@ -91,6 +95,8 @@ class AuditedTraining:
         try:
             for number in range(1, MOST_AUDITS + 1):
                 taken = self.api.surrogate(self.name).ledger.total
+                if self.saying is not None:
+                    self.saying(PROMISING)
                 handover = hand_over(self._subject(result), self.audit, self.waiting)
                 if number == MOST_AUDITS or not self._to_be_trained_on(handover.audit, result, taken, number):
                     break

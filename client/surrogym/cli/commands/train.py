@@ -350,6 +350,7 @@ def _train(
                 audit=loop.audited(settings.seed),
                 progress=record,
                 waiting=_waiting(update),
+                saying=partial(update, None),
             )
             return training.train()
         except ValueError as error:
