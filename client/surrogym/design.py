@@ -11,7 +11,7 @@ from __future__ import annotations
 import itertools
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, Protocol, Self
 from uuid import uuid4
@@ -105,9 +105,9 @@ class Design:
         self.budget = default_budget(spec) if budget is None else checks.whole("budget", budget, 2, checks.MOST_STEPS)
         self.target = spec.design.target if target is None else checks.share("target", target)
         self._threads = checks.whole("threads", threads, 1, checks.MOST_THREADS)
+        definition = definition_from_spec(spec)
         # Here no policy tries episodes, so the design leaves no steps to them.
-        own = spec.model_copy(update={"design": spec.design.model_copy(update={"trials": False})})
-        self._definition = definition_from_spec(own)
+        self._definition = replace(definition, design=replace(definition.design, trials=False))
         self._prior = prior
         self._name = uuid4().hex
         self._ids = itertools.count(1)

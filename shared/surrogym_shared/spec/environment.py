@@ -85,9 +85,6 @@ class Design(Frozen):
     sign if all coordinates and the action have. ``none``, and the preset ``paper``, don't test this.
 
     ``monte_carlo``: number of points that estimate the confidence index (eq. 8).
-
-    ``trials``: whether the design leaves the rest of its budget to trials of trained policies where only these can
-    steer the environment. Without trials it takes all steps itself, for a planner, which needs no training.
     """
 
     preset: PresetName = "default"
@@ -99,7 +96,6 @@ class Design(Frozen):
     tolerance: Tolerance | None = None
     monte_carlo: Annotated[int, Field(ge=16, le=100_000, strict=True)] | None = None
     symmetry: Literal["auto", "none"] = "auto"
-    trials: Annotated[bool, Field(strict=True)] = True
     seed: Annotated[int, Field(ge=0, lt=2**63, strict=True)] = 0
 
 
@@ -170,11 +166,10 @@ class EnvironmentSpec(Frozen):
 
     @property
     def needs_trials(self) -> bool:
-        """Whether trained policies try episodes: the environment can only be reset, has more coordinates than most
-        planners can steer through, no planner fits, and its design leaves steps to trials. Declared limits hold in a
-        trial, too, because the sampler keeps them."""
-        many = len(self.coordinates) > MOST_PLANNED and not self.fits_planner
-        return self.access == "reset" and self.design.trials and many
+        """Whether a design leaves steps to trials of trained policies: the environment can only be reset, has more
+        coordinates than most planners can steer through, and no planner fits. Declared limits hold in a trial, too,
+        because the sampler keeps them."""
+        return self.access == "reset" and len(self.coordinates) > MOST_PLANNED and not self.fits_planner
 
     @property
     def repeats_actions(self) -> tuple[bool, ...]:

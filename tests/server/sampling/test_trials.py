@@ -108,13 +108,12 @@ def test_the_actions_of_any_other_query_are_its_own():
     assert [design.acting(query)(i, [0.0, 0.0]) for i in range(query.steps)] == list(query.actions)
 
 
-def test_a_design_without_trials_leaves_no_steps_to_them():
+def test_a_design_in_python_leaves_no_steps_to_trials():
     plain = cartpole().model_copy(update={"query": "rollout"})
     spec = with_history(plain, changes=1, largest=dict.fromkeys(plain.coordinate_names, 1.0))
-    alone = spec.model_copy(update={"design": spec.design.model_copy(update={"trials": False})})
-    assert (spec.needs_trials, alone.needs_trials) == (True, False)
+    assert spec.needs_trials
     left = []
-    for own in (spec, alone):
-        facts = SimpleNamespace(definition=definition_from_spec(own), continues=True, testing=False, cost=1_000)
+    for definition in (definition_from_spec(spec), Design(spec)._definition):
+        facts = SimpleNamespace(definition=definition, continues=True, testing=False, cost=1_000)
         left.append(leave_to_trials(facts))  # type: ignore[arg-type]
     assert left == [(), None]

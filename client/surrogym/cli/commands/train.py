@@ -263,10 +263,7 @@ def _words_without_trials(view: SurrogateView, settings: TrainSettings) -> str:
 
     none = f"so no trials take the other {view.budget_left} real steps of the budget"
     if not allows_trials(view.spec, settings):
-        return (
-            f"samplers can't run policies of {name_of(settings)}, {none}: for trials, train without --algorithm; to "
-            'let the design take them, register the environment with "trials": false in "design" of its specification'
-        )
+        return f"samplers can't run policies of {name_of(settings)}, {none}: for trials, train without --algorithm"
     if view.samplers:
         return ""
     start = sample_command(view.name, view.environment)
