@@ -15,8 +15,8 @@ from surrogym.cli.errors import CommandError
         ("pcgym:tank.json", "expected --env pcgym:tank.json"),
         ("fmu:a plant.fmu", "expected --env 'fmu:a plant.fmu'"),
         ("rail:Rail", "expected --env rail:Rail"),
-        ("exec:./plant --port 7", "--env fmu:PLANT.fmu, or --exec COMMAND"),
-        ("a rail", "--env pcgym:FILE.json, --env fmu:PLANT.fmu, or --exec COMMAND"),
+        ("exec:./plant --port 7", "--env fmu:PLANT.fmu, --env mujoco:FILE.xml, or --exec COMMAND"),
+        ("a rail", "--env pcgym:FILE.json, --env fmu:PLANT.fmu, --env mujoco:FILE.xml, or --exec COMMAND"),
     ],
 )
 def test_the_refusal_to_open_a_surrogates_environment_names_the_option_that_allows_it(name: str, expected: str) -> None:
