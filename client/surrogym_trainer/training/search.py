@@ -161,7 +161,7 @@ def with_algorithm(settings: TrainSettings, spec: EnvironmentSpec) -> TrainSetti
 def _is_planned(settings: TrainSettings, spec: EnvironmentSpec) -> bool:
     """Whether a planner is the default: the environment can only be reset, and has so many coordinates because some
     repeat actions, through which a planner looks. Networks stay at a local optimum there, or need two to three times
-    the real steps (decision 98). A setting that only a training has asks for a network."""
+    the real steps (decision 101). A setting that only a training has asks for a network."""
     of_planner = {field.name for field in fields(cast("Any", SEARCHES.get(PLANNING)))}
     plain = TrainSettings(
         seed=settings.seed,

@@ -90,7 +90,7 @@ def _requirements(model: DynamicsModel) -> tuple[ObservationInverse, PlannedActi
     if able is None or steps is None or not able.plans:
         raise InvalidInput(
             "expected a model of Gaussian processes with compiled steps, beside at most one prior, because a planner "
-            "rolls it out in compiled code: train a policy"
+            "rolls it out in compiled code: train a network (--algorithm fastppo)"
         )
     return inverse, able, steps
 
@@ -108,14 +108,14 @@ def _inverse(definition: EnvironmentDefinition) -> ObservationInverse:
     }
     for expected, holds in asked.items():
         if not holds:
-            raise InvalidInput(f"a planner needs {expected}: train a policy")
+            raise InvalidInput(f"a planner needs {expected}: train a network (--algorithm fastppo)")
     inverse = ObservationInverse.of(definition, lags=True)
     found = {index for index, _ in inverse.sources}
     missing = [name for i, name in enumerate(names) if i not in found]
     if missing:
         raise InvalidInput(
             f"a planner reads the state from the observation, and {', '.join(missing)} can't be computed from it: "
-            "train a policy"
+            "train a network (--algorithm fastppo)"
         )
     return inverse
 

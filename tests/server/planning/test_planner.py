@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import zipfile
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -277,12 +278,15 @@ def test_a_horizon_out_of_its_range_is_refused(hanging: LocalSurrogate, horizon)
 def refused(spec: EnvironmentSpec, said: str) -> None:
     """The definition alone is refused, before the model is looked at."""
     model: Any = SimpleNamespace(definition=definition_from_spec(spec))
-    with pytest.raises(InvalidInput, match=said):
+    with pytest.raises(InvalidInput, match=re.escape(said)):
         planner_of(model, 20)
 
 
 def test_an_environment_with_too_many_coordinates_is_refused():
-    refused(reacher(), "a planner needs at most 4 coordinates that repeat no action, got 6: train a policy")
+    refused(
+        reacher(),
+        "a planner needs at most 4 coordinates that repeat no action, got 6: train a network (--algorithm fastppo)",
+    )
 
 
 def test_a_coordinate_that_the_observation_does_not_show_is_named():
@@ -294,7 +298,7 @@ def test_a_coordinate_that_the_observation_does_not_show_is_named():
 def test_an_action_with_a_rate_is_refused():
     resets = pendulum().model_copy(update={"query": "rollout"})
     rated = with_history(resets, actions=1, rate=(4.0,))
-    refused(rated, "a planner needs an action without rate: train a policy")
+    refused(rated, "a planner needs an action without rate: train a network (--algorithm fastppo)")
 
 
 def test_a_training_by_planner_writes_a_file_that_any_reader_of_policies_runs(hanging: LocalSurrogate, tmp_path):
