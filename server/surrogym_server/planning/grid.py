@@ -16,7 +16,7 @@ from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.safety import LimitSet
 from surrogym_server.models.abilities import ArrayTransition, Avoided, GridPolicy
 from surrogym_server.planning.pending import PendingActions
-from surrogym_shared.spec import MOST_PLANNED, BoxAction, DiscreteAction, Limit
+from surrogym_shared.spec import MOST_PLANNED, MOST_PLANNED_ENTRIES, BoxAction, DiscreteAction, Limit
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
@@ -176,9 +176,9 @@ def unfit(definition: EnvironmentDefinition) -> str | None:
     action, coordinates = definition.action, definition.kept
     if coordinates > MOST_PLANNED:
         return f"at most {MOST_PLANNED} coordinates that repeat no action, got {coordinates}"
-    if isinstance(action, DiscreteAction) or (isinstance(action, BoxAction) and action.size in LEVELS):
+    if isinstance(action, DiscreteAction) or (isinstance(action, BoxAction) and action.size <= MOST_PLANNED_ENTRIES):
         return None
-    return "one discrete action, or at most three continuous ones"
+    return f"one discrete action, or at most {MOST_PLANNED_ENTRIES} continuous ones"
 
 
 def _grid(definition: EnvironmentDefinition, nodes: int) -> tuple[Floats, Floats, NDArray[np.int64], NDArray[np.bool_]]:

@@ -12,7 +12,15 @@ from typing import TYPE_CHECKING
 from surrogym_shared.kinds import Access
 from surrogym_shared.lazy import on_first_use
 from surrogym_shared.spec.actions import Action, BoxAction, DiscreteAction, MultiDiscreteAction
-from surrogym_shared.spec.base import LONGEST_ROLLOUT, MAX_DIMENSIONS, MAX_ROLLOUT_QUERY, MOST_PLANNED, REWARD, ends_of
+from surrogym_shared.spec.base import (
+    LONGEST_ROLLOUT,
+    MAX_DIMENSIONS,
+    MAX_ROLLOUT_QUERY,
+    MOST_PLANNED,
+    MOST_PLANNED_ENTRIES,
+    REWARD,
+    ends_of,
+)
 from surrogym_shared.spec.coordinates import Bounds, Coordinate, Fixed, Lag, Normal, Uniform, limits
 from surrogym_shared.spec.environment import AcquisitionChoice, Choice, Design, EnvironmentSpec, ModelChoice
 from surrogym_shared.spec.rewards import DeclaredReward, Quantity, Reward, RewardTerm, Success
@@ -27,6 +35,7 @@ __all__ = [
     "MAX_DIMENSIONS",
     "MAX_ROLLOUT_QUERY",
     "MOST_PLANNED",
+    "MOST_PLANNED_ENTRIES",
     "REWARD",
     "Access",
     "AcquisitionChoice",

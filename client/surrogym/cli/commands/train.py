@@ -209,7 +209,7 @@ def _trainable(
                 limit_of(view.spec, str(limit))
         except ValueError as error:
             raise CommandError(str(error)) from error
-        if wait or (wait is None and _under_way(view)):
+        if wait or (wait is None and _is_at_work(view)):
             SEARCHES.get(name_of(settings))
             stays = "interrupted; the design continues on the server; the same command waits again"
             with working("design", stays, quiet=quiet) as update, suppress(_NobodyWorks):
@@ -218,7 +218,7 @@ def _trainable(
                     nonlocal view
                     view = now
                     update(share_of_design(now), words_of_design(now))
-                    if wait is None and now.phase not in COMPLETED and not _under_way(now):
+                    if wait is None and now.phase not in COMPLETED and not _is_at_work(now):
                         raise _NobodyWorks
 
                 view = wait_for_design(api, surrogate, wait or LONGEST_SECONDS, look)
@@ -245,7 +245,7 @@ class _NobodyWorks(Exception):
     """Neither a sampler nor a fit is at work for an unfinished design."""
 
 
-def _under_way(view: SurrogateView) -> bool:
+def _is_at_work(view: SurrogateView) -> bool:
     """Whether a sampler or a fit is at work for the design."""
     from surrogym_client.surrogates.waiting import COMPLETED
 
@@ -285,7 +285,7 @@ def _words_without_model(view: SurrogateView) -> str:
     from surrogym_sampler.original.loading import sample_command
 
     missing = f"{view.name!r} has no model yet, its phase is {view.phase}"
-    if _under_way(view):
+    if _is_at_work(view):
         return f"{missing}: leave --wait out, and the training begins after the design"
     learn = f"surrogym import LOG --to {view.name}" if view.budget == 0 else sample_command(view.name, view.environment)
     return f"{missing}: run {learn}, or give --wait SECONDS"

@@ -214,7 +214,7 @@ def plan(
                         plans[i, t, f] = centre[t, f]
             q[i], running[i], total[i] = start, True, 0.0
         weight = 1.0
-        for t in range(steps):
+        for t in range(steps + 1):
             if late:
                 end_without_action(
                     numbers,
@@ -236,6 +236,8 @@ def plan(
                 )
             else:
                 seen = q
+            if t == steps:
+                break
             for i in range(lanes):
                 policy_action(low, cell, count, cyclic, table, choices, seen[i], ends, share, votes, u[i])
                 for f in range(entries):
@@ -275,27 +277,6 @@ def plan(
                     running[i] = not over[i]
             q, q_next = q_next, q
             weight *= discount
-        if late:
-            end_without_action(
-                numbers,
-                places,
-                outputs,
-                prior_numbers,
-                prior_places,
-                prior_has_regions,
-                uses,
-                q,
-                known,
-                early,
-                choices,
-                least,
-                most,
-                without,
-                u,
-                seen,
-            )
-        else:
-            seen = q
         for i in range(lanes):
             if running[i]:
                 locate(low, cell, count, cyclic, seen[i], ends, share)
