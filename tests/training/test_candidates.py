@@ -9,13 +9,15 @@ import numpy as np
 import pytest
 
 from support.moody import SPEC, Line
+from surrogym_client.errors import SurrogymClientError
 from surrogym_lab.original_port import OriginalPort
 from surrogym_sampler.original.episodes import SteppedEpisode
+from surrogym_shared.wire import OpenSession, SessionView
 from surrogym_trainer.policies.predict import Predict
 from surrogym_trainer.training import audited
 from surrogym_trainer.training.audited import AuditedTraining
 from surrogym_trainer.training.closed_loop import Candidates
-from surrogym_trainer.training.settings import TrainResult, TrainSettings
+from surrogym_trainer.training.settings import TrainingInterrupted, TrainResult, TrainSettings
 
 POLICIES = {
     b"to the middle": lambda o: -np.clip(10 * o[:, :1], -1, 1),
@@ -79,10 +81,55 @@ def test_an_unreadable_candidate_policy_leaves_the_latest_one_in_place(port, tmp
     assert path.read_bytes() == b"to the middle"
 
 
+def test_ctrl_c_while_policies_are_compared_hands_over_the_best_of_those_compared(port, tmp_path: Path) -> None:
+    def interrupted(path: Path, algorithm: str) -> Predict:
+        if path.read_bytes() == b"away":
+            raise KeyboardInterrupt
+        return load(path, algorithm)
+
+    candidates, path = Candidates(interrupted), tmp_path / "policy.zip"
+    for policy in (b"to the middle", b"away"):
+        candidates.keep(replace(trained(path, policy, 100), settings={"made": policy}))
+    latest = trained(path, b"slowly to the middle", 300)
+    with pytest.raises(TrainingInterrupted) as stopped:
+        candidates.best(port, latest, TrainSettings())
+    assert path.read_bytes() == b"to the middle" == stopped.value.result.settings["made"], "result and file agree"
+    assert stopped.value.result.virtual_steps == 300
+
+
 class Audited(AuditedTraining):
     """One that asks no server how to train."""
 
     _chosen = TrainSettings()  # type: ignore[assignment]
+
+
+class Gone(OriginalPort):
+    """A surrogate whose server has ended."""
+
+    def open(self, request: OpenSession) -> SessionView:
+        raise SurrogymClientError("the server has ended")
+
+
+@pytest.mark.parametrize(("gone", "left"), [(False, b"to the middle"), (True, b"away")])
+def test_a_training_that_is_cut_off_after_an_audit_leaves_the_best_policy(
+    port, gone: bool, left: bytes, tmp_path: Path, monkeypatch
+) -> None:
+    """Without the surrogate nothing can be compared, and the latest policy stays."""
+
+    def cut_off(*_: object) -> None:
+        raise TrainingInterrupted(trained(path, b"away", 50))
+
+    path = tmp_path / "policy.zip"
+    monkeypatch.setattr(audited, "train", cut_off)
+    now = Gone(SPEC, lambda: SteppedEpisode(Lines())) if gone else port
+    training = Audited(None, "line", now, path, TrainSettings())  # type: ignore[arg-type]
+    training.candidates.load = load
+    first = trained(path, b"to the middle", 100)
+    training.candidates.keep(first)
+    with pytest.raises(TrainingInterrupted) as stopped:
+        training._train_on(first)
+    assert path.read_bytes() == left
+    assert stopped.value.result.virtual_steps == 150
 
 
 def test_the_policy_of_each_training_after_an_audit_is_a_candidate_for_the_result(

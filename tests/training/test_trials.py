@@ -38,11 +38,11 @@ from surrogym_shared.terms import observe
 from surrogym_shared.wire import Trial
 from surrogym_trainer.policies.files import load_network
 from surrogym_trainer.policies.integrals import IntegralPort
-from surrogym_trainer.training import TrainSettings
+from surrogym_trainer.training import TrainSettings, closed_loop
 from surrogym_trainer.training.audited import PROMISING, AuditedTraining
 from surrogym_trainer.training.closed_loop import LoopSettings
 from surrogym_trainer.training.handover import AuditSettings, Subject, hand_over
-from surrogym_trainer.training.settings import TrainingInterrupted
+from surrogym_trainer.training.settings import TrainingInterrupted, TrainResult
 from surrogym_trainer.training.trials import Trials, allows_trials, encoded, is_waiting_for_trials
 from surrogym_trainer.training.words import words_of_result
 
@@ -271,6 +271,29 @@ def test_ctrl_c_during_a_trial_leaves_the_best_policy_so_far(
             trials.train()
     assert stopped.value.result.virtual_steps == trials.trained[0].virtual_steps
     load_network(tmp_path / "p.zip")
+
+
+def test_ctrl_c_during_a_later_training_leaves_a_better_earlier_policy(
+    trials_server: ServerProcess, waiting: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The later network is a new one, and has learned nothing yet."""
+
+    def cut_off(port: object, out: Path, settings: TrainSettings, *_: object) -> TrainResult:
+        network, result = idle(-1.0), trials.trained[0]
+        network.save(out)
+        raise TrainingInterrupted(replace(result, virtual_steps=1))
+
+    path = tmp_path / "p.zip"
+    with Api(trials_server.url) as api, HttpSurrogate(trials_server.url, waiting) as port:
+        trials = Trials(api, waiting, port, path, SETTINGS, LoopSettings(queries=0))
+        learned = trials._learn(0, longer=False)
+        content = path.read_bytes()
+        monkeypatch.setattr(closed_loop, "train", cut_off)
+        monkeypatch.setattr(trials, "_run", lambda: trials._learn(1, longer=False))
+        with pytest.raises(TrainingInterrupted) as stopped:
+            trials.train()
+    assert path.read_bytes() == content
+    assert stopped.value.result.virtual_steps == learned.virtual_steps + 1
 
 
 @pytest.fixture

@@ -101,8 +101,8 @@ class AuditedTraining:
                 if number == MOST_AUDITS or not self._to_be_trained_on(handover.audit, result, taken, number):
                     break
                 result = self._train_on(result)
-        except TrainingInterrupted as interruption:
-            raise TrainingInterrupted(_joined(result, interruption.result)) from None
+        except TrainingInterrupted:
+            raise
         except KeyboardInterrupt:
             raise TrainingInterrupted(result) from None
         return result, handover
@@ -182,7 +182,11 @@ class AuditedTraining:
         now = self._chosen
         if search_for(self.settings).resumable:
             now = replace(now, start_from=self.out, trust_policy=False)
-        later = train(self.port, self.out, now, self._shifted(result.virtual_steps))
+        try:
+            later = train(self.port, self.out, now, self._shifted(result.virtual_steps))
+        except TrainingInterrupted as interruption:
+            cut_off = _joined(result, interruption.result)
+            raise self.candidates.after_ctrl_c(self.port, cut_off, now) from None
         self.candidates.keep(later)
         return self._best(_joined(result, later))
 

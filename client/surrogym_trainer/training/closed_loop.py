@@ -7,12 +7,14 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from surrogym_client.environments.lanes import Lanes, session_request
+from surrogym_client.errors import SurrogymClientError
 from surrogym_client.surrogates.waiting import DesignUnfinished, wait_for_design
 from surrogym_client.transport.api import Api
 from surrogym_shared.port import SurrogatePort
@@ -57,26 +59,43 @@ class Candidates:
         """Return the latest result, or an earlier one whose policy earns clearly more in the current model.
 
         If it is an earlier one, its policy is written to the latest result's file.
+
+        Raises:
+            TrainingInterrupted: Ctrl-C was pressed; it has the best of the policies that were compared by then.
         """
         others = [(result, content) for result, content in self._kept if content != Path(latest.path).read_bytes()]
         if not others:
             return latest
         path, current = Path(latest.path), Path(latest.path).read_bytes()
-        earned = self._earned(port, latest, settings)
-        found, kept, gain = latest, current, 0.0
+        found, kept, gain, interrupted = latest, current, 0.0, False
         try:
+            earned = self._earned(port, latest, settings)
             for result, content in others:
                 path.write_bytes(content)
                 more = self._earned(port, result, settings) - earned
                 error = float(more.std(ddof=1)) / np.sqrt(len(more))
                 if float(more.mean()) > max(gain, CLEARLY * error):
                     found, kept, gain = result, content, float(more.mean())
+        except KeyboardInterrupt:
+            interrupted = True
         finally:
             path.write_bytes(kept)
-        if found is latest:
-            return latest
-        took = {name: getattr(latest, name) for name in ("virtual_steps", "seconds", "lost_episodes")}
-        return replace(found, **took, visited_confidence=latest.visited_confidence)
+        if found is not latest:
+            took = {name: getattr(latest, name) for name in ("virtual_steps", "seconds", "lost_episodes")}
+            found = replace(found, **took, visited_confidence=latest.visited_confidence)
+        if interrupted:
+            raise TrainingInterrupted(found)
+        return found
+
+    def after_ctrl_c(self, port: SurrogatePort, cut_off: TrainResult, settings: TrainSettings) -> TrainingInterrupted:
+        """Return the exception to raise after Ctrl-C in a training whose policy so far is ``cut_off``. It has the
+        result of the best policy, whose file is in place."""
+        with suppress(SurrogymClientError):  # without the surrogate, nothing can be compared
+            try:
+                return TrainingInterrupted(self.best(port, cut_off, settings))
+            except TrainingInterrupted as again:
+                return again
+        return TrainingInterrupted(cut_off)
 
     def _earned(self, port: SurrogatePort, result: TrainResult, settings: TrainSettings) -> np.ndarray:
         predict = self.load(Path(result.path), result.algorithm)
@@ -151,7 +170,6 @@ class TrainingInRounds(ABC):
             self._run()
         except TrainingInterrupted as interruption:
             self.best = interruption.result
-            self.trained.append(self.best)
             raise TrainingInterrupted(self.result()) from None
         except KeyboardInterrupt:
             if self.trained:
@@ -173,7 +191,11 @@ class TrainingInRounds(ABC):
         return sum(result.virtual_steps for result in self.trained)
 
     def _train(self, settings: TrainSettings, progress: Callable[[TrainProgress], None] | None) -> TrainResult:
-        self.best = train(self.port, self.out, settings, progress)
+        try:
+            self.best = train(self.port, self.out, settings, progress)
+        except TrainingInterrupted as interruption:
+            self.trained.append(interruption.result)
+            raise self.candidates.after_ctrl_c(self.port, interruption.result, settings) from None
         self.trained.append(self.best)
         self.candidates.keep(self.best)
         return self.best
