@@ -36,16 +36,13 @@ STEPS, SEEDS, SAMPLES = 600_000, 3, 24
 def updates(rounds: int) -> dict[str, Any]:
     """Microseconds of an update with one batch: of both searches, and of six of the products in it."""
     spec, rng = pendulum(), np.random.default_rng(0)
-    learner, in_numpy = (
-        Learner(spec, np.zeros(3), np.ones(3), (64, 64), rng, compiled=compiled) for compiled in (True, False)
-    )
+    learner = Learner(spec, np.zeros(3), np.ones(3), (64, 64), rng)
     given, batch = batch_of(learner, rng)
     theirs = reference(learner, spec, given)
     rows, weights = torch.randn(ROWS, 64), torch.randn(64, 64)
     subjects = {
         "ppo": timed(theirs.train),
         "fastppo": timed(lambda: learner.update(batch, OBJECTIVE, 1e-6)),
-        "fastppo in NumPy": timed(lambda: in_numpy.update(batch, OBJECTIVE, 1e-6)),
         "six products": timed(lambda: [rows @ weights for _ in range(6)]),
     }
     turns = take_turns(subjects, rounds, calls=20, warm_up=5)

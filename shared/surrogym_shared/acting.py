@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from surrogym_shared.distributions import Bounded, Choices, middle_and_reach
+from surrogym_shared.distributions import Bounded, Choices, distribution_of
 from surrogym_shared.kinds import Activation
 from surrogym_shared.network import Layer, Network, forward, most_probable
 from surrogym_shared.policy_sizes import MAX_LAYERS, MAX_PARAMETERS, MAX_ROLLOUT, MAX_UNITS
@@ -232,9 +232,7 @@ class Actor:
 
     @cached_property
     def _distribution(self) -> Bounded | Choices:
-        if self.counts:
-            return Choices(self.counts)
-        return Bounded(*middle_and_reach(self.low, self.high, self.policy.dtype))
+        return distribution_of(self.counts, self.low, self.high, self.policy.dtype)
 
 
 def layers_of(sizes: Sequence[int], vector: Array) -> tuple[Layer, ...]:

@@ -86,10 +86,12 @@ class Choices:
         return np.split(outputs, np.cumsum(self.counts)[:-1], axis=1)
 
 
-def middle_and_reach(low: NDArray[np.float64], high: NDArray[np.float64], dtype: np.dtype[Any]) -> tuple[Array, Array]:
-    """Return the middle and half the width (F,) of the ranges with the ends ``low`` and ``high`` (F,), as arrays of
-    this dtype."""
-    return ((low + high) / 2).astype(dtype), ((high - low) / 2).astype(dtype)
+def distribution_of(
+    counts: tuple[int, ...], low: NDArray[np.float64], high: NDArray[np.float64], dtype: np.dtype[Any]
+) -> Bounded | Choices:
+    """Return the distribution of discrete actions with these numbers of choices, or of continuous actions within bounds
+    (F,), whose parameters have this dtype."""
+    return Choices(counts) if counts else Bounded(((low + high) / 2).astype(dtype), ((high - low) / 2).astype(dtype))
 
 
 def log_softmax(scores: Array) -> Array:

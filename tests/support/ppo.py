@@ -12,6 +12,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import DummyVecEnv
 
+from surrogym_shared.network import forward
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_trainer.policies.networks import WIDER, PaperPolicy, Standardise
 from surrogym_trainer.training.fast_ppo.learner import Batch, Learner, Objective
@@ -40,7 +41,7 @@ def batch_of(learner: Learner, rng: np.random.Generator) -> tuple[Mapping[str, n
     """One batch as a rollout buffer holds it, and as a learner takes it. Some ratios are outside the clip range."""
     seen = rng.normal(size=(ROWS, len(learner.mean))).astype(np.float32)
     x = learner.standardised(seen)
-    actions, logs = learner.distribution.sample(learner.actor.forward(x), learner.further, rng)
+    actions, logs = learner.distribution.sample(forward(learner.actor, learner.activation, x), learner.further, rng)
     logs = logs + rng.normal(0, 0.3, ROWS).astype(np.float32)
     values, advantages, returns = (rng.normal(size=ROWS).astype(np.float32) for _ in range(3))
     given = {"observations": seen, "actions": actions, "log_probs": logs}
@@ -75,7 +76,7 @@ def reference(learner: Learner, spec: EnvironmentSpec, given: Mapping[str, np.nd
 
 def layers(learner: Learner) -> list[tuple[np.ndarray, np.ndarray]]:
     """Weights and bias of the actor's layers, then of the critic's."""
-    return [*learner.actor.layers, *learner.critic.layers]
+    return [*learner.actor, *learner.critic]
 
 
 def linear(learner: PPO) -> list[torch.nn.Linear]:

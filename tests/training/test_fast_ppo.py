@@ -1,4 +1,4 @@
-"""PPO in NumPy: it learns as Stable-Baselines3's does, and hands over what it can't learn."""
+"""FASTPPO: it learns as Stable-Baselines3's does, and hands over what it can't learn."""
 
 from __future__ import annotations
 
@@ -21,24 +21,18 @@ from surrogym_client.environments.lanes import Lanes, session_request
 from surrogym_sampler.original.classic import cartpole, mountain_car_continuous, pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.local import LocalSurrogate
+from surrogym_shared.distributions import Bounded, Choices
 from surrogym_shared.spec import EnvironmentSpec, MultiDiscreteAction
 from surrogym_trainer.evaluation import imagined_returns
 from surrogym_trainer.policies import UnusablePolicy, load_policy
 from surrogym_trainer.training import TrainingInterrupted, TrainProgress, TrainSettings, train
+from surrogym_trainer.training import search as trainings
 from surrogym_trainer.training.checks import Checks
+from surrogym_trainer.training.fast_ppo import learner as learners
 from surrogym_trainer.training.fast_ppo import search as searches
-from surrogym_trainer.training.fast_ppo.learner import (
-    Bounded,
-    Choices,
-    Learner,
-    compiled_update,
-    noisy,
-    restored,
-)
+from surrogym_trainer.training.fast_ppo.learner import Learner, noisy, restored
 from surrogym_trainer.training.fast_ppo.rollouts import Collector, RewardScale, Rollout
-from surrogym_trainer.training.search import search_for
-
-needs_numba = pytest.mark.skipif(compiled_update() is None, reason="numba is not installed, or switched off")
+from surrogym_trainer.training.search import search_for, with_algorithm
 
 SMALL = {"n_steps": 16, "batch_size": 32, "n_epochs": 2}
 
@@ -59,13 +53,12 @@ def several() -> EnvironmentSpec:
 
 
 @pytest.mark.parametrize("make", [pendulum, cartpole, several], ids=["continuous", "discrete", "several choices"])
-@pytest.mark.parametrize("compiled", [pytest.param(True, marks=needs_numba), False], ids=["compiled", "numpy"])
-def test_a_numpy_ppo_update_equals_that_of_stable_baselines3(make: Callable[[], EnvironmentSpec], compiled: bool):
+def test_a_fast_ppo_update_equals_that_of_stable_baselines3(make: Callable[[], EnvironmentSpec]):
     """The same parameters after three updates of the same rollout, where some ratios are clipped."""
     spec, rng = make(), np.random.default_rng(0)
     size = len(spec.observation)
-    learner = Learner(spec, rng.normal(size=size), rng.uniform(0.5, 2, size), (64, 64), rng, compiled=compiled)
-    learner.actor.layers[-1][0][:] *= 100  # actions that differ
+    learner = Learner(spec, rng.normal(size=size), rng.uniform(0.5, 2, size), (64, 64), rng)
+    learner.actor[-1][0][:] *= 100  # actions that differ
     given, batch = batch_of(learner, rng)
     made = reference(learner, spec, given)
     for _ in range(3):
@@ -78,7 +71,7 @@ def test_a_numpy_ppo_update_equals_that_of_stable_baselines3(make: Callable[[], 
         np.testing.assert_allclose(learner.further, made.policy.log_std.detach().numpy(), atol=2e-5)
 
 
-def test_numpy_ppo_scales_rewards_like_vec_normalize():
+def test_fastppo_scales_rewards_like_vec_normalize():
     rng, gamma = np.random.default_rng(1), 0.97
     scale, statistics, returns = RewardScale(5, gamma), RunningMeanStd(shape=()), np.zeros(5)
     for _ in range(50):
@@ -90,7 +83,7 @@ def test_numpy_ppo_scales_rewards_like_vec_normalize():
         np.testing.assert_allclose(scale(reward, ended), expected, rtol=1e-12)
 
 
-def test_numpy_ppo_advantages_equal_those_of_stable_baselines3():
+def test_fastppo_advantages_equal_those_of_stable_baselines3():
     rng, steps, lanes = np.random.default_rng(2), 30, 4
     rewards, values = (rng.normal(size=(steps, lanes)).astype(np.float32) for _ in range(2))
     ended, last = rng.random((steps, lanes)) < 0.2, rng.normal(size=lanes).astype(np.float32)
@@ -138,7 +131,8 @@ def test_imagined_episodes_restart_if_the_session_is_lost(surrogate):
 def test_discrete_actions_are_drawn_with_their_probabilities():
     scores = np.array([[1.0, 0.0, -1.0, 0.5, 0.0]], dtype=np.float32)
     choices, rng = Choices((3, 2)), np.random.default_rng(0)
-    actions, logs = choices.sample(np.repeat(scores, 40_000, 0), choices.further(), rng)
+    none = np.zeros(0, dtype=np.float32)
+    actions, logs = choices.sample(np.repeat(scores, 40_000, 0), none, rng)
     np.testing.assert_allclose(logs, choices.log_probability(np.repeat(scores, 40_000, 0), logs[:0], actions))
     for i, part in enumerate(np.split(scores[0], [3])):
         expected = np.exp(part) / np.exp(part).sum()
@@ -150,15 +144,16 @@ def test_discrete_actions_are_drawn_with_their_probabilities():
 def test_continuous_actions_are_normal_around_the_mean_and_clipped_to_bounds():
     bounded, rng = Bounded(np.float32([1.0]), np.float32([2.0])), np.random.default_rng(0)
     outputs = np.full((40_000, 1), 0.5, dtype=np.float32)
-    actions, logs = bounded.sample(outputs, bounded.further(), rng)
+    further = np.zeros(1, dtype=np.float32)
+    actions, logs = bounded.sample(outputs, further, rng)
     assert actions.mean() == pytest.approx(1 + 2 * np.tanh(0.5), abs=0.02)
     assert actions.std() == pytest.approx(1.0, abs=0.02)
-    np.testing.assert_allclose(logs, bounded.log_probability(outputs, bounded.further(), actions), atol=1e-5)
+    np.testing.assert_allclose(logs, bounded.log_probability(outputs, further, actions), atol=1e-5)
     assert actions.max() > 3
     assert bounded.sent(actions).max() == 3
 
 
-def test_numpy_ppo_learns_to_improve_its_return(tmp_path: Path):
+def test_fastppo_learns_to_improve_its_return(tmp_path: Path):
     """An untrained CartPole falls after some twenty steps."""
     spec = cartpole().model_copy(update={"time_limit": 100})
     port = LocalSurrogate(spec, learn(definition_from_spec(spec), random_steps(spec, 40, seed=0)).model)
@@ -166,7 +161,7 @@ def test_numpy_ppo_learns_to_improve_its_return(tmp_path: Path):
     assert train(port, tmp_path / "policy.zip", settings).imagined_return > 80
 
 
-def test_a_policy_saved_by_numpy_ppo_acts_with_and_without_noise(surrogate, tmp_path: Path):
+def test_a_policy_saved_by_fastppo_acts_with_and_without_noise(surrogate, tmp_path: Path):
     settings = TrainSettings(algorithm="fastppo", total_steps=512, num_envs=16, hyperparameters=SMALL)
     path = train(surrogate, tmp_path / "policy.zip", settings).path
     observations = np.random.default_rng(0).normal(size=(2_000, 3)).astype(np.float32)
@@ -182,7 +177,7 @@ def test_restandardising_the_inputs_does_not_change_the_policy(make: Callable[[]
     spec, rng = make(), np.random.default_rng(0)
     size = len(spec.observation)
     learner = Learner(spec, rng.normal(size=size), rng.uniform(1, 2, size), (16, 16), rng)
-    learner.actor.layers[-1][0][:] = rng.normal(size=learner.actor.layers[-1][0].shape)
+    learner.actor[-1][0][:] = rng.normal(size=learner.actor[-1][0].shape)
     observations = (3 + 0.5 * rng.normal(size=(200, size))).astype(np.float32)
     observations[:, 0] = 0.7
     before, critic = learner.policy().outputs(observations), learner.values(learner.standardised(observations))
@@ -208,7 +203,7 @@ def watched(monkeypatch: pytest.MonkeyPatch) -> list[dict]:
     return opened
 
 
-def test_numpy_ppo_refines_its_policy_from_the_declared_starts(surrogate, tmp_path: Path, monkeypatch):
+def test_fastppo_refines_its_policy_from_the_declared_starts(surrogate, tmp_path: Path, monkeypatch):
     """The policy is never worse in the surrogate than before. Chosen steps are not followed by it."""
     opened = watched(monkeypatch)
     settings = TrainSettings(algorithm="fastppo", total_steps=4_096, num_envs=16, hyperparameters=SMALL, prolong=False)
@@ -228,7 +223,7 @@ def test_numpy_ppo_refines_its_policy_from_the_declared_starts(surrogate, tmp_pa
     assert train(surrogate, tmp_path / "further.zip", further).imagined_return >= refined.imagined_return
 
 
-def test_numpy_ppo_continues_from_a_saved_policy(surrogate, tmp_path: Path):
+def test_fastppo_continues_from_a_saved_policy(surrogate, tmp_path: Path):
     """Parameters and the moments of Adam; a policy alone is refused."""
     settings = TrainSettings(algorithm="fastppo", total_steps=512, num_envs=16, hyperparameters=SMALL, prolong=False)
     first = train(surrogate, tmp_path / "first.zip", settings).path
@@ -307,7 +302,7 @@ def test_with_option_anew_the_saved_policy_is_kept_until_a_new_network_is_compar
     assert result.imagined_return == pytest.approx(start.imagined_return)
 
 
-def test_numpy_ppo_refuses_to_continue_a_stable_baselines3_policy(surrogate, tmp_path: Path):
+def test_fastppo_refuses_to_continue_a_stable_baselines3_policy(surrogate, tmp_path: Path):
     small = {"total_steps": 512, "num_envs": 16, "hyperparameters": SMALL, "prolong": False}
     start = train(surrogate, tmp_path / "first.zip", TrainSettings("ppo", **small)).path
     for anew in (False, True):
@@ -315,7 +310,16 @@ def test_numpy_ppo_refuses_to_continue_a_stable_baselines3_policy(surrogate, tmp
         assert train(surrogate, tmp_path / "further.zip", further).algorithm == "PPO"
 
 
-def test_numpy_ppo_ends_early_if_nothing_can_be_gained(surrogate, tmp_path: Path, monkeypatch):
+def test_ppo_of_stable_baselines3_is_the_default_where_nothing_can_be_compiled(tmp_path: Path, monkeypatch):
+    for module in (learners, trainings):
+        monkeypatch.setattr(module, "available", lambda: False)
+    learners.compiled_update.cache_clear()
+    assert with_algorithm(TrainSettings(), pendulum()).algorithm == "PPO"
+    with pytest.raises(ValueError, match=r"expected numba and SciPy.*pip install.*--algorithm ppo"):
+        train(short(pendulum()), tmp_path / "policy.zip", TrainSettings(algorithm="fastppo"))
+
+
+def test_fastppo_ends_early_if_nothing_can_be_gained(surrogate, tmp_path: Path, monkeypatch):
     monkeypatch.setattr(Checks, "saturated", property(lambda self: self.best is not None))
     settings = TrainSettings(algorithm="fastppo", total_steps=8_192, num_envs=16, hyperparameters=SMALL, prolong=True)
     result = train(surrogate, tmp_path / "policy.zip", settings)
@@ -324,7 +328,7 @@ def test_numpy_ppo_ends_early_if_nothing_can_be_gained(surrogate, tmp_path: Path
     load_policy(result.path, result.algorithm)
 
 
-def test_ctrl_c_during_numpy_ppo_keeps_the_best_policy_so_far(surrogate, tmp_path: Path):
+def test_ctrl_c_during_fastppo_keeps_the_best_policy_so_far(surrogate, tmp_path: Path):
     def interrupt(now) -> None:
         if now.imagined_return is not None:
             raise KeyboardInterrupt
@@ -340,6 +344,6 @@ def test_ctrl_c_during_numpy_ppo_keeps_the_best_policy_so_far(surrogate, tmp_pat
     ("name", "value"),
     [("n_steps", 0), ("n_steps", 2.5), ("n_steps", True), ("clip_range", -1.0), ("gamma", 2.0), ("n_epochs", "x")],
 )
-def test_invalid_numpy_ppo_settings_are_refused(name: str, value: object):
+def test_invalid_fastppo_settings_are_refused(name: str, value: object):
     with pytest.raises(ValueError, match=f"{name}: expected .* got {value!r}"):
         search_for(TrainSettings(algorithm="fastppo", hyperparameters={name: value}))

@@ -23,6 +23,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, ClassVar, Protocol, cast
 
+from surrogym_shared.compiled import available
 from surrogym_shared.network import Network
 from surrogym_shared.plugins import Registry
 from surrogym_shared.port import SurrogatePort
@@ -137,12 +138,12 @@ def name_of(settings: TrainSettings) -> str:
 
 
 def with_algorithm(settings: TrainSettings, spec: EnvironmentSpec) -> TrainSettings:
-    """Return the settings with the name of a search. If they name none, it is ``FAST`` (PPO in NumPy), or ``REFERENCE``
-    (PPO of Stable-Baselines3) if ``FAST`` does not support the settings, or ``PLANNING`` for a machine with a dead time
-    (see ``_is_planned``).
+    """Return the settings with the name of a search. If they name none, it is ``FAST`` (PPO in compiled code), or
+    ``REFERENCE`` (PPO of Stable-Baselines3) if ``FAST`` does not support the settings, or ``PLANNING`` for a machine
+    with a dead time (see ``_is_planned``).
 
-    Only ``REFERENCE`` has trackers and some of the hyperparameters, and can continue a policy of Stable-Baselines3.
-    ``REFERENCE`` is also the search of the preset ``paper``.
+    Only ``FAST`` needs numba. Only ``REFERENCE`` has trackers and some of the hyperparameters, and can continue a
+    policy of Stable-Baselines3. ``REFERENCE`` is also the search of the preset ``paper``.
     """
     if settings.algorithm is not None:
         return settings
@@ -151,6 +152,7 @@ def with_algorithm(settings: TrainSettings, spec: EnvironmentSpec) -> TrainSetti
     start, known = settings.start_from, {field.name for field in fields(cast("Any", SEARCHES.get(FAST)))}
     by_reference = (
         settings.tracker is not None
+        or (start is None and not available())
         or not known.issuperset(settings.hyperparameters)
         or spec.preset.algorithm == REFERENCE
         or (start is not None and not Network.is_at(start))

@@ -1,1 +1,1 @@
-"""Proximal policy optimisation in NumPy, with derivatives written by hand. It does not need torch."""
+"""Proximal policy optimisation in compiled code, with derivatives written by hand. It does not need torch."""

@@ -1,4 +1,4 @@
-"""One update of PPO in compiled code. ``learner.Learner.update`` computes the same in NumPy, and is the reference.
+"""One update of PPO in compiled code. It computes what the update of Stable-Baselines3 does.
 
 A batch passes through the networks in blocks of rows, so that activations stay in the processor's cache. BLAS computes
 the matrix products. All arrays are float32.
@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 
 from surrogym_shared.compiled.jit import compiled, entry, inlined, summing
 from surrogym_shared.distributions import HALF_LOG_TAU
-from surrogym_trainer.training.fast_ppo.adam import EPSILON, FIRST_DECAY, SECOND_DECAY
 
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
 
+FIRST_DECAY, SECOND_DECAY, EPSILON = 0.9, 0.999, 1e-5  # of Adam, with the values of Stable-Baselines3
 BLOCK = 128  # number of rows of a batch that pass through the networks together; 64 and 256 were slower
 LARGEST_TANH = np.float32(7.90531110763549805)  # for larger arguments, tanh is 1 in float32
 NONE, ONE, HALF = np.float32(0), np.float32(1), np.float32(0.5)

@@ -64,7 +64,7 @@ STAGE_SEED = 2_000_003  # the seed of the actions' noise grows by this number fr
 
 @dataclass(frozen=True)
 class FastPpo(PolicySearch):
-    """Policy search by PPO in NumPy, with updates that take a sixth of the time of Stable-Baselines3's.
+    """Policy search by PPO in compiled code, with updates that take a sixth of the time of Stable-Baselines3's.
 
     Networks, loss, Adam, scaled rewards and advantages are those of the search ``PPO``. A training has two stages, each
     with cycles in which the learning rate falls. The functions ``learn`` and ``refine`` describe the episodes of the
