@@ -78,32 +78,30 @@ def posterior(errors: Callable[[Array], Array], inputs: Array, own: Array, withi
     off, jacobian = _linear(errors, x)
     # the likelihood does not depend on the parameters' part of the errors, so that one fit serves for all rounds
     processes = [_process(off[chosen, m], jacobian[chosen, m], apart) for m in range(off.shape[1])]
-    prior = np.eye(len(x)) / within**2
+    # Square roots of the precisions, because some parameters may only be determined as a ratio, within rounding errors.
+    prior = np.eye(len(x)) / within
+    roots = [np.linalg.cholesky(process.covariance) for process in processes]
     for _ in range(ROUNDS):
-        precision, gradient = prior.copy(), (own - x) / within**2
-        for m, process in enumerate(processes):
-            by = jacobian[chosen, m]
-            solved = np.linalg.solve(process.covariance, np.c_[by, off[chosen, m]])
-            precision += by.T @ solved[:, :-1]
-            gradient -= by.T @ solved[:, -1]
-        change = np.clip(np.linalg.solve(precision, gradient), -FARTHEST, FARTHEST)
+        whitened = [np.linalg.solve(root, np.c_[jacobian[chosen, m], -off[chosen, m]]) for m, root in enumerate(roots)]
+        rows = np.concatenate([*whitened, np.c_[prior, (own - x) / within]])
+        change = np.clip(np.linalg.lstsq(rows[:, :-1], rows[:, -1], rcond=None)[0], -FARTHEST, FARTHEST)
         x = np.clip(x + change, 0, 1)
         off, jacobian = _linear(errors, x)
     degrees = max(1.0, len(off) - len(x) / off.shape[1])
     sizes = (off**2).sum(0) / degrees
     sizes = np.maximum(sizes, max(SMALLEST**2, LEAST_SHARE**2 * sizes.max()))
-    precision = prior.copy()
-    for m, process in enumerate(processes):
-        alike = 1 + (len(off) - 1) * process.shared
-        precision += jacobian[:, m].T @ jacobian[:, m] / (sizes[m] * alike)
-    deviations = np.sqrt(np.diag(np.linalg.inv(precision)))
+    alike = 1 + (len(off) - 1) * np.array([process.shared for process in processes])
+    scaled = jacobian / np.sqrt(sizes * alike)[:, None]
+    root = np.linalg.qr(np.concatenate([scaled.reshape(-1, len(x)), prior]), mode="r")
+    deviations = np.sqrt((np.linalg.inv(root) ** 2).sum(1))
     return Posterior(x, np.maximum(deviations, FINEST), degrees)
 
 
 def _linear(errors: Callable[[Array], Array], x: Array) -> tuple[Array, Array]:
     """Return the errors (n, M) at ``x`` (P,), and their derivatives (n, M, P)."""
-    off = errors(x)
-    return off, np.stack([(errors(x + NUDGE * axis) - off) / NUDGE for axis in np.eye(len(x))], -1)
+    ends = [np.clip([x - NUDGE * axis, x + NUDGE * axis], 0, 1) for axis in np.eye(len(x))]
+    slopes = [(errors(end) - errors(begin)) / (end - begin).sum() for begin, end in ends]
+    return errors(x), np.stack(slopes, -1)
 
 
 def _process(error: Array, by: Array, apart: Array) -> _Process:

@@ -70,6 +70,23 @@ def test_a_simulator_parameter_without_effect_on_the_steps_keeps_its_value():
     assert {name: value for name, value in found.values.items() if name != "spare"} == pytest.approx(TRUE, rel=1e-4)
 
 
+def test_parameters_that_only_their_ratio_determines_have_wide_intervals():
+    """Mass, friction and force of this hinge can all be doubled without an effect on any step."""
+
+    class Geared(Textbook):
+        gear = 1.0
+
+        def step_from(self, coordinates, action):
+            return super().step_from(coordinates, self.gear * np.asarray(action))
+
+    scaled = (*RANGES, Parameter("gear", 0.5, 2.0))
+    found = {one.name: one for one in calibrated(8, parameters=scaled, plant=Geared).parameters}
+    assert found["length"].determined
+    assert not found["mass"].determined
+    assert not found["gear"].determined
+    assert all(found[name].low <= value <= found[name].high for name, value in (TRUE | {"gear": 1.0}).items())
+
+
 def test_calibration_without_parameters_only_measures_the_simulator_error():
     found = calibrated(5, parameters=())
     assert found.parameters == ()
