@@ -133,6 +133,19 @@ def test_drawn_functions_with_a_prior_pass_through_the_samples(textbook):
     assert float(off.abs().max()) < 0.02 * float(beside.scales[1])
 
 
+def test_drawn_functions_vary_as_much_as_deviations_that_count_an_uncertain_prior_model():
+    beside = learned(samples(Textbook(), 4, seed=3), learned(samples(Textbook(), 12, seed=1)))
+    test, count = samples(Real(), 12, seed=9), 1_000
+    paths = beside.draw(torch.randn(count, beside.path_size, generator=torch.Generator().manual_seed(1)).double())
+    drawn = [
+        beside.transition_along(paths, q.expand(count, -1), u.expand(count, -1)).q_next[:, 1].std()
+        for q, u in zip(test.q, test.u, strict=True)
+    ]
+    stated = beside.transition(test.q, test.u, stds=True).std
+    assert stated is not None
+    assert float((torch.stack(drawn) / stated[:, 1]).mean()) == pytest.approx(1, abs=0.2)
+
+
 def test_a_stored_model_contains_its_prior(textbook):
     beside = learned(samples(Real(), 8, seed=3), textbook)
     again = from_bytes(HINGE, to_bytes(beside))

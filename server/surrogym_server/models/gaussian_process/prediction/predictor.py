@@ -55,9 +55,11 @@ class Predictor:
         ``paths`` (m, W) are the weights of the sampled function that each row follows, or None for the mean.
         """
         doubt: Tensor | None = None
-        if self.prior is not None and (stds or reward_std or noise is not None):
+        if self.prior is not None and (stds or reward_std or noise is not None or paths is not None):
             doubt = self._doubt(self.prior, q, u)
             noise = None if noise is None else noise * doubt[:, :-1]
+            # a sampled function's distance from the mean is proportional to its weights
+            paths = None if paths is None else paths[:, : self.path_size] * doubt[:, self.output_of_weight]
         columns = self._columns if stds or noise is not None else ()
         columns += (self._reward_column,) if reward_std else ()
         rows = min(group.serving.rows for group in self._groups if group)
@@ -96,6 +98,14 @@ class Predictor:
         q_next, mean, _ = self._step((), q, u, None, None, None)
         reward, _ = self._rewards(q, u, q_next, mean[:, -1])
         return mean[:, list(self._columns)], q_next, reward
+
+    @cached
+    def output_of_weight(self) -> Tensor:
+        """Index of the output (W,) to which each weight of a sampled function belongs."""
+        places = {column: place for place, column in enumerate((*self._columns, self._reward_column))}
+        drawn = [one for group in self._groups if group for one in group.drawn]
+        owners = [places[one.column] for one in drawn for _ in range(one.pathwise.size)]
+        return torch.tensor(owners, dtype=torch.long, device=self.definition.device)
 
     @cached_property
     def path_size(self) -> int:

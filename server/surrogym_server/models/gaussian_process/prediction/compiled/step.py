@@ -404,6 +404,7 @@ class StepsOfModel(ArraySteps):
     # added to it, otherwise 0.
     uses: Floats
     doubted: Floats  # (O,) for each output, see ``Predictor.doubted``
+    output_of_weight: Ints  # (W,) for each weight of a sampled function, see ``Predictor.output_of_weight``
 
     @classmethod
     def of(cls, predictor: Predictor, ending: Region | None, prior: StepsOfModel | None) -> Self:
@@ -417,7 +418,8 @@ class StepsOfModel(ArraySteps):
         regions = ending is not None or bool(predictor.jumps)
         points = sum(group.serving.exponents.shape[1] for group in predictor._groups if group)
         outputs, tables = len(predictor.transitions) + 1, tables_of(predictor, ending)
-        of_prior = (array.cpu().numpy() for array in (predictor.uses_prior, predictor.doubted))
+        arrays = (predictor.uses_prior, predictor.doubted, predictor.output_of_weight)
+        of_prior = (array.cpu().numpy() for array in arrays)
         return cls(predictor.definition, tables, outputs, regions, points, prior, *of_prior)
 
     def __call__(
@@ -460,10 +462,12 @@ class StepsOfModel(ArraySteps):
         noise, process, paths = (NO_ROWS if given is None else given for given in (noise, process, paths))
         known = NO_ROWS if self.prior is None else self._by_prior(self.prior, q, u)
         doubt: Floats | None = None
-        if self.prior is not None and (stds or reward_std or len(noise)):
+        if self.prior is not None and (stds or reward_std or len(noise) or len(paths)):
             sigma = self.prior._steps(q, u, None, None, None, True, True, NO_ROWS).std
             doubt = np.sqrt(1 + sigma**2 / self.doubted)  # see ``Predictor._doubt``
             noise = noise * doubt[:, :-1] if len(noise) else noise
+            weights = self.output_of_weight
+            paths = paths[:, : len(weights)] * doubt[:, weights] if len(paths) else paths
 
         def rows(at: slice) -> None:
             step(
