@@ -109,6 +109,13 @@ def test_a_prior_that_fails_at_most_real_steps_says_how_the_design_continues(on_
     assert f"surrogym prior {sampled} --drop" in said.err
 
 
+def test_the_command_prior_says_at_how_many_real_steps_the_simulator_fails(on_server, sampled):
+    said = on_server("prior", sampled, "support.hinge:Partial", *PARAMETERS, "--steps", "60")
+    assert said.code == 0
+    assert "0.00% calibrated, on 5 real steps" in said.out
+    assert "it fails at 3 other real steps" in said.out
+
+
 def test_invalid_uses_of_the_prior_command_are_refused_and_change_nothing(on_server, server_process, hinge):
     refused = {
         ("prior", hinge): "got none",
@@ -122,6 +129,7 @@ def test_invalid_uses_of_the_prior_command_are_refused_and_change_nothing(on_ser
         ("prior", hinge, "support.hinge:Renamed"): "rate",
         ("prior", hinge, "support.hinge:Weaker"): "0.5",
         ("prior", hinge, "support.hinge:Broken"): "the solver diverged",
+        ("prior", hinge, "support.hinge:Noisy", "-p", "mass"): "same result twice",
         ("prior", "nobody", "support.hinge:Textbook"): "nobody",
     }
     for arguments, words in refused.items():

@@ -164,3 +164,14 @@ class Partial(Textbook):
         if coordinates[1] < -3:
             raise FloatingPointError("the solver diverged")
         return super().step_from(coordinates, action)
+
+
+class Noisy(Textbook):
+    """A simulator with noise that differs from step to step."""
+
+    taken = 0
+
+    def step_from(self, coordinates: Array, action: Array) -> RealStep:
+        step, self.taken = super().step_from(coordinates, action), self.taken + 1
+        angle, speed = step.next_coordinates
+        return RealStep(step.coordinates, step.action, (angle, speed + 0.1 * math.sin(self.taken)), step.reward)

@@ -210,7 +210,10 @@ class Calibration:
     deviation of each coordinate's changes."""
 
     parameters: tuple[Calibrated, ...]
-    steps: int
+    steps: int  # number of real steps that were used
+    failed: (
+        int  # number of further real steps that were not used, because the simulator with its own values fails there
+    )
     error_before: float  # error of the simulator with its own parameter values
     error: float  # error of the simulator with the calibrated parameter values
 
@@ -245,23 +248,29 @@ def calibrate(
     if len(real) < FEWEST:
         raise NotCalibrated(f"expected at least {FEWEST} real steps for a calibration, got {len(real)}: take more")
     errors = _Errors(spec, real, step, many)
+    before = errors(own)
+    failed = (np.abs(before) >= FAR).all(1)
+    if failed.mean() > 0.5:
+        raise NotCalibrated(
+            f"expected a simulator that can repeat the real steps, got a simulator that fails in most of {len(real)}"
+            f"{errors.failure}: check its coordinates, units and actions, or give it a smaller time step"
+        )
+    if failed.any():
+        real = RealTransitions(*(column[~failed] for column in vars(real).values()))
+        errors = _Errors(spec, real, step, many)
+        before = errors(own)
     if errors.measured <= len(parameters):
         raise NotCalibrated(
             f"expected at least {len(parameters) // errors.moving + 1} real steps to calibrate {len(parameters)} "
             f"parameters, got {len(real)}: calibrate fewer parameters, or register the plant with a larger --initial"
         )
-    before = errors(own)
-    if (np.abs(before) >= FAR).all(1).mean() > 0.5:
-        raise NotCalibrated(
-            f"expected a simulator that can repeat the real steps, got a simulator that fails in most of {len(real)}"
-            f"{errors.failure}: check its coordinates, units and actions"
-        )
+    counts = (len(real), int(failed.sum()))
     if not parameters:
-        return Calibration((), len(real), _rms(before), _rms(before))
+        return Calibration((), *counts, _rms(before), _rms(before))
     scaling = _Scaling.of(parameters)
     x = _best(errors, scaling, own)
     found = _with_intervals(parameters, scaling, errors, own, x)
-    return Calibration(found, len(real), _rms(before), _rms(errors(scaling.values(x))))
+    return Calibration(found, *counts, _rms(before), _rms(errors(scaling.values(x))))
 
 
 class _Errors:
@@ -296,6 +305,8 @@ class _Errors:
 
     def __call__(self, values: Array) -> Array:
         rows = self._many(values, self._real.coordinates, self._real.action)
+        if not self.failure and not np.isfinite(rows).all():
+            self.failure = ", with numbers that are infinite or NaN, as a solver that diverges gives"
         errors = self._difference(rows, self._real.next_coordinates)[:, self._moves] / self._scale
         return np.where(np.isfinite(errors), np.clip(errors, -FAR, FAR), FAR)
 

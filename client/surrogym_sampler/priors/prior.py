@@ -44,6 +44,7 @@ REPORT_SECONDS = 1.0  # time between two reports of a calibration's progress
 SLOW = 0.1  # seconds of a simulated step that counts as slow, if the seconds of a real step are not known
 LONGEST_SOURCE = 200  # largest number of characters in the description of a prior's source
 NOTHING = DeclaredReward(kind="declared", terms=(RewardTerm(weight=0.0, shape="one"),))
+SAME = 1e-6  # results of the same step that differ by less, in parts or absolutely, count as equal
 RIGHT = 1e-3  # if the simulator's error is below this share of the coordinates' changes, its parameters are kept
 
 StepsFrom = Callable[[Array, Array], Array]  # from coordinates (n, C) with actions (n, F) to next coordinates (n, C)
@@ -132,6 +133,8 @@ class SimulatorPrior(ABC):
         # Takes many steps at once; None if the simulator can't.
         self._steps_from: StepsFrom | None = getattr(self.simulator, "steps_from", None)
         self._own = np.array([present[parameter.name] for parameter in self.parameters])
+        if self.parameters:
+            _require_repeatable(self.simulator, self.spec)
         self.calibration: Calibration | None = None
         self._calibrated_on = 0  # number of real steps in the last calibration
         self.file: SurrogateFile | None = None
@@ -244,6 +247,7 @@ class SimulatorPrior(ABC):
             source=self.source,
             parameters=[CalibratedParameter(**vars(parameter)) for parameter in found.parameters],
             real_steps=found.steps,
+            failed_steps=found.failed,
             error_before=found.error_before,
             error=found.error,
             simulated_steps=self.steps,
@@ -354,21 +358,43 @@ def _coordinates(spec: EnvironmentSpec) -> list[str]:
 
 def _require_steps(environment: OriginalEnvironment, spec: EnvironmentSpec) -> None:
     """Check that the simulator can take at least one of a few steps from random states of the sampling ranges."""
+    reached, why = _tried(environment, spec)
+    if reached is None:
+        raise UnknownEnvironment(
+            f"expected a simulator that steps from states in its sampling ranges to {len(spec.coordinates)} finite "
+            f"coordinates, got a simulator that failed in all {TRIALS} trials: {why}; "
+            "correct the simulator, or narrow the sampling ranges"
+        )
+
+
+def _require_repeatable(environment: OriginalEnvironment, spec: EnvironmentSpec) -> None:
+    """Check that the same step has the same result twice, without which no effect of a parameter can be measured."""
+    (one, _), (other, _) = (_tried(environment, spec) for _ in range(2))
+    if one is None or other is None or not np.allclose(one, other, rtol=SAME, atol=SAME):
+        raise UnknownEnvironment(
+            "expected a simulator whose step from the same state with the same action has the same result twice, got "
+            f"{_listed(one)} and {_listed(other)}: switch its noise off, or leave out the parameters"
+        )
+
+
+def _tried(environment: OriginalEnvironment, spec: EnvironmentSpec) -> tuple[Array | None, str]:
+    """Return the coordinates (C,) after the first of a few steps from random states that the simulator can take, or
+    None, and why the last of the others failed."""
     rng, why = np.random.default_rng(0), ""
     for _ in range(TRIALS):
         start = draw(spec, rng, wide=True)
         try:
             reached = np.asarray(environment.step_from(start, middle_action(spec)).next_coordinates)
             if reached.shape == start.shape and np.isfinite(reached).all():
-                return
+                return reached, why
             why = f"it gave {reached.tolist()}"
         except Exception as error:  # a user's code may raise anything
             why = f"{type(error).__name__}: {str(error)[:200]}"
-    raise UnknownEnvironment(
-        f"expected a simulator that steps from states in its sampling ranges to {len(spec.coordinates)} finite "
-        f"coordinates, got a simulator that failed in all {TRIALS} trials: {why}; "
-        "correct the simulator, or narrow the sampling ranges"
-    )
+    return None, why
+
+
+def _listed(reached: Array | None) -> str:
+    return "a failure" if reached is None else str(reached.tolist())
 
 
 def _transitions(real: Sequence[RealStep]) -> RealTransitions:

@@ -80,7 +80,7 @@ export function prior({ awaited, about }, fidelity) {
   return card("What was known", [
     `Prior: ${about.source}`,
     ...about.parameters.map((one) => `${one.name}: ${number(one.value)}, ${one.determined ? `${number(one.low)} to ${number(one.high)}` : "not determined by these steps"}`),
-    ...(about.error === null ? [] : [`Error of the simulator: ${percent(about.error)} of the changes, on ${plural(about.real_steps, "real step")}`]),
+    ...(about.error === null ? [] : [`Error of the simulator: ${percent(about.error)} of the changes, on ${plural(about.real_steps, "real step")}${about.failed_steps ? `; it fails at ${count(about.failed_steps)} others` : ""}`]),
     ...(fidelity ? [`Outputs that use it: ${uses.join(", ") || "none"}`] : []),
   ].map((line) => h("p", { class: "note" }, line)));
 }

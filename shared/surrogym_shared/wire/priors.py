@@ -32,6 +32,11 @@ class PriorAbout(Request):
         default_factory=list, description="parameters of the simulator that were calibrated"
     )
     real_steps: int = Field(default=0, ge=0, description="number of real steps that the parameters were calibrated on")
+    failed_steps: int = Field(
+        default=0,
+        ge=0,
+        description="number of further real steps that were not used, because the simulator fails there",
+    )
     error_before: Share | None = Field(
         default=None, description="error of the simulator with its original values of the parameters"
     )

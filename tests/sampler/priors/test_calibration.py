@@ -106,3 +106,9 @@ def test_calibration_with_too_few_real_steps_is_refused_with_the_needed_number(c
 def test_calibrating_a_simulator_that_always_fails_is_refused_with_its_error():
     with pytest.raises(NotCalibrated, match="the solver diverged"):
         calibrated(6, plant=Broken)
+
+
+def test_a_simulator_whose_steps_together_diverge_is_refused_with_that_reason():
+    real = RealTransitions(np.zeros((3, 2)), np.zeros((3, 1)), np.ones((3, 2)))
+    with pytest.raises(NotCalibrated, match=r"infinite or NaN.*smaller time step"):
+        calibrate(hinge_spec(), real, (), np.zeros(0), lambda *_: np.zeros(2), lambda *_: np.full((3, 2), np.nan))

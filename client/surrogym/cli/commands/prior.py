@@ -107,8 +107,8 @@ def command(
             return
         with (
             prints_aside(),
-            _opened(api, view, simulator, parameter or [], steps) as prior,
             progress("prior", quiet=output.quiet) as update,
+            _opened(api, view, simulator, parameter or [], steps, update) as prior,
             on_interrupt(lambda: _as_it_is(surrogate, calls.get(surrogate))),
         ):
             stored, view = target.follow(prior, update)
@@ -177,9 +177,12 @@ class _Target:
         ]
 
 
-def _opened(api: Api, view: SurrogateView, simulator: str, parameters: list[str], steps: int | None) -> ServerPrior:
+def _opened(
+    api: Api, view: SurrogateView, simulator: str, parameters: list[str], steps: int | None, update: Update
+) -> ServerPrior:
     from surrogym_sampler.priors.on_server import ServerPrior
 
+    update(None, f"opening {simulator}, and trying some of its steps")
     try:
         return ServerPrior(api, view.name, simulator, view.spec, parameters, steps=steps)
     except ValueError as error:
@@ -253,6 +256,11 @@ def words_of_prior(about: PriorAbout) -> list[str]:
         steps = f"on {about.real_steps} real steps"
         lines.append(
             f"  error {about.error_before:.2%} of the changes as it was, {about.error:.2%} calibrated, {steps}"
+        )
+    if about.failed_steps:
+        lines.append(
+            f"  it fails at {about.failed_steps} other real steps, which were not used: correct it, or give it a "
+            "smaller time step"
         )
     if about.confidence_index is not None and about.confidence_index < CERTAIN:
         lines.append(
