@@ -8,9 +8,9 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import product
-from typing import Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,6 +27,8 @@ FEWEST_LEFT = 2  # a machine is stopped only if at least this number of its epis
 # A machine is stopped if too many of its episodes left a limit. If the true share is at most twice the allowed one, it
 # is stopped by mistake with at most this probability.
 LEFT_LEVEL = 0.01
+# If a policy leaves the limits no more often than declared, they count as broken with at most this probability.
+LEVEL = 0.05
 STARTS = 1_000  # number of random start states at which limits are checked
 # margin of a limit that is given at run time, as a share of the range of its term, for errors of the model
 MARGIN = 0.01
@@ -186,6 +188,74 @@ class KeptSteps:
         return [*lines, f"limits: the fallback was due after {self.near} of {self.steps} real steps"]
 
 
+@dataclass(frozen=True)
+class KeptEpisodes:
+    """How N real episodes kept the limits of their specification.
+
+    Attributes:
+        episodes: number of episodes.
+        violations: number of episodes that left a limit.
+        fallbacks: number of steps in which the fallback acted in the place of the policy.
+        fallback_episodes: number of episodes with such a step.
+        steps: number of all steps.
+        least_room: by name of the limit, the smallest distance from an end of it; negative if the limit was left.
+        probability: declared share of episodes that may leave a limit.
+    """
+
+    episodes: int
+    violations: int
+    fallbacks: int
+    fallback_episodes: int
+    steps: int
+    least_room: dict[str, float]
+    probability: float
+
+    def interval(self) -> tuple[float, float]:
+        """Return the exact 95 % interval (Clopper and Pearson) of the share of episodes that leave a limit."""
+        from scipy.stats import binomtest  # imported on first use, because SciPy takes a second to load
+
+        found = binomtest(self.violations, self.episodes).proportion_ci(method="exact")
+        return float(found.low), float(found.high)
+
+    @property
+    def broken(self) -> bool:
+        """Whether more episodes left a limit than the declared probability explains, at a level of 5 %."""
+        return left_too_often(self.violations, self.episodes, self.probability, LEVEL)
+
+    def summary(self) -> dict[str, Any]:
+        """Return the counts and the interval, as JSON."""
+        return {**asdict(self), "interval": list(self.interval())}
+
+    def words(self) -> str:
+        """Describe in a sentence how the limits were kept."""
+        low, high = self.interval()
+        return (
+            f"{self.violations} of {self.episodes} episodes left a limit (95 % interval {100 * low:.2g} to "
+            f"{100 * high:.2g} %, allowed {100 * self.probability:g} %); the fallback acted in {self.fallbacks} of "
+            f"{self.steps} steps, in {self.fallback_episodes} of {self.episodes} episodes"
+        )
+
+    def found(self, low: float, high: float) -> Literal["more often", "less often", "as often"]:
+        """Return how often the fallback acted, beside the predicted interval of its share from ``low`` to ``high``: the
+        share differs if its exact 95 % interval lies outside of the predicted one."""
+        from scipy.stats import binomtest
+
+        real = binomtest(self.fallback_episodes, self.episodes).proportion_ci(method="exact")
+        return "more often" if real.low > high else "less often" if real.high < low else "as often"
+
+    def expected(self, low: float, high: float) -> str:
+        """Compare the share of episodes with a fallback with its predicted interval from ``low`` to ``high``, in
+        words."""
+        found = self.found(low, high)
+        return (
+            f"the fallback acted {found} {'as' if found == 'as often' else 'than'} expected: in {_percent(low, high)}"
+        )
+
+
+def _percent(low: float, high: float) -> str:
+    return f"{100 * low:.2g} to {100 * high:.2g} % of the episodes"
+
+
 def check_limits(spec: EnvironmentSpec) -> None:
     """Check that the limits of a specification fit its other entries and each other.
 
@@ -209,7 +279,7 @@ def check_limits(spec: EnvironmentSpec) -> None:
         _check_term(spec, limit)
     _check_pairs(declared)
     _check_fallback(spec, declared)
-    for states in _starts(spec):
+    for states in starts(spec):
         inside = room(spec, states) - np.array([limit.margin for limit in declared.keep])
         row, column = np.unravel_index(int(np.argmin(inside)), inside.shape)
         limit = declared.keep[int(column)]
@@ -274,7 +344,7 @@ def limit_of(spec: EnvironmentSpec, text: str) -> Limit:
         low + margin < value < high - margin,
         f"limit {text!r}: expected a number between {low:g} and {high:g}, where the model has samples, got {value:g}",
     )
-    for states in _starts(spec):
+    for states in starts(spec):
         inside = distances(spec, [limit], states)[:, 0]
         start = dict(zip(spec.coordinate_names, states[np.argmin(inside)].round(6).tolist(), strict=True))
         require(
@@ -338,7 +408,7 @@ def _check_fallback(spec: EnvironmentSpec, declared: Limits) -> None:
         )
 
 
-def _starts(spec: EnvironmentSpec) -> Iterator[Array]:
+def starts(spec: EnvironmentSpec) -> Iterator[Array]:
     """Yield states (n, C) at which episodes may start: the listed states, or corners and random states of the start
     ranges."""
     if spec.starts:

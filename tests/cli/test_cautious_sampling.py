@@ -157,7 +157,8 @@ def test_sampling_and_evaluating_with_a_named_fallback_need_its_program(
     on_server: Any, name: str, tmp_path: Path
 ) -> None:
     named, program_of = ("--env", "support.limited:NamedCart"), ("--fallback", "brake=support.limited:brake")
-    assert on_server("register", name, *named).code == 0
+    registered = on_server("register", name, *named)
+    assert registered.out.endswith(" --fallback brake=package.module:function\n")
     (tmp_path / "policy").mkdir()
     policy = str(network(tmp_path / "policy", NamedCart().spec(), (4,)))
     for command in (
@@ -204,3 +205,25 @@ def test_the_status_command_shows_how_many_real_steps_were_beyond_each_limit(on_
     shown = on_server("status", cart).out
     assert "limit rail: 0 of 3 real steps beyond it" in shown
     assert "margin 0.4" in shown
+
+
+def test_violations_and_fallbacks_of_evaluations_are_in_ledger_policy_and_report(
+    on_server: Any, cart: str, server_process: Any, tmp_path: Path
+) -> None:
+    policy = str(network(tmp_path, SPEC, (4,)))
+    evaluated = json.loads(on_server("evaluate", policy, *CART, "--episodes", "3", "--surrogate", cart, "--json").out)
+    counts = {key: evaluated["limits"][key] for key in ("violations", "fallbacks", "fallback_episodes")}
+    assert counts["fallbacks"] > 0
+    sentence = "0 of 3 episodes left a limit (95 % interval 0 to 71 %, allowed 1 %); the fallback acted in "
+    sentence += f"{counts['fallbacks']} of 120 steps, in {counts['fallback_episodes']} of 3 episodes"
+    with Api(server_process.url) as api:
+        assert api.limits(cart) == [f"evaluations: {sentence}"]
+        (stored,) = api.policies.list(cart)[0].evaluations
+        assert stored.limits is not None
+        assert counts.items() <= stored.limits.model_dump().items()
+    assert f"evaluations: {sentence}" in on_server("status", cart).out
+    assert f"declared starts, from seed 10000: {sentence}" in on_server("policy", "show", cart).out
+    page = tmp_path / "report.html"
+    assert on_server("report", cart, "--out", str(page)).code == 0
+    assert f"evaluations: {sentence}" in page.read_text()
+    assert f"Limits in real episodes: {sentence}." in page.read_text()

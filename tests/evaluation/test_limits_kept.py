@@ -10,8 +10,9 @@ import pytest
 from support.limited import RAIL, SPEC, Cart, PatientCart, with_limits
 from support.rated import RATED, RatedRail
 from surrogym_sampler.original.episodes import open_episode
+from surrogym_shared.limits import KeptEpisodes
 from surrogym_shared.spec import Limits, Term
-from surrogym_trainer.evaluation.evaluator import Evaluation, EvaluationSettings, LimitsKept, evaluate, limits_kept
+from surrogym_trainer.evaluation.evaluator import Evaluation, EvaluationSettings, evaluate, limits_kept
 
 
 def pushed_right(*, limited: bool) -> Evaluation:
@@ -24,8 +25,8 @@ def pushed_right(*, limited: bool) -> Evaluation:
     )
 
 
-def counted(violations: int, episodes: int) -> LimitsKept:
-    return LimitsKept(episodes, violations, 0, 0, 40 * episodes, {"rail": 0.0}, 0.01)
+def counted(violations: int, episodes: int) -> KeptEpisodes:
+    return KeptEpisodes(episodes, violations, 0, 0, 40 * episodes, {"rail": 0.0}, 0.01)
 
 
 def test_a_policy_that_drives_off_the_rail_is_stopped_by_the_fallback_and_counted() -> None:

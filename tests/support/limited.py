@@ -128,6 +128,16 @@ def brake(coordinates):
     return [-0.5 * x - 1.6 * v]
 
 
+def two(coordinates):
+    """A program with an entry too many."""
+    return [0.0, 0.0]
+
+
+def broken(coordinates):
+    """A program that fails."""
+    raise RuntimeError("no pressure")
+
+
 class NamedCart(PatientCart):
     """A cart whose limits name their fallback."""
 

@@ -554,10 +554,19 @@ class Api:
         return self._get(wire.LimitsKept, f"{routes.surrogate(name)}/limits").said
 
     def report_steps(
-        self, name: str, steps: int, *, episodes: int = 0, note: str = "", idempotency_key: str | None = None
+        self,
+        name: str,
+        steps: int,
+        *,
+        episodes: int = 0,
+        note: str = "",
+        limits: wire.LimitCounts | None = None,
+        idempotency_key: str | None = None,
     ) -> wire.Ledger:
-        """Report the number of real steps of an evaluation, and return the surrogate's counts of real steps."""
-        body = wire.ReportSteps(steps=steps, episodes=episodes, note=note, idempotency_key=idempotency_key or new_key())
+        """Report the number of real steps of an evaluation, and how its episodes kept ``limits``. Return the
+        surrogate's counts of real steps."""
+        key = idempotency_key or new_key()
+        body = wire.ReportSteps(steps=steps, episodes=episodes, note=note, limits=limits, idempotency_key=key)
         return self._post(wire.Ledger, f"{routes.surrogate(name)}/ledger", body)
 
     def improve(

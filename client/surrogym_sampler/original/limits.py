@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from surrogym_sampler.original.episode import Episode, Moment
-from surrogym_sampler.original.errors import RAISED, StepFailed, StepRefused, UnknownEnvironment
+from surrogym_sampler.original.errors import RAISED, StepFailed, StepRefused, UnknownEnvironment, sentence
 from surrogym_sampler.original.factories import load_factory
 from surrogym_sampler.original.protocol import (
     Array,
@@ -30,7 +30,7 @@ from surrogym_sampler.original.protocol import (
     RolloutEnvironment,
     runs_in_parallel,
 )
-from surrogym_shared.limits import clipped_action, fallback_action, falls_back, is_near, margins, nearest, room
+from surrogym_shared.limits import clipped_action, fallback_action, falls_back, is_near, margins, nearest, room, starts
 from surrogym_shared.spec import BoxAction, EnvironmentSpec
 from surrogym_shared.spec.safety import NamedFallback
 
@@ -45,7 +45,8 @@ def program_of(spec: EnvironmentSpec, given: str | None) -> Program | None:
         given: what a person gave, as NAME=package.module:function.
 
     Raises:
-        UnknownEnvironment: no program was given for the name, one for another name, or one that can't be called.
+        UnknownEnvironment: no program was given for the name, one for another name, one that can't be called, or one
+            that gives no action at a start of the specification.
     """
     declared = None if spec.limits is None else spec.limits.fallback
     if not isinstance(declared, NamedFallback):
@@ -56,12 +57,18 @@ def program_of(spec: EnvironmentSpec, given: str | None) -> Program | None:
             )
         return None
     name, _, target = (given or "").partition("=")
-    if name != declared.name:
+    if name != declared.name or not target:
         raise UnknownEnvironment(
             f"the limits name the fallback {declared.name!r}: expected --fallback "
             f"{declared.name}=package.module:function, got {given or 'none'}"
         )
     program: Program = load_factory(target)
+    try:
+        called(program, spec, next(starts(spec))[0])
+    except RAISED as error:  # near a limit, it would fail in the same way
+        raise UnknownEnvironment(
+            f"--fallback {given} was tried at a start, without a step: {sentence(error)}"
+        ) from error
     return program
 
 

@@ -6,8 +6,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, field, replace
-from typing import Any, Literal
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,7 @@ from surrogym_sampler.original.errors import RAISED, EvaluationFailed, PolicyMis
 from surrogym_sampler.original.fitting import check_policy
 from surrogym_sampler.original.periods import is_timed
 from surrogym_sampler.original.protocol import LONGEST_EPISODE
-from surrogym_shared.limits import left_too_often, limits_of, must_stop, past, room
+from surrogym_shared.limits import KeptEpisodes, limits_of, must_stop, past, room
 from surrogym_shared.logs.rewards import declared_reward
 from surrogym_shared.set_points import with_set_points
 from surrogym_shared.spec import Coordinate, EnvironmentSpec, Success, limits
@@ -106,7 +106,7 @@ class Evaluation:
     limit: int | None = None  # largest number of steps in an episode, by the specification or by the environment itself
     seeded: bool = True  # whether a second reset with the first seed began in the same state
     # How the limits that the specification declares were kept; None if it declares none.
-    limits: LimitsKept | None = None
+    limits: KeptEpisodes | None = None
 
     @property
     def trace(self) -> Trace:
@@ -524,79 +524,7 @@ def succeeded(spec: EnvironmentSpec, next_coordinates: Array, rewards: Array, *,
     return _meets(spec.success, held, len(rewards), float(rewards.sum()), terminated=terminated)
 
 
-# If a policy leaves the limits no more often than declared, they count as broken with at most this probability.
-LEVEL = 0.05
-
-
-@dataclass(frozen=True)
-class LimitsKept:
-    """How N real episodes kept the limits of their specification.
-
-    Attributes:
-        episodes: number of episodes.
-        violations: number of episodes that left a limit.
-        fallbacks: number of steps in which the fallback acted in the place of the policy.
-        fallback_episodes: number of episodes with such a step.
-        steps: number of all steps.
-        least_room: by name of the limit, the smallest distance from an end of it; negative if the limit was left.
-        probability: declared share of episodes that may leave a limit.
-    """
-
-    episodes: int
-    violations: int
-    fallbacks: int
-    fallback_episodes: int
-    steps: int
-    least_room: dict[str, float]
-    probability: float
-
-    def interval(self) -> tuple[float, float]:
-        """Return the exact 95 % interval (Clopper and Pearson) of the share of episodes that leave a limit."""
-        from scipy.stats import binomtest  # imported on first use, because SciPy takes a second to load
-
-        found = binomtest(self.violations, self.episodes).proportion_ci(method="exact")
-        return float(found.low), float(found.high)
-
-    @property
-    def broken(self) -> bool:
-        """Whether more episodes left a limit than the declared probability explains, at a level of 5 %."""
-        return left_too_often(self.violations, self.episodes, self.probability, LEVEL)
-
-    def summary(self) -> dict[str, Any]:
-        """Return the counts and the interval, as JSON."""
-        return {**asdict(self), "interval": list(self.interval())}
-
-    def words(self) -> str:
-        """Describe in a sentence how the limits were kept."""
-        low, high = self.interval()
-        return (
-            f"{self.violations} of {self.episodes} episodes left a limit (95 % interval {100 * low:.2g} to "
-            f"{100 * high:.2g} %, allowed {100 * self.probability:g} %); the fallback acted in {self.fallbacks} of "
-            f"{self.steps} steps, in {self.fallback_episodes} of {self.episodes} episodes"
-        )
-
-    def found(self, low: float, high: float) -> Literal["more often", "less often", "as often"]:
-        """Return how often the fallback acted, beside the predicted interval of its share from ``low`` to ``high``: the
-        share differs if its exact 95 % interval lies outside of the predicted one."""
-        from scipy.stats import binomtest
-
-        real = binomtest(self.fallback_episodes, self.episodes).proportion_ci(method="exact")
-        return "more often" if real.low > high else "less often" if real.high < low else "as often"
-
-    def expected(self, low: float, high: float) -> str:
-        """Compare the share of episodes with a fallback with its predicted interval from ``low`` to ``high``, in
-        words."""
-        found = self.found(low, high)
-        return (
-            f"the fallback acted {found} {'as' if found == 'as often' else 'than'} expected: in {_percent(low, high)}"
-        )
-
-
-def _percent(low: float, high: float) -> str:
-    return f"{100 * low:.2g} to {100 * high:.2g} % of the episodes"
-
-
-def limits_kept(spec: EnvironmentSpec, paths: Sequence[NDArray[np.float64]], fallbacks: Sequence[int]) -> LimitsKept:
+def limits_kept(spec: EnvironmentSpec, paths: Sequence[NDArray[np.float64]], fallbacks: Sequence[int]) -> KeptEpisodes:
     """Count the episodes that left a limit.
 
     Args:
@@ -605,7 +533,7 @@ def limits_kept(spec: EnvironmentSpec, paths: Sequence[NDArray[np.float64]], fal
         fallbacks: number of steps of each episode in which the fallback acted.
     """
     least = np.min([room(spec, path).min(axis=0) for path in paths], axis=0)
-    return LimitsKept(
+    return KeptEpisodes(
         episodes=len(paths),
         violations=sum(bool(past(spec, path).any()) for path in paths),
         fallbacks=sum(fallbacks),

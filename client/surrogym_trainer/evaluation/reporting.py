@@ -60,7 +60,17 @@ def as_reported(
         lengths=result.lengths.tolist(),
         success=None if result.success is None else result.success.tolist(),
         traces=[_trace(rank, settings.first_seed + at, result.traces[at]) for rank, at in shown.items()],
+        limits=counts_of_limits(result),
         idempotency_key=key,
+    )
+
+
+def counts_of_limits(result: Evaluation) -> wire.LimitCounts | None:
+    """Return how the episodes kept their limits, in the form in which a server counts it; None without limits."""
+    if (kept := result.limits) is None:
+        return None
+    return wire.LimitCounts(
+        violations=kept.violations, fallbacks=kept.fallbacks, fallback_episodes=kept.fallback_episodes
     )
 
 

@@ -536,8 +536,10 @@ def prediction(known: Known) -> str:
     """Return the report's section that compares the policy's promise with its evaluation, as HTML."""
     policy, real, title = known.policy, known.real, "Was it predicted?"
     promise = None if policy is None else policy.promise
+    kept = [] if real is None or real.limits is None else [f"Limits in real episodes: {real.limits.said}."]
     if policy is None or promise is None:
-        return section(title, paragraph("Nothing was predicted." if policy else "There is no controller yet."))
+        said = ["Nothing was predicted." if policy else "There is no controller yet.", *kept]
+        return section(title, paragraph(" ".join(said)))
     ranges = [Range("predicted, 90 %", promise.median, promise.low, promise.high)]
     said = ["Nobody judged the prediction."]
     if policy.trusted is not None:
@@ -551,6 +553,7 @@ def prediction(known: Known) -> str:
     else:
         ranges.append(_range("real", real))
         said.append(_words(found, promise, real))
+    said += kept
     ranges += [_range(SHORT_NAMES[one.controller], one) for one in (known.without, known.reference) if one is not None]
     alt = "; ".join(f"{one.label}: {number(one.value)}" for one in ranges)
     picture_ = picture(svg(draw_ranges(ranges, "average return")), alt)

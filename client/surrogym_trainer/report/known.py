@@ -48,6 +48,7 @@ class Known:
         others: the other versions of the surrogate's policies.
         check: check of the policy's deployed controller; None if there is none.
         missing: sentences about what could not be read.
+        limits: how all real steps kept the limits of the specification, in sentences.
     """
 
     view: SurrogateView
@@ -62,6 +63,7 @@ class Known:
     others: tuple[PolicyView, ...] = ()
     check: StoredCheck | None = None
     missing: tuple[str, ...] = ()
+    limits: tuple[str, ...] = ()
 
 
 def collect(api: Api, name: str, which: str | None = None, controller: Path | None = None) -> Known:
@@ -78,14 +80,14 @@ def collect(api: Api, name: str, which: str | None = None, controller: Path | No
         UnusableCheck: the folder has no check of this policy.
     """
     view, models, samples = api.surrogate(name), api.models(name), list(api.samples(name))
-    server = f"{api.url}, surrogym {api.health().version}"
+    server, limits = f"{api.url}, surrogym {api.health().version}", tuple(api.limits(name))
     policy, missing = _policy(api, name, which), list[str]()
     if policy is None:
         if controller is not None:
             raise UnusableCheck(
                 f"expected a stored policy of surrogate {name!r} for the check in {controller}, got none: push it first"
             )
-        return Known(view, models, samples, server)
+        return Known(view, models, samples, server, limits=limits)
     check = None
     if controller is not None:
         check = read_check(controller, next((file.digest for file in policy.files if file.form == "zip"), ""))
@@ -101,7 +103,19 @@ def collect(api: Api, name: str, which: str | None = None, controller: Path | No
     missing += lacks
     others = tuple(one for one in api.policies.list(name) if one.version != policy.version)
     return Known(
-        view, models, samples, server, policy, details[0], details[1], details[2], video, others, check, tuple(missing)
+        view,
+        models,
+        samples,
+        server,
+        policy,
+        real=details[0],
+        without=details[1],
+        reference=details[2],
+        video=video,
+        others=others,
+        check=check,
+        missing=tuple(missing),
+        limits=limits,
     )
 
 

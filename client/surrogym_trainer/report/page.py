@@ -17,7 +17,6 @@ import numpy as np
 from surrogym_client.errors import SurrogymClientError
 from surrogym_client.runtime.versions import versions
 from surrogym_client.surrogates.waiting import IN_WORDS
-from surrogym_shared.limits import KeptSteps
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import ModelView, OutputFidelity, Phase, SampleView, SurrogateView
 from surrogym_trainer.coverage import Cut, coverage_of
@@ -117,7 +116,7 @@ def page(known: Known, cuts: Sequence[Cut] = ()) -> str:
 
 def _details(known: Known, cuts: Sequence[Cut]) -> list[str]:
     view, models, samples = known.view, known.models, known.samples
-    sections = [_summary(view, samples), _spent(view)]
+    sections = [_summary(known), _spent(view)]
     if models:
         sections.append(_fidelity(view, models))
     if samples:
@@ -145,7 +144,8 @@ def _covered(view: SurrogateView, samples: Sequence[SampleView]) -> str:
     return f"{shown}<p>{escape(coverage.words())}</p>"
 
 
-def _summary(view: SurrogateView, samples: Sequence[SampleView]) -> str:
+def _summary(known: Known) -> str:
+    view = known.view
     index = "no model yet" if view.confidence_index is None else f"{view.confidence_index:.4f}"
     facts = [
         ("phase", f"{PHASES[view.phase]}, paused" if view.paused else PHASES[view.phase]),
@@ -154,7 +154,7 @@ def _summary(view: SurrogateView, samples: Sequence[SampleView]) -> str:
         ("model", view.model_version),
         ("queries", ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in view.queries)),
         *([("last error", view.error)] if view.error else []),
-        *(("limits", words) for words in KeptSteps().with_steps(view.spec, samples).words(view.spec)),
+        *(("limits", words) for words in known.limits),
     ]
     return section("State of the design", rows(facts))
 

@@ -23,7 +23,7 @@ from surrogym_trainer.evaluation.evaluator import (
     evaluate,
     for_set_points,
 )
-from surrogym_trainer.evaluation.reporting import as_reported, paired_start, words_of
+from surrogym_trainer.evaluation.reporting import as_reported, counts_of_limits, paired_start, words_of
 from surrogym_trainer.evaluation.videos import record
 from surrogym_trainer.policies.card import set_points_in, write_card
 from surrogym_trainer.policies.files import load_policy
@@ -173,7 +173,7 @@ def run_episodes(
 
         result = _counted(predict, environment, settings, controller, tell, gathered, trained_for)
         results[controller] = for_set_points(result, trained_for, points)
-    paired = paired_start(results["policy"], settings.episodes)
+    paired = paired_start(results["policy"], min(len(result.returns) for result in results.values()))
     gathered.evaluations = [
         as_reported(
             result,
@@ -230,12 +230,12 @@ def _counted(
 ) -> Evaluation:
     """Run the episodes of one controller, and record their real steps in ``gathered``."""
 
-    def note(steps: int, episodes: int, what: str) -> None:
+    def note(steps: int, episodes: int, what: str, limits: wire.LimitCounts | None = None) -> None:
         if steps:
             acting = "the reference controller" if controller == "reference" else f"{controller} actions"
             said = what if controller == "policy" else f"{what}, {acting}"
             gathered.steps.append(
-                wire.ReportSteps(steps=steps, episodes=episodes, note=said, idempotency_key=uuid4().hex)
+                wire.ReportSteps(steps=steps, episodes=episodes, note=said, limits=limits, idempotency_key=uuid4().hex)
             )
 
     try:
@@ -246,7 +246,9 @@ def _counted(
     except EvaluationInterrupted as interruption:
         note(interruption.steps, 0, "interrupted")
         raise
-    note(result.steps, settings.episodes, f"{counted(settings.episodes, 'episode')} from seed {settings.first_seed}")
+    episodes = len(result.returns)  # fewer than asked for, if limits were left too often
+    said = f"{counted(episodes, 'episode')} from seed {settings.first_seed}"
+    note(result.steps, episodes, said, counts_of_limits(result))
     return result
 
 

@@ -17,6 +17,7 @@ from surrogym_server.convert.exports import samples_as_csv, samples_as_npz
 from surrogym_server.convert.stored import read_stored
 from surrogym_server.storage.records import LogPart
 from surrogym_shared.codes import Code
+from surrogym_shared.limits import KeptEpisodes
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire import (
     AddedSamples,
@@ -106,11 +107,18 @@ def dirt(name: str, use: Use) -> DirtList:
     responses=documented(Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST),
 )
 def limits(name: str, use: Use) -> LimitsKept:
-    """Count how many of all real steps ended beyond each limit of the specification, and after how many the fallback
-    was due."""
+    """Count how many of all real steps ended beyond each limit of the specification, after how many the fallback was
+    due, and how many episodes of evaluations left a limit."""
     record = use.storage.surrogates.get(name)
     spec = read_stored(EnvironmentSpec, "a stored specification", record.spec)
-    return LimitsKept(said=[] if spec.limits is None else use.samples.kept(record, spec).words(spec))
+    if spec.limits is None:
+        return LimitsKept(said=[])
+    said = use.samples.kept(record, spec).words(spec)
+    if counts := use.storage.ledger.limited(name):
+        said.append(
+            f"evaluations: {KeptEpisodes(**counts, probability=spec.limits.probability, least_room={}).words()}"
+        )
+    return LimitsKept(said=said)
 
 
 @router.get(
@@ -147,8 +155,9 @@ def drop_snapshots(
 def report(name: str, body: Annotated[ReportSteps, example(examples.LEDGER)], use: Use) -> Ledger:
     """Report real steps of an evaluation, which are counted separately from those of the design. Reports with the same
     idempotency key count once."""
+    kept = None if body.limits is None else body.limits.model_dump()
     counts = use.storage.ledger.report(
-        name, body.steps, key=body.idempotency_key, episodes=body.episodes, note=body.note
+        name, body.steps, key=body.idempotency_key, episodes=body.episodes, note=body.note, limits=kept
     )
     return resources.ledger(counts)
 

@@ -55,5 +55,6 @@ function outcome(policy) {
   const unjudged = promise ? ": too few to judge the promise" : "";
   const kept = real.promise_kept === null ? unjudged : real.promise_kept ? ": the promise was kept" : ": the promise was broken";
   const success = real.success_rate === null ? "" : `; ${percent(real.success_rate)} succeeded`;
-  return `${said}; real mean return ${meanWords(real)} in ${plural(real.episodes, "episode")}${success}${kept}.`;
+  const limits = real.limits ? ` Limits: ${real.limits.said}.` : "";
+  return `${said}; real mean return ${meanWords(real)} in ${plural(real.episodes, "episode")}${success}${kept}.${limits}`;
 }

@@ -27,6 +27,7 @@ export function surrogateView(main, name, context) {
   let kept = []; // how real steps kept the limits, in sentences
   let known = null; // the prior
   let version = null;
+  let evaluated = 0; // real steps of evaluations when `kept` was read
   let closed = false;
   main.replaceChildren(h("h1", {}, name), h("div", { class: "card loading", "aria-busy": "true" }, "Asking the server…"));
 
@@ -54,20 +55,21 @@ export function surrogateView(main, name, context) {
     }
     const newSamples = samples.length !== now.samples && allSamples();
     const newDirt = newSamples && call("GET", `${url}/dirt`).then(({ findings }) => { dirt = findings; });
-    const newKept = newSamples && now.spec.limits && call("GET", `${url}/limits`).then(({ said }) => { kept = said; });
+    const newKept = (newSamples || evaluated !== now.ledger.evaluation) && now.spec.limits && call("GET", `${url}/limits`).then(({ said }) => { kept = said; });
     const newPrior = (newSamples || !known || known.awaited || version !== now.model_version) && call("GET", `${url}/prior`).then((reply) => { known = reply; });
     const newModels = version !== now.model_version && call("GET", `${url}/models`).then((reply) => { models = reply.models; });
     const [queries, sessions, stored] = await Promise.all([call("GET", `${url}/queries`), call("GET", `${url}/sessions`), policiesNow(now, first), newSamples, newDirt, newKept, newPrior, newModels]);
     if (closed) return;
     parts.show({ now, samples, dirt, kept, known, models: newModels && models, queries: queries.queries, sessions: sessions.sessions, policies: stored.policies });
     version = now.model_version;
+    evaluated = now.ledger.evaluation;
   }
 
   function fail(error) {
     const missing = error instanceof Problem && error.status === 404;
     parts?.close();
     parts = null;
-    [samples, models, dirt, kept, known, version] = [[], [], [], [], null, null];
+    [samples, models, dirt, kept, known, version, evaluated] = [[], [], [], [], null, null, 0];
     main.replaceChildren(h("h1", {}, name), h("div", { class: "card bad", role: "alert" },
       missing ? "There is no surrogate of this name, or it was deleted." : error.message, " ", h("a", { href: "#/" }, "All surrogates")));
   }

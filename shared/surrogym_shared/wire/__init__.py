@@ -44,9 +44,9 @@ _NAMES = {
     ),
     "queries": (
         "QUERY_LEASE_SECONDS AddedSamples AddQueries AddSamples AuditModel ClaimedQueries ClaimQueries DirtFinding "
-        "DirtList DroppedSnapshots DropSnapshots FailQuery Improve LeasedQuery LimitsKept NewSample Query QueryList "
-        "QueryView RenewLease ReportSteps RolloutQuery SamplePage SampleView SnapshotList SnapshotView StepQuery Trial "
-        "WithdrawnQueries WithdrawQueries"
+        "DirtList DroppedSnapshots DropSnapshots FailQuery Improve LeasedQuery LimitCounts LimitsKept NewSample "
+        "Query QueryList QueryView RenewLease ReportSteps RolloutQuery SamplePage SampleView SnapshotList "
+        "SnapshotView StepQuery Trial WithdrawnQueries WithdrawQueries"
     ),
     "service": "Access Event Health Ready",
     "sessions": (

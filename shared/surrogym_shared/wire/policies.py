@@ -3,14 +3,15 @@ of the original environment since its model was learned."""
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from surrogym_shared.kinds import Side
 from surrogym_shared.patterns import ALIAS, DIGEST, VISIBLE
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_shared.wire.base import MAX_MEASURED, Key, Measured, Reply, Request, SurrogateName, Vector
+from surrogym_shared.wire.queries import LimitCounts
 
 # Formats of policy files (zip, onnx, pt2) and of videos of policies (mp4, gif).
 PolicyForm = Literal["zip", "onnx", "pt2", "mp4", "gif"]
@@ -248,7 +249,16 @@ class AddEvaluation(Request):
     traces: list[EpisodeTrace] = Field(
         default=[], max_length=MAX_TRACES, description="states, actions and rewards of some episodes"
     )
+    limits: LimitCounts | None = Field(
+        default=None, description="how all episodes kept the limits of the specification; null without limits"
+    )
     idempotency_key: Key = Field(description="a repeat with the same key adds nothing")
+
+    @model_validator(mode="after")
+    def _possible(self) -> Self:
+        if self.limits is not None:
+            self.limits.require_fit(len(self.returns), sum(self.lengths))
+        return self
 
 
 class PutAlias(Request):
@@ -274,6 +284,19 @@ class Interval(Reply):
 
     low: float = Field(description="lower end")
     high: float = Field(description="upper end")
+
+
+class EvaluationLimits(Reply):
+    """How the real episodes of one evaluation kept the limits of their specification."""
+
+    violations: int = Field(description="number of episodes that left a limit")
+    fallbacks: int = Field(description="number of steps in which the fallback acted")
+    fallback_episodes: int = Field(description="number of episodes with such a step")
+    kept: bool = Field(
+        description="false if more episodes left a limit than the allowed probability explains, or more had a fallback "
+        "than the policy's promise expected; exact tests at 5 and 2.5 %"
+    )
+    said: str = Field(description="these counts in a sentence, with an exact 95 % interval of the share of violations")
 
 
 class EvaluationView(Reply):
@@ -312,6 +335,9 @@ class EvaluationView(Reply):
         description="whether the mean return is at least the lower end of the policy's promise; null without a "
         "promise, with fewer than 30 episodes, or if the environment or the starts are other ones"
     )
+    limits: EvaluationLimits | None = Field(
+        default=None, description="how the episodes kept declared limits; null if none were reported"
+    )
     pushed_by: str | None = Field(default=None, description="who stored it, as for a policy")
 
 
@@ -340,7 +366,7 @@ class PolicyView(Reply):
     audit: PolicyAudit | None = Field(description="audit of the policy")
     trusted: bool | None = Field(
         description="whether the promise is trusted; false if the mean return of the latest evaluation that can judge "
-        "it is lower, or if drift was reported later; null: not decided"
+        "it is lower, if the latest one did not keep the limits, or if drift was reported later; null: not decided"
     )
     reason: str = Field(description="why the promise is trusted or not")
     drifted_at: float | None = Field(

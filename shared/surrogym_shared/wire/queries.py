@@ -6,6 +6,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
+from surrogym_shared.checks import require
 from surrogym_shared.spec import MAX_ROLLOUT_QUERY
 from surrogym_shared.wire.base import (
     MAX_BATCH,
@@ -392,6 +393,31 @@ class LimitsKept(Reply):
     said: list[str] = Field(description="a sentence for each limit, and one on the fallback; empty without limits")
 
 
+class LimitCounts(Request):
+    """How real episodes of a policy kept the limits of their specification. Each episode that left a limit, and each
+    step in which the fallback acted, is counted."""
+
+    violations: Annotated[int, Field(ge=0, le=1_000_000_000)] = Field(
+        description="number of episodes that left a limit"
+    )
+    fallbacks: Annotated[int, Field(ge=0, le=1_000_000_000)] = Field(
+        description="number of steps in which the fallback acted, because the state was within a margin"
+    )
+    fallback_episodes: Annotated[int, Field(ge=0, le=1_000_000_000)] = Field(
+        description="number of episodes with such a step"
+    )
+
+    def require_fit(self, episodes: int, steps: int) -> None:
+        """Check that the counts are possible in so many episodes and steps. Raises ``ValueError``."""
+        require(
+            self.violations <= episodes
+            and self.fallback_episodes <= min(episodes, self.fallbacks, steps)
+            and self.fallbacks <= steps,
+            f"limits: expected counts that are possible in {episodes} episodes with {steps} steps, got "
+            f"{self.violations} violations and {self.fallbacks} fallbacks in {self.fallback_episodes} episodes",
+        )
+
+
 class ReportSteps(Request):
     """Report of the number of real steps that an evaluation took. They don't count towards the budget."""
 
@@ -403,7 +429,16 @@ class ReportSteps(Request):
     note: Annotated[str, Field(max_length=1_000)] = Field(
         default="", description="remark for people, stored with the report"
     )
+    limits: LimitCounts | None = Field(
+        default=None, description="how the episodes kept the limits of the specification; null without limits"
+    )
     idempotency_key: Key = Field(description="a repeat with the same key adds nothing")
+
+    @model_validator(mode="after")
+    def _possible(self) -> Self:
+        if self.limits is not None:
+            self.limits.require_fit(self.episodes, self.steps)
+        return self
 
 
 class Trial(Request):

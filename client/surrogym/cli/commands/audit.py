@@ -132,6 +132,7 @@ def by_episodes(
     from surrogym_sampler.original.errors import EvaluationFailed
     from surrogym_sampler.original.protocol import LONGEST_EPISODE
     from surrogym_trainer.evaluation.evaluator import EvaluationInterrupted, evaluate
+    from surrogym_trainer.evaluation.reporting import counts_of_limits
     from surrogym_trainer.policies.integrals import IntegralPort
     from surrogym_trainer.training.handover import judge_episodes
 
@@ -144,16 +145,16 @@ def by_episodes(
     most = settings.episodes * (spec.time_limit or LONGEST_EPISODE)
     count = counted(settings.episodes, "whole episode")
     say(f"the audit takes {count} in {env}: at most {most} real steps", quiet=quiet)
-    note, taken = f"audit, {count} from seed {settings.first_seed}", 0
+    note, taken, episodes, kept = f"audit, {count} from seed {settings.first_seed}", 0, 0, None
     try:
         result = evaluate(acting, opener, settings, trained_for=spec)
-        taken = result.steps
+        taken, episodes, kept = result.steps, len(result.returns), counts_of_limits(result)
     except (EvaluationFailed, EvaluationInterrupted) as error:
         taken = error.steps
         raise
     finally:
         if taken:
-            subject.api.report_steps(subject.name, taken, episodes=settings.episodes, note=note)
+            subject.api.report_steps(subject.name, taken, episodes=episodes, note=note, limits=kept)
     return judge_episodes(subject, result)
 
 

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from surrogym_sampler.original.episode import Episode
     from surrogym_shared.spec import EnvironmentSpec
     from surrogym_shared.terminal import Update
-    from surrogym_shared.wire import Controller
+    from surrogym_shared.wire import Controller, LimitCounts
     from surrogym_trainer.evaluation.evaluator import Evaluation, EvaluationSettings, Progress
     from surrogym_trainer.policies.card import PolicyCard
     from surrogym_trainer.policies.evidence import Promise
@@ -173,7 +173,7 @@ def command(
     promise = card.promise if is_promised(settings, result, card.spec) else None
     if card.set_points and card.spec is None:
         promise = None
-    expected = promise if _judges(settings.episodes) else None
+    expected = promise if _judges(len(result.returns)) else None
     elsewhere = _elsewhere(env, card, promise)
     with kept(learning, policy, result, quiet=output.quiet) as steps:
         if stored := keeping.push and ledger is not None:
@@ -342,7 +342,7 @@ def _reports(
     trained_for: EnvironmentSpec | None,
     run: Callable[..., Evaluation],
     announce: Callable[[EnvironmentSpec], None],
-    enter: Callable[[int, int, str], None],
+    enter: Callable[..., None],
     settings: EvaluationSettings,
     policy: Path,
 ) -> list[tuple[Controller, Evaluation]]:
@@ -353,17 +353,20 @@ def _reports(
         trained_for: specification that the policy was trained for.
         run: runs the episodes of one controller.
         announce: prints the number of real steps of all controllers, given the environment's specification.
-        enter: reports real steps and episodes, with a note, to the server.
+        enter: reports real steps and episodes, with a note and counts of limits, to the server.
         settings: settings of the evaluation.
         policy: file of the policy.
     """
+    from surrogym_trainer.evaluation.reporting import counts_of_limits
+
     reports: list[tuple[Controller, Evaluation]] = []
     for controller, load in controllers.items():
         actions = {"policy": "", "reference": "the reference controller"}.get(controller, f"{controller} actions")
         first = (trained_for, announce) if controller == "policy" else (None, None)
         result = run(load, *first, what=actions or str(policy))
-        note = f"{counted(settings.episodes, 'episode')} from seed {settings.first_seed}"
-        enter(result.steps, settings.episodes, f"{note}, {actions}" if actions else note)
+        episodes = len(result.returns)  # fewer than asked for, if limits were left too often
+        note = f"{counted(episodes, 'episode')} from seed {settings.first_seed}"
+        enter(result.steps, episodes, f"{note}, {actions}" if actions else note, counts_of_limits(result))
         reports.append((controller, result))
     return reports
 
@@ -386,7 +389,7 @@ def _keep(
     from surrogym_trainer.evaluation.reporting import as_reported, paired_start
     from surrogym_trainer.policies.pushing import keep
 
-    paired = paired_start(reports[0][1], settings.episodes)
+    paired = paired_start(reports[0][1], min(len(result.returns) for _, result in reports))
     try:
         noted = [
             as_reported(
@@ -477,6 +480,7 @@ def enter_steps(
     steps: int,
     episodes: int,
     note: str,
+    limits: LimitCounts | None = None,
     *,
     quiet: bool,
 ) -> None:
@@ -487,7 +491,7 @@ def enter_steps(
         return
     try:
         with connect(server, token) as api:
-            api.report_steps(surrogate, steps, episodes=episodes, note=note)
+            api.report_steps(surrogate, steps, episodes=episodes, note=note, limits=limits)
     except SurrogymClientError as error:
         say(f"not entered into the ledger of {surrogate!r}: {sentence(error)}", quiet=quiet)
 

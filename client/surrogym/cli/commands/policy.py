@@ -253,6 +253,10 @@ def _words(name: str, policy: PolicyDetail) -> str:
     if policy.evaluations:
         heading = ("real episodes of", "environment", "starts", "episodes", "mean (95 %)", "success", "promise kept")
         lines.append(columns([heading, *map(_evaluation, policy.evaluations)]))
+        limited = [one for one in policy.evaluations if one.limits is not None]
+        lines += [
+            f"limits, real episodes of {one.controller}, {one.note}: {one.limits.said}" for one in limited if one.limits
+        ]
     else:
         lines.append(f"no real episodes yet; next: surrogym policy get {name}@{policy.version} --out policy.zip")
     return "\n".join(lines)

@@ -286,6 +286,7 @@ def _with_tolerances(spec: EnvironmentSpec, tolerances: dict[str, float]) -> Env
 def _words(view: SurrogateView, environment: str, file: Path | None) -> str:
     from surrogym_client.surrogates.waiting import awaits_log, words_of_no_log
     from surrogym_sampler.original.loading import is_known, sample_command
+    from surrogym_shared.spec.safety import NamedFallback
 
     registered = f"{view.name}: {view.environment or 'own environment'}, {len(view.spec.coordinates)} coordinates"
     if awaits_log(view):
@@ -297,4 +298,6 @@ def _words(view: SurrogateView, environment: str, file: Path | None) -> str:
     lagging = any(coordinate.lag is not None for coordinate in view.spec.coordinates)
     if file is not None and (lagging or view.spec.limits is not None):
         start += f" --spec {shlex.quote(str(file))}"
+    if view.spec.limits is not None and isinstance(view.spec.limits.fallback, NamedFallback):
+        start += f" --fallback {view.spec.limits.fallback.name}=package.module:function"
     return f"{registered}, budget of {view.budget} real steps, target {view.target:g}; next: {start}"

@@ -333,9 +333,14 @@ def _fields(record: PolicyRecord, card: wire.PushedCard) -> dict[str, Any]:
 def _trust(card: wire.PushedCard, evaluations: list[dict[str, Any]]) -> tuple[bool | None, str]:
     """Return whether a policy's promise (an interval for its mean return) is trusted, with the reason.
 
-    It is not trusted if the mean return in the latest evaluation that can judge the promise is below the interval.
-    Otherwise, the policy's card has the answer and the reason.
+    It is not trusted if the mean return in the latest evaluation that can judge the promise is below the interval, or
+    if the policy's latest episodes as declared did not keep the limits. Otherwise, the policy's card has the answer and
+    the reason.
     """
+    as_declared = [one for one in evaluations if one["controller"] == "policy" and one["declared"] and one["own"]]
+    limited = [one for one in as_declared if one.get("limits")]
+    if limited and not (kept := max(limited, key=lambda one: int(one["id"]))["limits"])["kept"]:
+        return False, f"the latest evaluation did not keep the limits: {kept['said']}"
     latest = _latest(evaluations)
     if latest is None or latest["promise_kept"] or card.promise is None:
         return card.trusted, card.reason

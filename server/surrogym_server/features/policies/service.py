@@ -40,6 +40,7 @@ from surrogym_server.storage.sql.models import LATEST
 from surrogym_shared import intervals, network
 from surrogym_shared.checks import trace_fault
 from surrogym_shared.environments import is_name, is_same
+from surrogym_shared.limits import KeptEpisodes
 from surrogym_shared.surrogate_file import PLANNER_HEAD
 from surrogym_shared.wire import AddEvaluation
 
@@ -196,12 +197,22 @@ class PolicyService(Service):
             InvalidInput: the lists have different lengths, or a trace does not fit the specification.
             TooLarge: the files of the surrogate's policies would exceed their limit.
         """
-        _require_lengths(episodes, self._storage.surrogates.get(name).spec)
+        spec = self._storage.surrogates.get(name).spec
+        _require_lengths(episodes, spec)
         episodewise = episodes.model_dump(mode="json", include={"returns", "lengths", "success", "traces"})
         content = json.dumps(episodewise, separators=(",", ":")).encode()
         digest = hashlib.sha256(content).hexdigest()
         blob = self._blobs.put(content)
         summary = {**_summary(episodes), "own": self._is_own(name, episodes.environment), PUSHED_BY: by}
+        if episodes.limits is not None and spec.get("limits"):
+            kept = KeptEpisodes(
+                episodes=len(episodes.returns),
+                steps=sum(episodes.lengths),
+                probability=spec["limits"]["probability"],
+                least_room={},
+                **episodes.limits.model_dump(),
+            )
+            summary["limits"] = _limits(kept, self._policies.get(name, str(version)).card)
         new = NewEvaluation(episodes.idempotency_key, summary, len(content), digest, blob)
         with self._removed_if_refused(blob):
             stored, created, freed = self._policies.evaluate(name, version, new, self._most_bytes)
@@ -370,6 +381,18 @@ def _summary(episodes: AddEvaluation) -> JSON:
         "success_rate": None if not success else sum(success) / len(success),
         "success_interval": None if share is None else share._asdict(),
     }
+
+
+def _limits(kept: KeptEpisodes, card: JSON) -> JSON:
+    """Return how an evaluation's episodes kept the limits of the specification, and whether they did so as allowed and
+    as the promise in the policy's ``card`` expected."""
+    said = kept.words()
+    expected: JSON | None = (card.get("promise") or {}).get("fallback")
+    more = expected is not None and kept.found(expected["low"], expected["high"]) == "more often"
+    if expected is not None and more:
+        said += f"; {kept.expected(expected['low'], expected['high'])}"
+    counts = {name: getattr(kept, name) for name in ("violations", "fallbacks", "fallback_episodes")}
+    return {**counts, "kept": not kept.broken and not more, "said": said}
 
 
 MOST_ENTRIES = 10_000  # a zip file with more entries is not accepted as a policy

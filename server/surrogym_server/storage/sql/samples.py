@@ -398,6 +398,7 @@ def _is_since(surrogate_id: int, counts: SampleCounts) -> sa.ColumnElement[bool]
 
 
 REPORT = "report_steps"
+OF_LIMITS = ("violations", "fallbacks", "fallback_episodes")  # columns of evaluations with limits
 
 
 BOUNDS: tuple[sa.BindParameter[int], sa.BindParameter[int]] = (sa.bindparam("first"), sa.bindparam("last"))
@@ -438,11 +439,22 @@ class Ledger:
         self._database = database
         self._counted = counts
 
-    def report(self, name: str, steps: int, *, key: str, episodes: int = 0, note: str = "") -> LedgerRecord:
+    def report(
+        self,
+        name: str,
+        steps: int,
+        *,
+        key: str,
+        episodes: int = 0,
+        note: str = "",
+        limits: Mapping[str, int] | None = None,
+    ) -> LedgerRecord:
         """Add ``steps`` real steps of an evaluation of ``episodes`` episodes, once for each key. Return the counts of
-        real steps by purpose. ``note`` is a text about the evaluation."""
-        body = fingerprint(steps, episodes, note)
-        fields = {"steps": steps, "episodes": episodes, "note": note}
+        real steps by purpose. ``note`` is a text about the evaluation, and ``limits`` says how the episodes kept
+        declared limits, by the columns ``OF_LIMITS``."""
+        kept = dict(limits or {})
+        body = fingerprint(steps, episodes, note, *([kept] if kept else []))
+        fields = {"steps": steps, "episodes": episodes, "note": note, **kept}
         with self._database.write() as connection:
             surrogate = hold(connection, name)
             if recall(connection, surrogate, REPORT, key, body) is None:
@@ -451,6 +463,14 @@ class Ledger:
                 append_event(connection, surrogate, "ledger", purpose="evaluation", **fields)
                 remember(connection, surrogate, REPORT, key, body, True)
             return self._read(connection, surrogate.id)
+
+    def limited(self, name: str) -> dict[str, int]:
+        """Return the sums of episodes, steps and ``OF_LIMITS`` of all reports with limits; empty if there is none."""
+        columns = [evaluations.c[column] for column in ("episodes", "steps", *OF_LIMITS)]
+        summed = sa.select(*(sa.func.sum(column) for column in columns)).where(evaluations.c.violations.is_not(None))
+        with self._database.read() as connection:
+            row = connection.execute(summed.where(evaluations.c.surrogate_id == find(connection, name))).one()
+        return {} if row[0] is None else {c.name: int(total) for c, total in zip(columns, row, strict=True)}
 
     def read(self, name: str) -> LedgerRecord:
         with self._database.read() as connection:

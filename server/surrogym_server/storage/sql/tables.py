@@ -289,6 +289,10 @@ evaluations = sa.Table(
     sa.Column("episodes", sa.BigInteger, nullable=False),
     sa.Column("note", sa.Text, nullable=False),
     sa.Column("created_at", sa.Double, nullable=False),
+    # how the episodes kept declared limits; NULL: without limits
+    sa.Column("violations", sa.BigInteger),
+    sa.Column("fallbacks", sa.BigInteger),
+    sa.Column("fallback_episodes", sa.BigInteger),
     sqlite_autoincrement=True,
 )
 

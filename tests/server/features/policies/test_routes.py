@@ -16,6 +16,8 @@ import httpx
 import numpy as np
 import pytest
 
+from support.controllers import network
+from support.limited import SPEC
 from support.server import ServerProcess
 from surrogym_client.errors import InvalidInput, ServerFailure, SpecConflict, UnknownPolicy
 from surrogym_client.transport import Api
@@ -24,7 +26,7 @@ from surrogym_server.features.policies import routes
 from surrogym_shared import wire
 from surrogym_shared.network import Network
 from surrogym_shared.spec import EnvironmentSpec
-from surrogym_shared.wire.policies import AddDrift
+from surrogym_shared.wire.policies import AddDrift, PolicyFallback
 
 PROMISE = wire.PolicyPromise(median=-150, low=-170, high=-130)
 
@@ -183,6 +185,36 @@ def test_a_policy_whose_latest_evaluation_missed_its_promised_return_is_not_trus
         "the latest evaluation broke the promise: a mean return of -180, where at least -170 was promised"
     )
     assert said[2].reason == "an audit passed"
+
+
+def test_a_policy_whose_latest_evaluation_did_not_keep_its_limits_is_not_trusted(api: Api, name: str, tmp_path: Path):
+    """Too many violations, or more fallbacks than promised. Other controllers judge nothing."""
+    api.create_surrogate(name, SPEC)
+    network(tmp_path, SPEC, (4,))
+    fallback = PolicyFallback(median=0.0, mean=0.01, low=0.0, high=0.1)
+    promised = card(SPEC, reason="an audit passed").model_copy(
+        update={"promise": PROMISE.model_copy(update={"fallback": fallback})}
+    )
+    api.policies.push(name, promised, [], "zip", (tmp_path / "policy.zip").read_bytes())
+
+    def judged(key: str, violations: int, fell_back: int, **fields: Any) -> wire.PolicyView:
+        counts = wire.LimitCounts(violations=violations, fallbacks=2 * fell_back, fallback_episodes=fell_back)
+        many: dict[str, Any] = {"returns": [-150.0] * 50, "lengths": [40] * 50, "limits": counts}
+        api.policies.evaluate(name, 1, episodes(key, **many, **fields))
+        return api.policies.list(name)[0]
+
+    kept, left, late = judged("kept", 0, 1), judged("left", 4, 4), judged("late", 0, 20)
+    other = judged("zero", 0, 50, controller="zero")
+    again = judged("again", 1, 0)
+    assert [one.trusted for one in (kept, left, late, other, again)] == [True, False, False, False, True]
+    assert left.reason == (
+        "the latest evaluation did not keep the limits: 4 of 50 episodes left a limit (95 % interval 2.2 to 19 %, "
+        "allowed 1 %); the fallback acted in 8 of 2000 steps, in 4 of 50 episodes"
+    )
+    assert late.reason.endswith("the fallback acted more often than expected: in 0 to 10 % of the episodes")
+    assert [one.limits and one.limits.violations for one in again.evaluations] == [0, 4, 0, 0, 1]
+    with pytest.raises(ValueError, match="possible in 50 episodes with 2000 steps, got 51 violations"):
+        judged("impossible", 51, 0)
 
 
 def test_reported_drift_makes_a_policy_untrusted_until_an_evaluation_confirms_its_return(
