@@ -4,6 +4,7 @@ Each run makes a design by resets alone, with the budget of its task, and no ear
 that it ends with (``surrogym train --algorithm planner``), in 100 real episodes, from which nothing is learned. The
 targets are those of the demo, without its second evaluation. Prints one line for each run, and appends it to
 ``resets.csv``. With ``--rounds`` there is a line for each round of the design, with the returns of ten real episodes.
+``decision_ms`` is the median processor time of the planner's decisions.
 
     python lab/benchmarks/bench_resets.py --seeds 9903 9904 9905 9906 9907 --tasks pendulum cartpole
     python lab/benchmarks/bench_resets.py --seeds 121 122 123 124 125 --tasks swingup --dirt encoder --budget 150
@@ -21,10 +22,12 @@ from __future__ import annotations
 
 import argparse
 import json
+import statistics
 import time
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from bench_dirt import KINDS
@@ -142,13 +145,21 @@ def _earned(
     name = MACHINES[task].name.format(seed=seed) if task in MACHINES else spec.environment or task
     judged = InProcess(dirt or "clean", seed, spec)
 
+    taken = []
+
+    def acting(observations: NDArray[np.floating]) -> NDArray[Any]:
+        begin = time.process_time()
+        actions = planner(observations)
+        taken.append(time.process_time() - begin)
+        return actions
+
     def episode() -> Episode:
         dirty = answering(judged) if dirt else None
         if isinstance(dirty, RolloutEnvironment):
             return RolloutEpisode(dirty)
         return open_episode(name, spec, partial(original.make, name, spec=spec))
 
-    real = evaluate(planner, episode, settings)
+    real = evaluate(acting, episode, settings)
     mean, least = float(real.returns.mean()), float(real.returns.min())
     success = None if real.success is None else float(np.mean(judged.ups if dirt else real.success))
     reached = None
@@ -159,6 +170,7 @@ def _earned(
         "least": round(least, 2),
         "success": success,
         "reached": reached,
+        "decision_ms": round(1e3 * statistics.median(taken), 2),
         "violations": sum(_is_beyond(task, trace.coordinates) for trace in real.traces),
         "fallback_episodes": None if real.limits is None else real.limits.fallback_episodes,
         "fallbacks": None if real.limits is None else real.limits.fallbacks,

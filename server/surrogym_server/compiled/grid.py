@@ -27,73 +27,40 @@ GRID = (types.float64[::1], types.float64[::1], types.int64[::1], types.boolean[
 
 
 @compiled
-def locate(low: Floats, cell: Floats, count: Ints, cyclic: Bools, q: Floats, ends: Ints, share: Floats) -> None:
+def locate(low: Floats, cell: Floats, count: Ints, cyclic: Bools, q: Floats, nodes: Ints, weights: Floats) -> None:
     """Find the cell of the grid that contains the state q (C,).
 
-    Write to ``ends`` (C, 2) what the cell's lower and upper end along each coordinate add to the number of a node, and
-    to ``share`` (C,) how far q is from the lower to the upper end, from 0 to 1.
+    Write the numbers of the nodes at its corners to ``nodes`` (2^C,), and their weights in a multilinear interpolation
+    to ``weights`` (2^C,). Bit c of a corner's index is 1 at the cell's upper end along coordinate c.
     """
-    stride = 1
+    nodes[0], weights[0] = 0, 1.0
+    stride, corners = 1, 1
     for c in range(len(low)):
         at = (q[c] - low[c]) / cell[c]
         if cyclic[c]:
             at -= count[c] * math.floor(at / count[c])
+            at = at if at > 0.0 else 0.0  # also if it is not a number
             lower = min(int(at), count[c] - 1)
             upper = lower + 1 if lower + 1 < count[c] else 0
         else:
-            at = min(max(at, 0.0), count[c] - 1.0)
+            at = min(at if at > 0.0 else 0.0, count[c] - 1.0)
             lower = min(int(at), count[c] - 2)
             upper = lower + 1
-        ends[c, 0], ends[c, 1] = lower * stride, upper * stride
-        share[c] = at - lower
+        share = at - lower
+        for k in range(corners):
+            nodes[corners + k], weights[corners + k] = nodes[k] + upper * stride, weights[k] * share
+            nodes[k], weights[k] = nodes[k] + lower * stride, weights[k] * (1.0 - share)
         stride *= count[c]
+        corners *= 2
 
 
 @compiled
-def corner(k: int, ends: Ints, share: Floats) -> tuple[int, float]:
-    """Return the node at corner number k of a cell that ``locate`` found, from 0 to 2^C - 1, and its weight in a
-    multilinear interpolation."""
-    node, weight = 0, 1.0
-    for c in range(len(share)):
-        upper = k >> c & 1
-        node += ends[c, upper]
-        weight *= share[c] if upper else 1.0 - share[c]
-    return node, weight
-
-
-@compiled
-def interpolated(values: Floats, ends: Ints, share: Floats) -> float:
+def interpolated(values: Floats, nodes: Ints, weights: Floats) -> float:
     """Return the multilinear interpolation of values (S,) in a cell that ``locate`` found."""
     total = 0.0
-    for k in range(1 << len(share)):
-        node, weight = corner(k, ends, share)
-        if weight > 0:
-            total += weight * values[node]
+    for k in range(len(nodes)):
+        total += weights[k] * values[nodes[k]]
     return total
-
-
-@compiled
-def action_value(
-    low: Floats,
-    cell: Floats,
-    count: Ints,
-    cyclic: Bools,
-    q_next: Singles,
-    reward: float,
-    discount: float,
-    values: Floats,
-    ends: Ints,
-    share: Floats,
-    q: Floats,
-) -> float:
-    """Return the reward of a step plus the discounted value of the state after it, ``q_next`` (C,), which is not a
-    number where the episode ended. ``ends`` (C, 2), ``share`` and ``q`` (C,) are overwritten."""
-    if np.isnan(q_next[0]):
-        return reward
-    for c in range(len(q)):
-        q[c] = q_next[c]
-    locate(low, cell, count, cyclic, q, ends, share)
-    return reward + discount * interpolated(values, ends, share)
 
 
 @entry(
@@ -131,7 +98,7 @@ def sweep(
         values: (S,) values, updated.
         best: (S,) index of the best action of each node; updated with ``all_actions``.
     """
-    ends, share, q = np.empty((len(low), 2), np.int64), np.empty(len(low)), np.empty(len(low))
+    nodes, weights, q = np.empty(1 << len(low), np.int64), np.empty(1 << len(low)), np.empty(len(low))
     change = 0.0
     for i in range(len(values)):
         s = i if upwards else len(values) - 1 - i
@@ -139,9 +106,13 @@ def sweep(
         for a in range(reward.shape[1]):
             if not all_actions and a != best[s]:
                 continue
-            value = action_value(
-                low, cell, count, cyclic, q_next[s, a], float(reward[s, a]), discount, values, ends, share, q
-            )
+            # Written out here and in ``choose``: a function of so many arrays is not inlined, and takes 3 times as long
+            value = float(reward[s, a])
+            if not np.isnan(q_next[s, a, 0]):
+                for c in range(len(q)):
+                    q[c] = q_next[s, a, c]
+                locate(low, cell, count, cyclic, q, nodes, weights)
+                value += discount * interpolated(values, nodes, weights)
             if value > top:
                 top, chosen = value, a
         change = max(change, abs(top - values[s]))
@@ -179,14 +150,17 @@ def choose(
             (a // L^(F - 1 - f)) % L of entry f.
         table: (S, F) actions, written; a discrete one is its number.
     """
-    ends, share, q = np.empty((len(low), 2), np.int64), np.empty(len(low)), np.empty(len(low))
+    nodes, weights, q = np.empty(1 << len(low), np.int64), np.empty(1 << len(low)), np.empty(len(low))
     entries, number = levels.shape
     of_action = np.empty(reward.shape[1])
     for s in range(len(values)):
         for a in range(len(of_action)):
-            of_action[a] = action_value(
-                low, cell, count, cyclic, q_next[s, a], float(reward[s, a]), discount, values, ends, share, q
-            )
+            of_action[a] = float(reward[s, a])
+            if not np.isnan(q_next[s, a, 0]):
+                for c in range(len(q)):
+                    q[c] = q_next[s, a, c]
+                locate(low, cell, count, cyclic, q, nodes, weights)
+                of_action[a] += discount * interpolated(values, nodes, weights)
         best, stride = int(np.argmax(of_action)), 1
         if entries == 0:
             table[s, 0] = best
@@ -210,8 +184,8 @@ def policy_action(
     table: Floats,
     choices: int,
     q: Floats,
-    ends: Ints,
-    share: Floats,
+    nodes: Ints,
+    weights: Floats,
     votes: Floats,
     u: Floats,
 ) -> None:
@@ -223,20 +197,17 @@ def policy_action(
         choices: number of discrete actions, of which the one with the largest weight is taken; 0 for continuous
             actions, which are interpolated.
         q: (C,) state.
-        ends, share, votes: arrays (C, 2), (C,) and (choices,) that are overwritten.
+        nodes, weights, votes: arrays (2^C,), (2^C,) and (choices,) that are overwritten.
         u: (F,) the action.
     """
-    locate(low, cell, count, cyclic, q, ends, share)
+    locate(low, cell, count, cyclic, q, nodes, weights)
     u[:] = 0.0
     votes[:] = 0.0
-    for k in range(1 << len(share)):
-        node, weight = corner(k, ends, share)
-        if weight == 0:
-            continue
+    for k in range(len(nodes)):
         if choices:
-            votes[int(table[node, 0])] += weight
+            votes[int(table[nodes[k], 0])] += weights[k]
         else:
             for f in range(len(u)):
-                u[f] += weight * table[node, f]
+                u[f] += weights[k] * table[nodes[k], f]
     if choices:
         u[0] = float(np.argmax(votes))

@@ -377,6 +377,11 @@ class PlannedActions(ABC):
         """Whether the model can plan. It can't without compiled steps, or if its prior model has a prior itself."""
 
     @abstractmethod
+    def for_planning(self) -> DynamicsModel:
+        """Return a model with nearly the same means, which are faster to compute. Its standard deviations have no
+        meaning."""
+
+    @abstractmethod
     def planned(
         self,
         policy: GridPolicy,

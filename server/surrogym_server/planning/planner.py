@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -67,7 +67,8 @@ def planner_of(
     model = with_set_points(model, tuple((set_points or {}).items()))
     inverse, able, steps = _requirements(model)
     pending = PendingActions.of(steps)
-    policy = solve(pending, model.terminal_reward, model.definition.time_limit, limits)
+    _, able, fewer = _requirements(able.for_planning())
+    policy = solve(replace(pending, steps=fewer), model.terminal_reward, model.definition.time_limit, limits)
     noise = {name: std for name, std in (sensor_noise or {}).items() if std > 0}
     state_filter = StateFilter.of(model, steps, noise) if noise else None
     return Planner(model.definition, inverse, able, policy, horizon, seed, pending, state_filter)

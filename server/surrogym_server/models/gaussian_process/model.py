@@ -17,6 +17,7 @@ from surrogym_server.environment.points import Points
 from surrogym_server.environment.samples import Samples, increments
 from surrogym_server.environment.step_rules import paid
 from surrogym_server.gp import covariance
+from surrogym_server.gp.thinning import thinned
 from surrogym_server.models.abilities import (
     ArraySteps,
     AtSamples,
@@ -253,6 +254,14 @@ class GaussianProcessModel(
     @property
     def plans(self) -> bool:
         return self._compiled is not None and (self.prior is None or self.prior.prior is None)
+
+    def for_planning(self) -> GaussianProcessModel:
+        outputs = [
+            output if output.posterior is None else replace(output, posterior=thinned(output.posterior))
+            for output in self.outputs
+        ]
+        prior = None if self.prior is None else self.prior.for_planning()
+        return replace(self, transitions=tuple(outputs[:-1]), reward=outputs[-1], prior=prior)
 
     def planned(
         self,

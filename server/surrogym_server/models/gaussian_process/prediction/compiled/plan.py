@@ -196,7 +196,7 @@ def plan(
     reward, std, over = np.empty(lanes), np.empty((lanes, outputs)), np.empty(lanes, np.bool_)
     running, total = np.empty(lanes, np.bool_), np.empty(lanes)
     plans, first, reached = np.empty((lanes, steps, entries)), np.empty((lanes, entries)), np.empty((lanes, size))
-    ends, share, votes = np.empty((len(low), 2), np.int64), np.empty(len(low)), np.empty(choices)
+    nodes, weights, votes = np.empty(1 << len(low), np.int64), np.empty(1 << len(low)), np.empty(choices)
     without, seen = np.empty((lanes, size)), np.empty((lanes, size))
     centre, highest = best.copy(), -np.inf
     for k in range(rounds):
@@ -239,7 +239,7 @@ def plan(
             if t == steps:
                 break
             for i in range(lanes):
-                policy_action(low, cell, count, cyclic, table, choices, seen[i], ends, share, votes, u[i])
+                policy_action(low, cell, count, cyclic, table, choices, seen[i], nodes, weights, votes, u[i])
                 for f in range(entries):
                     if choices and plans[i, t, f] >= 0:
                         u[i, f] = plans[i, t, f]
@@ -279,8 +279,8 @@ def plan(
             weight *= discount
         for i in range(lanes):
             if running[i]:
-                locate(low, cell, count, cyclic, seen[i], ends, share)
-                total[i] += weight * interpolated(values, ends, share)
+                locate(low, cell, count, cyclic, seen[i], nodes, weights)
+                total[i] += weight * interpolated(values, nodes, weights)
         order = np.argsort(-total)
         if total[order[0]] > highest:
             highest = total[order[0]]
