@@ -96,6 +96,26 @@ def test_compiled_steps_of_a_model_with_nonstationary_processes_equal_the_model(
     check_compiled(model, points, how)
 
 
+@pytest.fixture(scope="module")
+def beside(model) -> GaussianProcessModel:
+    """The model as the difference from a prior model of few samples."""
+    outputs = tuple(replace(output, size_with_prior=1.0) for output in model.transitions)
+    return replace(model, transitions=outputs, prior=gaussian_processes(REACTION, steps(12, 5)))
+
+
+@pytest.mark.parametrize("how", [how for how in WAYS if how != "in C"])
+def test_compiled_steps_of_nonstationary_processes_with_a_prior_equal_the_model(beside, points, how):
+    check_compiled(beside, points, how)
+
+
+def test_a_prior_model_adds_at_most_its_own_uncertainty_where_an_output_grows(beside, points):
+    hotter = (points[0] + torch.tensor([0.0, 3.0]), points[1])
+    own, known = (one.transition(*hotter, stds=True).std for one in (replace(beside, prior=None), beside.prior))
+    found = beside.transition(*hotter, stds=True).std
+    assert (found[:, 0] > own[:, 0]).all()
+    assert (found[:, 0].square() <= 1.1 * (own[:, 0].square() + known[:, 0].square())).all()
+
+
 def test_functions_drawn_from_nonstationary_processes_have_the_predicted_deviations(model, points):
     count = 2_000
     noise = torch.randn(count, model.path_size, generator=torch.Generator().manual_seed(1), dtype=torch.float64)

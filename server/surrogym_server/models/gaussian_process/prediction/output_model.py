@@ -85,12 +85,11 @@ class OutputModel:
 
     @property
     def function_variance(self) -> float:
-        """Variance of the output's function before any sample, in its unit squared: mean over the points of its
-        process; infinite for an output without a process."""
+        """Variance of the output's function before any sample, in its unit squared, where its amplitude is 1: mean over
+        the points of its process; infinite for an output without a process."""
         if self.posterior is None:
             return math.inf
-        x = self.posterior.x
-        return float(((self.scale * self.amplitude(x)).square() * variance(self.posterior.hyper, x)).mean())
+        return self.scale**2 * float(variance(self.posterior.hyper, self.posterior.x).mean())
 
     @property
     def noise_floor(self) -> float:

@@ -20,6 +20,8 @@ from surrogym_server.environment.features import Encoder, leading
 from surrogym_server.environment.observation_inverse import ObservationInverse
 from surrogym_server.environment.step_rules import clip, moved
 from surrogym_server.gp import Output
+from surrogym_server.models.abilities import PredictedSteps
+from surrogym_server.models.gaussian_process.prediction.lookahead import process_inputs
 from surrogym_server.models.gaussian_process.prediction.output_group import Grown, OutputGroup
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 from surrogym_server.models.gaussian_process.prediction.regions import Jump, jumped
@@ -74,7 +76,8 @@ class Predictor:
 
     def _doubt(self, prior: Predictor, q: Tensor, u: Tensor) -> Tensor:
         """Return by how much the standard deviations of the outputs (m, O) are larger because the prior model is not
-        certain either: sqrt(1 + sigma_p^2 / a^2), sigma_p its standard deviation and a^2 the ``doubted`` variance.
+        certain either: sqrt(1 + sigma_p^2 / a^2), sigma_p its standard deviation and a^2 the variance of the output's
+        function there before any sample.
 
         The process of an output has learned the difference from the prior's mean at the samples, so what the prior
         gets wrong is part of it, with an amplitude that grows with sigma_p. So samples narrow it as they do the rest.
@@ -83,12 +86,22 @@ class Predictor:
         assert known.std is not None
         assert known.reward_std is not None
         sigma = torch.cat([known.std, known.reward_std[:, None]], -1)
-        return (1 + sigma.square() / self.doubted).sqrt()
+        return (1 + (sigma / self.growth(q, u)).square() / self.doubted).sqrt()
+
+    def growth(self, q: Tensor, u: Tensor) -> Tensor:
+        """Return the amplitude (m, O) of each output that is added to the prior model's prediction, at q (m, C) and u
+        (m, F): 1 without rates. For an output that reads next values, present ones stand for them."""
+        grown = torch.ones(len(q), len(self.transitions) + 1, dtype=torch.float64, device=self.definition.device)
+        for column, output in enumerate((*self.transitions, self.reward)):
+            if output.feature_map.rates and output.size_with_prior is not None:
+                x = process_inputs(self.definition, output, PredictedSteps(q, u, q))
+                grown[:, column] = output.amplitude(x)
+        return grown
 
     @cached
     def doubted(self) -> Tensor:
-        """For each output (O,), the variance of its function before any sample; infinite if it does not use a
-        prior."""
+        """For each output (O,), the variance of its function before any sample where its amplitude is 1; infinite if it
+        does not use a prior."""
         outputs = (*self.transitions, self.reward)
         variances = [math.inf if output.size_with_prior is None else output.function_variance for output in outputs]
         return torch.tensor(variances, dtype=torch.float64, device=self.definition.device)

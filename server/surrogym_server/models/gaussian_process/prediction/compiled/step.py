@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Self
 
@@ -10,6 +11,7 @@ import numpy as np
 import torch
 from numba import types
 from numpy.typing import NDArray
+from torch import Tensor
 
 from surrogym_server.compiled.tables import Tables, TablesBuilder, matrix
 from surrogym_server.compiled.threads import side_by_side
@@ -405,6 +407,7 @@ class StepsOfModel(ArraySteps):
     uses: Floats
     doubted: Floats  # (O,) for each output, see ``Predictor.doubted``
     output_of_weight: Ints  # (W,) for each weight of a sampled function, see ``Predictor.output_of_weight``
+    growth: Callable[[Tensor, Tensor], Tensor]  # see ``Predictor.growth``
 
     @classmethod
     def of(cls, predictor: Predictor, ending: Region | None, prior: StepsOfModel | None) -> Self:
@@ -419,8 +422,10 @@ class StepsOfModel(ArraySteps):
         points = sum(group.serving.exponents.shape[1] for group in predictor._groups if group)
         outputs, tables = len(predictor.transitions) + 1, tables_of(predictor, ending)
         arrays = (predictor.uses_prior, predictor.doubted, predictor.output_of_weight)
-        of_prior = (array.cpu().numpy() for array in arrays)
-        return cls(predictor.definition, tables, outputs, regions, points, prior, *of_prior)
+        uses, doubted, owners = (array.cpu().numpy() for array in arrays)
+        return cls(
+            predictor.definition, tables, outputs, regions, points, prior, uses, doubted, owners, predictor.growth
+        )
 
     def __call__(
         self,
@@ -464,6 +469,7 @@ class StepsOfModel(ArraySteps):
         doubt: Floats | None = None
         if self.prior is not None and (stds or reward_std or len(noise) or len(paths)):
             sigma = self.prior._steps(q, u, None, None, None, True, True, NO_ROWS).std
+            sigma = sigma / self.growth(torch.from_numpy(q), torch.from_numpy(u)).numpy()
             doubt = np.sqrt(1 + sigma**2 / self.doubted)  # see ``Predictor._doubt``
             noise = noise * doubt[:, :-1] if len(noise) else noise
             weights = self.output_of_weight
