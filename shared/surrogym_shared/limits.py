@@ -14,8 +14,10 @@ from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydantic import ValidationError
 
 from surrogym_shared.checks import require, require_known, require_unique
+from surrogym_shared.faults import first_fault
 from surrogym_shared.spec import BoxAction, EnvironmentSpec, Term, limits
 from surrogym_shared.spec.safety import Limit, Limits, NamedFallback
 from surrogym_shared.terms import evaluate
@@ -338,7 +340,10 @@ def limit_of(spec: EnvironmentSpec, text: str) -> Limit:
     ranges = {c.name: limits(c.sampling) for c in spec.coordinates}
     low, high = np.sum([sorted(weight * end for end in ranges[name]) for name, weight in weights.items()], axis=0)
     margin, side = MARGIN * float(high - low), "high" if sides and sides["relation"] == "<=" else "low"
-    limit = Limit.model_validate({"name": text[:64], "term": Term.linear(**weights), side: value, "margin": margin})
+    try:
+        limit = Limit.model_validate({"name": text[:64], "term": Term.linear(**weights), side: value, "margin": margin})
+    except ValidationError as error:  # a number that is too large
+        raise ValueError(f"limit {text!r}: {first_fault(error, got=True)}") from error
     _check_term(spec, limit)
     require(
         low + margin < value < high - margin,

@@ -186,6 +186,8 @@ def test_a_limit_in_other_words_is_refused_with_the_coordinates(text: str) -> No
 def test_a_limit_where_nothing_was_learned_or_that_a_start_violates_is_refused() -> None:
     with pytest.raises(ValueError, match=r"limit 'x<=1.6': expected a number between -1.5 and 1.5, .* got 1.6"):
         limit_of(SPEC, "x<=1.6")
+    with pytest.raises(ValueError, match=r"limit 'x<=1e300': high: expected a number less than .*, got 1e\+300"):
+        limit_of(SPEC, "x<=1e300")
     with pytest.raises(
         ValueError, match=r"'x>=0': expected every start to be inside by at least 0.03, got .*'x': -0.1"
     ):
