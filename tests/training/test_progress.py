@@ -37,12 +37,12 @@ def test_the_estimated_remaining_time_follows_the_steps_per_second():
     """The first estimate was far too long: it took the time of compiling for that of the first steps."""
     estimate, compiling = ProgressEstimate(), 60.0
     assert estimate.words_of_time_left(100, 1_000, compiling + 1.0) == "", "no pace is known yet"
-    assert estimate.words_of_time_left(200, 1_000, compiling + 2.0) == ", about 8 s left"
-    assert estimate.words_of_time_left(200, 100_000, compiling + 2.0) == ", about 17 min left"
+    assert estimate.words_of_time_left(200, 1_000, compiling + 2.0) == "about 8 s left, "
+    assert estimate.words_of_time_left(200, 100_000, compiling + 2.0) == "about 17 min left, "
     assert estimate.words_of_time_left(1_000, 1_000, compiling + 10.0) == ""
 
 
 def test_no_remaining_time_is_estimated_before_the_first_step():
     estimate = ProgressEstimate()
     assert estimate.words_of_time_left(0, 400, 10.0) == estimate.words_of_time_left(0, 400, 20.0) == ""
-    assert estimate.words_of_time_left(100, 400, 30.0) == ", about 60 s left"
+    assert estimate.words_of_time_left(100, 400, 30.0) == "about 60 s left, "

@@ -181,7 +181,7 @@ class SurrogateRun:
                     real = self._api.surrogate(self._settings.task).ledger.total
                     steps, total = line["steps"], line["total_steps"]
                     left = estimate.words_of_time_left(steps, total, line["seconds"])
-                    update(estimate.share(steps, total), f"{words_of(line)}, {real} real steps{left}")
+                    update(estimate.share(steps, total), f"{left}{words_of(line)}, {real} real steps")
                 with suppress(subprocess.TimeoutExpired):
                     trainer.process.wait(LOOK_SECONDS)
             trainer.check()

@@ -246,7 +246,8 @@ class ProgressEstimate:
         """Return in words an estimate of how long a training of ``total`` virtual steps still takes.
 
         The pace is measured since the first call, because work before the first steps, such as compiling, happens only
-        once. So the first call gives no estimate, which is an empty text.
+        once. So the first call gives no estimate, which is an empty text. The estimate ends with a comma, because it
+        stands before other words, which a narrow terminal cuts off.
 
         Args:
             steps: virtual steps taken.
@@ -257,7 +258,7 @@ class ProgressEstimate:
         if steps <= before or seconds <= began or steps >= total:
             return ""
         left = (total - steps) * (seconds - began) / (steps - before)
-        return f", about {f'{left:.0f} s' if left < 90 else f'{left / 60:.0f} min'} left"
+        return f"about {f'{left:.0f} s' if left < 90 else f'{left / 60:.0f} min'} left, "
 
 
 def after(now: TrainProgress, done: int, total: int = 0) -> TrainProgress:

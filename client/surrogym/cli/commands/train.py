@@ -306,7 +306,7 @@ def _recording(path: Path | None, curve: list[CurvePoint], update: Update) -> It
             seconds = round(time.monotonic() - started, 3)
             left = estimate.words_of_time_left(now.steps, now.total_steps, seconds)
             share = estimate.share(now.steps, now.total_steps) if now.total_steps else None
-            update(share, f"{words_of(asdict(now))}{left}")
+            update(share, f"{left}{words_of(asdict(now))}")
             if now.total_steps:
                 curve.append(CurvePoint(steps=now.steps, imagined_return=now.imagined_return, seconds=seconds))
             if file is not None:
