@@ -121,8 +121,13 @@ def nearest(spec: EnvironmentSpec, coordinates: Array) -> tuple[Limit, float]:
 
 def words_of_fallbacks(expected: float, low: float, high: float) -> str:
     """Say in which share of the episodes of a policy the fallback is expected, with the interval of the share."""
-    interval = f"{100 * low:.2g} to {100 * high:.2g} %"
-    return f"the fallback is expected in {100 * expected:.2g} % of the episodes ({interval}), so no more leave a limit"
+    interval = f"{percent(low)} to {percent(high)} %"
+    return f"the fallback is expected in {percent(expected)} % of the episodes ({interval}), so no more leave a limit"
+
+
+def percent(share: float) -> str:
+    """Return a share as percent with two digits; 100 for the whole."""
+    return "100" if 100 * share >= 99.5 else f"{100 * share:.2g}"
 
 
 def left_too_often(left: int, episodes: int, share: float, level: float) -> bool:
@@ -232,8 +237,8 @@ class KeptEpisodes:
         """Describe in a sentence how the limits were kept."""
         low, high = self.interval()
         return (
-            f"{self.violations} of {self.episodes} episodes left a limit (95 % interval {100 * low:.2g} to "
-            f"{100 * high:.2g} %, allowed {100 * self.probability:g} %); the fallback acted in {self.fallbacks} of "
+            f"{self.violations} of {self.episodes} episodes left a limit (95 % interval {percent(low)} to "
+            f"{percent(high)} %, allowed {100 * self.probability:g} %); the fallback acted in {self.fallbacks} of "
             f"{self.steps} steps, in {self.fallback_episodes} of {self.episodes} episodes"
         )
 
@@ -249,13 +254,8 @@ class KeptEpisodes:
         """Compare the share of episodes with a fallback with its predicted interval from ``low`` to ``high``, in
         words."""
         found = self.found(low, high)
-        return (
-            f"the fallback acted {found} {'as' if found == 'as often' else 'than'} expected: in {_percent(low, high)}"
-        )
-
-
-def _percent(low: float, high: float) -> str:
-    return f"{100 * low:.2g} to {100 * high:.2g} % of the episodes"
+        than = "as" if found == "as often" else "than"
+        return f"the fallback acted {found} {than} expected: in {percent(low)} to {percent(high)} % of the episodes"
 
 
 def check_limits(spec: EnvironmentSpec) -> None:

@@ -78,7 +78,8 @@ def test_limits_count_as_broken_if_chance_does_not_explain_the_violations(
 def test_the_summary_of_limits_is_json_with_an_exact_interval() -> None:
     summary = json.loads(json.dumps(counted(0, 100).summary()))
     assert summary["interval"] == pytest.approx([0.0, 0.0362], abs=1e-4)
-    assert "0 of 100 episodes left a limit" in counted(0, 100).words()
+    assert "0 of 100 episodes left a limit (95 % interval 0 to 3.6 %" in counted(0, 100).words()
+    assert "2 of 2 episodes left a limit (95 % interval 16 to 100 %" in counted(2, 2).words()
 
 
 def test_an_evaluation_of_a_machine_ends_early_if_the_limits_are_left_more_often_than_allowed() -> None:
