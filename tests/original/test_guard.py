@@ -227,6 +227,19 @@ def test_the_safety_fallback_continues_after_an_error_in_one_of_its_steps(diary:
     assert diary.read_text().endswith("close\n")
 
 
+def test_a_safety_fallback_that_keeps_failing_asks_to_stop_the_machine_by_hand(
+    diary: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    faulty = keeping_limits(answering(Faulty(dict.fromkeys(range(4, 20), OSError("no byte came")))))
+    assert isinstance(faulty, GuardedRollouts)
+    pushed(faulty, 3)
+    said = "the fallback failed, so the machine may still move: stop it by hand: OSError: no byte came"
+    assert until(lambda: said in capsys.readouterr().err)
+    with pytest.raises(StepFailed, match=said):
+        faulty.act(RIGHT)
+    faulty.close()
+
+
 def test_the_safety_fallback_acts_after_a_coordinate_that_was_not_measured() -> None:
     class Blind(PatientCart):
         blind = False

@@ -33,6 +33,7 @@ from surrogym_sampler.original.protocol import (
 from surrogym_shared.limits import clipped_action, fallback_action, falls_back, is_near, margins, nearest, room, starts
 from surrogym_shared.spec import BoxAction, EnvironmentSpec
 from surrogym_shared.spec.safety import NamedFallback
+from surrogym_shared.terminal import say
 
 Program = Callable[[Array], ArrayLike]  # an action (F,) from coordinates (C,)
 
@@ -88,6 +89,7 @@ def called(program: Program, spec: EnvironmentSpec, coordinates: Array) -> Array
 
 
 MOST_STEPS = 200  # after this number of steps, the fallback controller stops, even if the machine still moves
+FAILED = "limits: the fallback failed, so the machine may still move: stop it by hand"
 MOST_ERRORS = 5  # after this number of errors of the environment in a row, the fallback controller stops
 STILL = 1e-3  # a machine rests if no coordinate changes by more than this share of its largest change in the episode
 
@@ -279,10 +281,13 @@ class Watchdog:
             moves = self._step(self._guard.fallback()) and not self._guard.at_rest
             self._errors = 0
             self.taken += 1
-        except RAISED:
+        except RAISED as error:
             self._errors += 1
             self._due += self._period
             moves = self._errors < MOST_ERRORS
+            if not moves:
+                self._fallen = f"{FAILED}: {sentence(error)}"
+                say(self._fallen)
         if not moves or self._steps >= MOST_STEPS or time.monotonic() >= self._end:
             self._due = None
 
