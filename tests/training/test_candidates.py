@@ -132,6 +132,14 @@ def test_a_training_that_is_cut_off_after_an_audit_leaves_the_best_policy(
     assert stopped.value.result.virtual_steps == 150
 
 
+def test_a_planner_by_default_is_made_anew_after_an_audit(port, tmp_path: Path, monkeypatch) -> None:
+    path, seen = tmp_path / "policy.zip", []
+    monkeypatch.setattr(audited, "train", lambda _, __, now, *___: seen.append(now) or trained(path, b"away", 0))
+    monkeypatch.setattr(Audited, "_chosen", TrainSettings("PLANNER"))
+    Audited(None, "line", port, path, TrainSettings())._train_on(trained(path, b"away", 0))  # type: ignore[arg-type]
+    assert seen[0].start_from is None, "it can't begin from a policy"
+
+
 def test_the_policy_of_each_training_after_an_audit_is_a_candidate_for_the_result(
     port, tmp_path: Path, monkeypatch
 ) -> None:

@@ -27,7 +27,7 @@ from surrogym_shared.port import SurrogatePort
 from surrogym_shared.spec import Design, EnvironmentSpec
 from surrogym_trainer.training import TrainProgress, TrainResult, TrainSettings, train
 from surrogym_trainer.training.closed_loop import VISIT_LANES, ClosedLoop, LoopSettings, shares
-from surrogym_trainer.training.search import search_for
+from surrogym_trainer.training.search import search_for, with_algorithm
 from surrogym_trainer.training.settings import DRAWS, chosen_for
 
 SETTINGS = TrainSettings(
@@ -143,9 +143,10 @@ def test_state_dependent_exploration_is_reproducible_and_differs_between_environ
     out, spec = tmp_path / "policy.zip", pendulum()
     port = LocalSurrogate(spec, learn(definition_from_spec(spec), random_steps(spec, 8, seed=0)).model)
     hyperparameters = {"n_steps": 16, "use_sde": True}
-    train(port, out, TrainSettings(total_steps=128, num_envs=8, hyperparameters=hyperparameters))
+    settings = with_algorithm(TrainSettings(total_steps=128, num_envs=8, hyperparameters=hyperparameters), spec)
+    train(port, out, settings)
     same = np.tile(np.float32([[1.0, 0.0, 0.5]]), (VISIT_LANES, 1))
-    first, again = (search_for(TrainSettings()).explorer(out, "PPO", VISIT_LANES) for _ in range(2))
+    first, again = (search_for(settings).explorer(out, "PPO", VISIT_LANES) for _ in range(2))
     actions = np.asarray(first(same))
     assert len(np.unique(actions)) > VISIT_LANES / 2  # the rest are clipped to the bounds
     assert np.array_equal(actions, first(same)), "until the next visit"

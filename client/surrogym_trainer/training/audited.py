@@ -180,7 +180,7 @@ class AuditedTraining:
     def _train_on(self, result: TrainResult) -> TrainResult:
         """Train further, from the current policy, in the model that includes the audit's samples."""
         now = self._chosen
-        if search_for(self.settings).resumable:
+        if search_for(now).resumable:
             now = replace(now, start_from=self.out, trust_policy=False)
         try:
             later = train(self.port, self.out, now, self._shifted(result.virtual_steps))

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
@@ -63,24 +64,23 @@ class Candidates:
         Raises:
             TrainingInterrupted: Ctrl-C was pressed; it has the best of the policies that were compared by then.
         """
-        others = [(result, content) for result, content in self._kept if content != Path(latest.path).read_bytes()]
+        path = Path(latest.path)
+        current = path.read_bytes()
+        others = [(result, content) for result, content in self._kept if content != current]
         if not others:
             return latest
-        path, current = Path(latest.path), Path(latest.path).read_bytes()
         found, kept, gain, interrupted = latest, current, 0.0, False
         try:
-            earned = self._earned(port, latest, settings)
+            earned = self._earned(port, latest, current, settings)
             for result, content in others:
-                path.write_bytes(content)
-                more = self._earned(port, result, settings) - earned
+                more = self._earned(port, result, content, settings) - earned
                 error = float(more.std(ddof=1)) / np.sqrt(len(more))
                 if float(more.mean()) > max(gain, CLEARLY * error):
                     found, kept, gain = result, content, float(more.mean())
         except KeyboardInterrupt:
             interrupted = True
-        finally:
-            path.write_bytes(kept)
         if found is not latest:
+            path.write_bytes(kept)
             took = {name: getattr(latest, name) for name in ("virtual_steps", "seconds", "lost_episodes")}
             found = replace(found, **took, visited_confidence=latest.visited_confidence)
         if interrupted:
@@ -97,8 +97,12 @@ class Candidates:
                 return again
         return TrainingInterrupted(cut_off)
 
-    def _earned(self, port: SurrogatePort, result: TrainResult, settings: TrainSettings) -> np.ndarray:
-        predict = self.load(Path(result.path), result.algorithm)
+    def _earned(self, port: SurrogatePort, result: TrainResult, content: bytes, settings: TrainSettings) -> np.ndarray:
+        """Return the returns (``EPISODES``,) of a policy, of which ``content`` is the file's content."""
+        with TemporaryDirectory() as folder:
+            file = Path(folder, Path(result.path).name)
+            file.write_bytes(content)
+            predict = self.load(file, result.algorithm)
         return imagined_returns(port, predict, EPISODES, settings.seed, **settings.judging)
 
 
@@ -325,7 +329,7 @@ def visit(
         The number of virtual steps that this took, and the confidence index over the visited states.
     """
     spec = port.spec()
-    act = search_for(settings).explorer(learned.path, learned.algorithm, VISIT_LANES)
+    act = search_for(with_algorithm(settings, spec)).explorer(learned.path, learned.algorithm, VISIT_LANES)
     options = {**settings.session, "occupancy": True, "seed": settings.seed}
     lanes = Lanes(port, session_request(VISIT_LANES, "same_step", options))
     steps = min(spec.time_limit or VISIT_STEPS, VISIT_STEPS)
