@@ -149,11 +149,6 @@ class Learner:
         moments, constants = (self._first, self._second), (self._updates, *astuple(objective), rate)
         self._update(self.parameters, *moments, *self._fixed, *rows, *constants)
 
-    def limit_noise(self, logarithms: Array, share: float) -> None:
-        """Lower the standard deviations of continuous actions to at most ``share`` times given standard deviations,
-        whose ``logarithms`` (F,) are passed."""
-        np.minimum(self.further, logarithms + np.float32(np.log(share)), out=self.further)
-
     def take_up(self, learned: LearnedNetwork) -> None:
         """Take over parameters, statistics and Adam's moments of another learner of the same network."""
         self.mean, self.deviation = learned.policy.mean.astype(np.float32), learned.policy.deviation.astype(np.float32)

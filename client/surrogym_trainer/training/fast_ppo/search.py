@@ -18,6 +18,7 @@ from surrogym_sampler.original.protocol import LONGEST_EPISODE
 from surrogym_shared.network import Network
 from surrogym_shared.spec import EnvironmentSpec
 from surrogym_trainer.evaluation.imagined import DECLARED, observation_statistics
+from surrogym_trainer.policies.card import UnusablePolicy
 from surrogym_trainer.policies.defaults import HIDDEN, LANES, LEARNING_RATE, WIDER, decaying
 from surrogym_trainer.policies.predict import Predict
 from surrogym_trainer.training.checks import Checks, Returns, checked
@@ -31,7 +32,7 @@ from surrogym_trainer.training.fast_ppo.learner import (
     restored,
 )
 from surrogym_trainer.training.fast_ppo.rollouts import Collector
-from surrogym_trainer.training.search import REFERENCE, SEARCHES, Found, PolicySearch, SearchTask
+from surrogym_trainer.training.search import Found, PolicySearch, SearchTask
 from surrogym_trainer.training.settings import CHECKS, TrainProgress, TrainSettings, even_batch, suggested_gamma
 
 RANGES = {  # Allowed range of each setting; settings with integer bounds must be integers.
@@ -49,16 +50,13 @@ RANGES = {  # Allowed range of each setting; settings with integer bounds must b
 # The suggested number of virtual steps is divided into this number of training cycles in the stage ``learn``.
 CYCLES = 3
 LEARNING = 2  # the stage ``learn`` takes at most this multiple of the suggested number of steps
-REFINING = 1 / 2  # the stage ``refine`` takes this share of the steps of a cycle of the stage ``learn``
+REFINING = 1 / 4  # the stage ``refine`` takes this share of the steps of a cycle of the stage ``learn``
 PATIENT_ROLLOUTS = 32  # a network that has learned nothing is replaced after this number of rollouts at the earliest
 HELD = 16  # if actions are continuous, the noise of every second new network stays the same for this number of steps
 FINE = 0.1  # learning rate in the stage ``refine``, as a share of that in the stage ``learn``
-# standard deviation of the actions' noise at the end of the stage ``refine``, as a share of that at its beginning
-QUIET = 0.1
 # the stage ``refine`` first collects observations, without learning, in at most this share of the suggested steps
 LOOKS = 1 / 8
-# before the actor learns in the stage ``refine``, only the critic learns in this number of rollouts
-CRITIC_ROLLOUTS = 8
+CRITIC_ROLLOUTS = 8  # then only the critic learns, in this number of rollouts
 STAGE_SEED = 2_000_003  # the seed of the actions' noise grows by this number from one stage to the next
 
 
@@ -105,14 +103,12 @@ class FastPpo(PolicySearch):
     def search(self, task: SearchTask) -> Found:
         start = task.settings.start_from
         if start is not None and not Network.is_at(start):
-            return _reference().search(task)  # only Stable-Baselines3 can continue to train its own policies
+            raise UnusablePolicy(f"fastppo can't continue {start}, which it has not saved: leave --algorithm out")
         compiled_update()  # loads the linear algebra library now, so that its threads are limited as well
         with threadpool_limits(limits=task.settings.threads):
             return _Training(self, task).run()
 
-    def explorer(self, policy: Path, algorithm: str, num_envs: int) -> Predict:
-        if not Network.is_at(policy):
-            return _reference().explorer(policy, algorithm, num_envs)
+    def explorer(self, policy: Path, algorithm: str, num_envs: int) -> Predict:  # noqa: ARG002
         return noisy(policy)
 
 
@@ -134,6 +130,11 @@ class _Training:
         self._objective = Objective(search.clip_range, search.vf_coef, search.max_grad_norm)
         self._planned = max(task.steps // self._rollout, 1)  # number of planned rollouts
         self._cycle = max(self._planned // CYCLES, 1) if task.prolong else self._planned
+        # numbers of rollouts of the stage ``refine``: those that only collect observations, of an episode in each lane,
+        # and those of its cycle
+        episode = -(-(self._spec.time_limit or LONGEST_EPISODE) // search.n_steps)
+        self._looks = max(min(episode, int(LOOKS * self._planned)), 1)
+        self._refining = max(int(REFINING * self._cycle), 1)
         # number of rollouts left before the stage ``refine``
         self._left = self._planned * (LEARNING if task.prolong else 1)
         saved = self._imagined(self._saved) if settings.anew and self._saved is not None else None
@@ -165,17 +166,6 @@ class _Training:
         """Number of rollouts after which a network that has learned nothing is replaced."""
         return max(self._planned // CYCLES, PATIENT_ROLLOUTS)
 
-    @property
-    def _looks(self) -> int:
-        """Number of rollouts with which the stage ``refine`` begins, in which it only collects observations."""
-        episode = -(-(self._spec.time_limit or LONGEST_EPISODE) // self._search.n_steps)
-        return max(min(episode, int(LOOKS * self._planned)), 1)
-
-    @property
-    def _refining(self) -> int:
-        """Number of rollouts of the cycle of the stage ``refine``."""
-        return max(int(REFINING * self._cycle), 1)
-
     def _learn(self, learner: Learner, hold: int) -> None:
         """Train a network in cycles, as long as it gains; its noise stays the same for ``hold`` steps."""
         own, stage = 0, learn(self._task)
@@ -191,16 +181,15 @@ class _Training:
         assert self._kept is not None
         learner, stage = self._made(), refine(self._task)
         learner.take_up(self._kept)
-        looks, cycle = self._looks, self._refining
         rate = LEARNING_RATE if self._search.learning_rate is None else self._search.learning_rate
         with self._open(stage):
-            self._expect(looks + CRITIC_ROLLOUTS + cycle)
-            seen = [self._collect(learner).observations for _ in range(looks)]
+            self._expect(self._looks + CRITIC_ROLLOUTS + self._refining)
+            seen = [self._collect(learner).observations for _ in range(self._looks)]
             learner.standardise_anew(np.concatenate(seen), self._rng)
             for _ in range(CRITIC_ROLLOUTS):
                 rows = self._collect(learner)
                 self._update(learner, replace(rows, advantages=np.zeros_like(rows.advantages)), rate)
-            self._run_cycle(stage, learner, 0, cycle)
+            self._run_cycle(stage, learner, 0, self._refining)
 
     def _run_cycle(self, stage: Stage, learner: Learner, own: int, rollouts: int, hold: int = 1) -> tuple[int, bool]:
         """Train a network while its learning rate falls. Returns the number of rollouts, and whether another cycle may
@@ -214,7 +203,7 @@ class _Training:
             rollouts: rollouts of this cycle.
             hold: number of steps for which the noise of its actions stays the same.
         """
-        fine, noise, before = stage.name == "refine", learner.further.copy(), self._checks.returns_of_best
+        fine, before = stage.name == "refine", self._checks.returns_of_best
         further = self._looks + CRITIC_ROLLOUTS + self._refining if self._task.prolong and not fine else 0
         self._expect(rollouts + further)
         for number in range(1, rollouts + 1):
@@ -224,8 +213,6 @@ class _Training:
             remaining, rate = 1 - (own + number) / (own + rollouts), self._search.learning_rate
             rate = decaying(remaining) if rate is None else rate
             self._update(learner, rows, FINE * rate if fine else rate)
-            if fine:
-                learner.limit_noise(noise, 1 - (1 - QUIET) * number / rollouts)
             if number == rollouts // 2 and not fine:
                 self._check(learner)
                 before = self._checks.returns_of_best
@@ -339,15 +326,6 @@ def units_of(spec: EnvironmentSpec) -> tuple[int, ...]:
 
 def _saved(learner: Learner) -> LearnedNetwork:
     return LearnedNetwork(learner.policy(), learner.state())
-
-
-def _reference() -> PolicySearch:
-    """Return the ``PPO`` search of Stable-Baselines3.
-
-    Raises:
-        ModuleNotFoundError: Stable-Baselines3 is not installed.
-    """
-    return SEARCHES.get(REFERENCE)()
 
 
 SHORTER = 5  # in the stage ``learn``, an episode is shorter than the time limit by this factor
