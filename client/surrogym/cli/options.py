@@ -28,7 +28,7 @@ SHOWN = (
 )
 NAMES = (  # forms of an environment's name, for the help of every command that opens an environment
     "a Gymnasium id, package:Id-v0, dm_control:DOMAIN-TASK, pcgym:MODEL, pcgym:FILE.json, fmu:PLANT.fmu, "
-    "mujoco:FILE.xml or package.module:factory"
+    "mujoco:FILE.xml, exec:COMMAND or package.module:factory"
 )
 QUICK = 1.0  # seconds to wait for a server in the first attempt, because it may not be running
 
