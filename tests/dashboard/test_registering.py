@@ -7,15 +7,18 @@ import re
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import pytest
 from playwright.sync_api import Page, expect
 
 from support import limited, reactor
 from support.browser import serious
+from support.controllers import network
 from support.server import ServerProcess
 from surrogym_client.transport import Api
 from surrogym_sampler.original.classic import pendulum
+from surrogym_shared import wire
 from surrogym_shared.wire import NewSample
 
 Open = Callable[..., Page]
@@ -53,7 +56,7 @@ def test_a_drafted_specification_can_be_reviewed_and_registered_on_the_dashboard
 
 
 def test_the_dashboard_shows_declared_limits_and_counts_real_steps_beyond_them(
-    url: str, open_page: Open, complaints: list[str]
+    url: str, open_page: Open, complaints: list[str], tmp_path: Path
 ):
     page = open_page(f"{url}/#/register")
     page.get_by_label("or paste its text").fill(limited.SPEC.model_dump_json())
@@ -77,6 +80,18 @@ def test_the_dashboard_shows_declared_limits_and_counts_real_steps_beyond_them(
         expect(page.locator("#ledger")).to_contain_text("limit rail: 1 of 2 real steps beyond it, least room -0.16")
         expect(page.locator("#ledger")).to_contain_text("the fallback was due after 2 of 2 real steps")
         assert api.limits("limited")[0] in page.locator("#ledger").text_content()
+        counts = wire.LimitCounts(violations=2, fallbacks=9, fallback_episodes=4)
+        api.report_steps("limited", 400, episodes=10, limits=counts)
+        expect(page.locator("#ledger")).to_contain_text("evaluations: 2 of 10 episodes left a limit")
+        file = network(tmp_path, limited.SPEC, (4,)).read_bytes()
+        api.policies.push("limited", wire.PushedCard(), [], "zip", file)
+        episodes: dict[str, Any] = {"returns": [1.0] * 10, "lengths": [40] * 10, "first_seed": 0, "limits": counts}
+        api.policies.evaluate("limited", 1, wire.AddEvaluation(**episodes, idempotency_key="a"))
+        summary = page.locator("#policies summary").first
+        expect(summary).to_contain_text(
+            "Limits: 2 of 10 episodes left a limit (95 % interval 2.5 to 56 %, allowed 1 %)"
+        )
+        expect(summary).to_contain_text("Not trusted: the latest evaluation did not keep the limits")
         api.delete_surrogate("limited")
     assert complaints == []
 
