@@ -3,9 +3,8 @@
     python lab/benchmarks/rail_bound.py --first-seed 10000 --episodes 10
 
 Each force is chosen by the cross-entropy method on rollouts of the exact equations: without a limit, with a cost of
-leaving the rail, with the guard, and with the guard and a cost of each step in which its fallback acts. Each start has
-several horizons, of which the best return counts. Prints the mean return, the largest position, and the share of steps
-in which the fallback acted. A better search may find more.
+leaving the rail, and with the guard. Each start has several horizons, of which the best return counts. Prints the mean
+return, the largest position, and the share of steps in which the fallback acted. A better search may find more.
 """
 
 from __future__ import annotations
@@ -45,25 +44,25 @@ def derivative(q: Tensor, u: Tensor) -> Tensor:
     return torch.stack([v, acceleration, omega, angular], -1)
 
 
-def rolled(start: Tensor, before: Tensor, forces: Tensor, *, guarded: bool) -> tuple[Tensor, Tensor]:
-    """States (T + 1, N, 4) under forces (T, N) from a start (4,), one step after the state ``before`` (4,), and the
-    number (N,) of steps in which the fallback acts in place of a force if the guard is on."""
+def rolled(start: Tensor, before: Tensor, forces: Tensor, *, guarded: bool) -> Tensor:
+    """States (T + 1, N, 4) under forces (T, N) from a start (4,) after the state ``before`` (4,). The fallback
+    acts in place of a force near the limit if the guard is on."""
     many, h = forces.shape[1], STEP_SECONDS / PARTS
-    path, fallbacks, earlier = [start.expand(many, 4)], torch.zeros(many), before.expand(many, 4) @ TERM
+    path, earlier = [start.expand(many, 4)], before.expand(many, 4) @ TERM
     for u in forces:
         q = path[-1]
         if guarded:
             now = q @ TERM
             near = torch.maximum(now.abs(), (2 * now - earlier).abs()) > RAIL - MARGIN
             u = torch.where(near, (q @ FALLBACK).clamp(-MAX_FORCE, MAX_FORCE), u)
-            fallbacks, earlier = fallbacks + near, now
+            earlier = now
         for _ in range(PARTS):
             k1 = derivative(q, u)
             k2 = derivative(q + h / 2 * k1, u)
             k3 = derivative(q + h / 2 * k2, u)
             q = q + h / 6 * (k1 + 2 * k2 + 2 * k3 + derivative(q + h * k3, u))
         path.append(q)
-    return torch.stack(path), fallbacks
+    return torch.stack(path)
 
 
 def earned(path: Tensor) -> Tensor:
@@ -73,20 +72,15 @@ def earned(path: Tensor) -> Tensor:
     return (-(across**2 + below**2) / (2 * WIDTH["smooth"] ** 2)).exp().sum(0)
 
 
-# Whether the guard is on, and the cost of a metre beyond the rail and of a step with the fallback.
-ROWS = {
-    "no limit": (False, 0.0, 0.0),
-    "rail": (False, 50.0, 0.0),
-    "guard": (True, 0.0, 0.0),
-    "no fallback": (True, 0.0, 1.0),
-}
+# Whether the guard is on, and the cost of each metre beyond the rail.
+ROWS = {"no limit": (False, 0.0), "rail": (False, 50.0), "guard": (True, 0.0)}
 
 
 class Search:
     """Chooses each force by the cross-entropy method on rollouts of ``horizon`` steps with the exact equations."""
 
     def __init__(self, row: str, horizon: int) -> None:
-        self.horizon, (self.guarded, self.beyond, self.fallback) = horizon, ROWS[row]
+        self.horizon, (self.guarded, self.beyond) = horizon, ROWS[row]
         self.mean, self.drawn = torch.zeros(horizon, dtype=torch.float64), torch.Generator()
         self.drawn.manual_seed(0)
 
@@ -99,9 +93,9 @@ class Search:
                 noise[step] = COLOUR * noise[step - 1] + (1 - COLOUR**2) ** 0.5 * noise[step]
             noise[:, 0] = 0.0
             forces = (mean[:, None] + std[:, None] * noise).clamp(-MAX_FORCE, MAX_FORCE)
-            path, fallbacks = rolled(state, before, forces, guarded=self.guarded)
+            path = rolled(state, before, forces, guarded=self.guarded)
             beyond = (path[..., 0].abs() - RAIL).relu().sum(0)
-            value = earned(path) - self.beyond * beyond - self.fallback * fallbacks
+            value = earned(path) - self.beyond * beyond
             best = forces[:, value.topk(ELITE).indices]
             mean, std = best.mean(1), best.std(1)
         mean = best[:, 0]
