@@ -16,8 +16,9 @@ are:
 
 A row has the design's phase and real steps, the largest error of a step (of the standard deviation of the changes,
 over 300 states drawn from the sampling range), and with ``--policy`` the mean real return of 50 episodes of a policy
-that was trained in the model, and the share of them that succeed. ``--without`` names a parameter that the simulator
-lacks: it is 0 there. Rows are kept in ``--out``/priors.csv, so that the same command goes on after Ctrl-C.
+that was trained in the model, the share of them that succeed, and the policy's promise. ``--without`` names a
+parameter that the simulator lacks: it is 0 there. Rows are kept in ``--out``/priors.csv, so that the same command
+goes on after Ctrl-C.
 """
 
 from __future__ import annotations
@@ -49,6 +50,7 @@ from surrogym_server.environment.actions import model_actions
 from surrogym_server.local import LocalSurrogate
 from surrogym_shared.spec import BoxAction, EnvironmentSpec
 from surrogym_trainer.evaluation.evaluator import EvaluationSettings, evaluate
+from surrogym_trainer.evaluation.promise import promise_of
 from surrogym_trainer.policies import load_policy
 from surrogym_trainer.training import TrainSettings, train
 
@@ -107,6 +109,8 @@ class Row:
     parameters: int  # calibrated
     value: float  # mean real return of the policy; nan without --policy
     success: float  # share of its episodes that succeed; nan without --policy, or if success is not declared
+    low: float  # its promise, the interval in which the model expects its mean real return; nan for a planner
+    high: float
 
 
 class Turned:
@@ -185,7 +189,7 @@ def run(
         sum(one.startswith("prior + ") for one in model.model.structures),
         sum(one.low <= truth[one.name] <= one.high for one in found),
         len(found),
-        *(earned(model, plant, seed, policy) if policy else (float("nan"), float("nan"))),
+        *(earned(model, plant, seed, policy) if policy else [float("nan")] * 4),
     )
 
 
@@ -244,15 +248,18 @@ def _drawn(sampling: Any, rng: np.random.Generator) -> Any:
     return rng.uniform(sampling.low, sampling.high, TESTS)
 
 
-def earned(model: LocalSurrogate, plant: Callable[[], Any], seed: int, by: str) -> tuple[float, float]:
-    """Mean real return of a policy that was trained in the model, or of a planner on it (``by``), and the share of its
-    episodes that succeed."""
+def earned(model: LocalSurrogate, plant: Callable[[], Any], seed: int, by: str) -> tuple[float, float, float, float]:
+    """Mean real return of a policy that was trained in the model, or of a planner on it (``by``), the share of its
+    episodes that succeed, and both ends of its promise before any audit."""
     with TemporaryDirectory() as folder:
         path = Path(folder) / "policy.zip"
         train(model, path, TrainSettings(by, seed=seed))
         predict = load_policy(path, by)
     found = evaluate(predict, lambda: SteppedEpisode(plant()), EvaluationSettings(50, 10_000))
-    return float(np.mean(found.returns)), float("nan") if found.success_rate is None else found.success_rate
+    success = float("nan") if found.success_rate is None else found.success_rate
+    promise = promise_of(model, predict, seed) if by == SEARCH else None  # a planner's takes too long here
+    ends = (float("nan"), float("nan")) if promise is None else (promise.low, promise.high)
+    return float(np.mean(found.returns)), success, *ends
 
 
 def _options() -> argparse.Namespace:
