@@ -1,5 +1,6 @@
 """What a query would do to the deviations is what it does, and is known before its answer."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +14,7 @@ from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.features import encode
 from surrogym_server.environment.points import Points
 from surrogym_server.models.gaussian_process.model import GaussianProcessModel
+from surrogym_server.models.gaussian_process.prediction.lookahead import _log_determinants
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 from surrogym_server.sampling.confidence import stds
 from surrogym_server.sampling.latin_hypercube import random_points
@@ -94,3 +96,13 @@ def test_the_predicted_variance_of_a_reward_after_the_step_uses_the_predicted_ne
     outlook = outlook_of(model, candidates, candidates[NOTHING], candidates[NOTHING])
     expected = stds(model, candidates.q, candidates.u)[:, -1]
     torch.testing.assert_close(outlook[-1].std, expected, rtol=1e-6, atol=1e-9)
+
+
+def test_information_along_a_path_survives_rounding_errors_and_values_that_are_not_finite():
+    covariance, weight = torch.eye(2, dtype=torch.float64).repeat(4, 1, 1), torch.ones(4, 2, dtype=torch.float64)
+    covariance[1, 0, 0], covariance[2, 1, 1], covariance[3] = -1e-9, torch.nan, torch.nan
+    weight[1] = 1e5
+    information = _log_determinants(covariance, weight)
+    torch.testing.assert_close(information[0], torch.tensor([0.5, 1.0], dtype=torch.float64) * math.log(2))
+    assert bool((information[:, 1:] >= information[:, :1] - 1e-9).all())
+    assert bool((information >= -1e-9).all())

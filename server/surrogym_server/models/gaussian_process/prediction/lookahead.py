@@ -168,5 +168,11 @@ def _log_determinants(covariance: Tensor, weight: Tensor) -> Tensor:
         weight: diagonal of the diagonal matrix W of each path, (b, T).
     """
     one = torch.eye(weight.shape[1], dtype=weight.dtype)
-    factor: Tensor = torch.linalg.cholesky(one + weight[:, :, None] * covariance * weight[:, None, :])
-    return factor.diagonal(dim1=-2, dim2=-1).log().cumsum(-1)
+    matrix = one + weight[:, :, None] * covariance * weight[:, None, :]
+    factor, failed = torch.linalg.cholesky_ex(matrix)
+    if bool((wrong := failed > 0).any()):  # large weights scale up rounding errors, or a path is not finite
+        finite = matrix[wrong].nan_to_num(nan=1.0, posinf=1.0, neginf=1.0)
+        lacking = (1 - torch.linalg.eigvalsh(finite)[:, :1, None]).clamp_min(0.0)
+        factor[wrong] = torch.linalg.cholesky(finite + lacking * one)
+    gained: Tensor = factor.diagonal(dim1=-2, dim2=-1).log().cumsum(-1)
+    return gained
