@@ -34,7 +34,7 @@ EVIDENCE = 3.0
 STARTS = ((0.0, 0.5, -2.0), (-2.0, 0.5, 0.0))
 BOUNDS = ((-4.0, 5.0), (0.0, 3.0), (-6.0, 3.0))
 NOISE_ALONE = ((-4.0, 0.5, 0.0), ((-4.0, -4.0), (0.5, 0.5), (-6.0, 3.0)))  # a start and bounds without a process
-FEWEST_LEFT = 2  # with fewer steps beyond the number of parameters, all errors count as shared
+FEWEST_LEFT = 8  # with fewer steps beyond the number of parameters, all errors count as shared
 MODES, DEVIATIONS = np.array([0.0, 0.5, -2.0]), np.array([2.0, 1.0, 2.0])
 
 
