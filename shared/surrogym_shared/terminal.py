@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from datetime import timedelta
 from typing import Any
 
 import typer
@@ -119,15 +120,30 @@ def progress(title: str, *, quiet: bool = False) -> Iterator[Update]:
 @contextmanager
 def _bar(title: str) -> Iterator[Update]:
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+    from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn
+    from rich.table import Column
+    from rich.text import Text
 
+    class Words(ProgressColumn):
+        """What is done. Of the columns, a narrow terminal cuts off only this one, which may wrap as far as it knows."""
+
+        def render(self, task: Task) -> Text:
+            return Text(task.fields["words"], no_wrap=True, overflow="ellipsis")
+
+    class Elapsed(ProgressColumn):
+        """The duration so far, which goes on when the bar is full, because an audit may follow."""
+
+        def render(self, task: Task) -> Text:
+            return Text(str(timedelta(seconds=int(task.elapsed or 0))), style="progress.elapsed")
+
+    console, whole = Console(stderr=True), Column(no_wrap=True)
     parts = (
         TextColumn("{task.description:<10}"),
-        BarColumn(24),
-        TextColumn("{task.fields[words]}"),
-        TimeElapsedColumn(),
+        BarColumn(min(24, console.width // 4), table_column=whole),
+        Words(Column()),
+        Elapsed(whole),
     )
-    with Progress(*parts, console=Console(stderr=True)) as bar:
+    with Progress(*parts, console=console) as bar:
         task = bar.add_task(title, total=1.0, words="")
         yield lambda share, words: bar.update(task, completed=share, words=words)
 

@@ -28,3 +28,11 @@ def test_writing_a_policy_description_replaces_an_earlier_one(tmp_path: Path) ->
 def test_a_folder_is_refused_as_the_file_of_a_policy(tmp_path: Path) -> None:
     with pytest.raises(UnusablePolicy, match=r"expected a file for the policy, got the folder .*: add a file name"):
         require_place(tmp_path)
+
+
+def test_a_place_where_no_file_can_be_created_is_refused_before_a_training_is_lost(tmp_path: Path) -> None:
+    (tmp_path / "log.csv").touch()
+    with pytest.raises(UnusablePolicy, match=r"got .*x\.zip: no file can be created in .*log\.csv \(Not a directory\)"):
+        require_place(tmp_path / "log.csv" / "x.zip")
+    require_place(tmp_path / "new" / "folder" / "x.zip")
+    assert [path.name for path in tmp_path.iterdir()] == ["log.csv"]

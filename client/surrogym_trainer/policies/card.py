@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -118,10 +119,19 @@ def require_place(policy: Path) -> None:
     a specification.
 
     Raises:
-        UnusablePolicy: the file is a folder, or a JSON file with the card's name exists and is not a card.
+        UnusablePolicy: the file is a folder, no file can be created where it is to be, or a JSON file with the card's
+            name exists and is not a card.
     """
     if policy.is_dir():
         raise UnusablePolicy(f"expected a file for the policy, got the folder {policy}: add a file name")
+    folder = next(place for place in policy.absolute().parents if place.exists())
+    try:
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        raise UnusablePolicy(
+            f"expected a place where the policy can be written, got {policy}: no file can be created in {folder} "
+            f"({error.strerror}): choose another file"
+        ) from error
     path = card_path(policy)
     if not path.exists():
         return

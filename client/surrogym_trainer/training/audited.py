@@ -30,8 +30,6 @@ from surrogym_trainer.training.settings import (
 from surrogym_trainer.training.trainer import train
 from surrogym_trainer.training.trials import Trials, allows_trials, is_waiting_for_trials
 
-PROMISING = "computes the promise by whole virtual episodes, and audits it"
-
 
 @dataclass
 class AuditedTraining:
@@ -70,7 +68,7 @@ class AuditedTraining:
     audit: AuditSettings | None = None
     progress: Callable[[TrainProgress], None] | None = None
     waiting: Callable[[SurrogateView], None] | None = None
-    saying: Callable[[str], None] | None = None
+    saying: Callable[[str], None] = lambda _: None
     candidates: Candidates = field(default_factory=Candidates, init=False)
     # Number of rounds (train a policy, then query where it goes) that took no real step.
     _unspent: int = field(default=0, init=False)
@@ -95,8 +93,6 @@ class AuditedTraining:
         try:
             for number in range(1, MOST_AUDITS + 1):
                 taken = self.api.surrogate(self.name).ledger.total
-                if self.saying is not None:
-                    self.saying(PROMISING)
                 handover = hand_over(self._subject(result), self.audit, self.waiting)
                 if number == MOST_AUDITS or not self._to_be_trained_on(handover.audit, result, taken, number):
                     break
@@ -140,7 +136,8 @@ class AuditedTraining:
         session = chosen_for(self.api.surrogate(self.name), settings).judging
         usual = {*settings.hyperparameters} <= {"horizon"} and not settings.set_points
         plans = result.algorithm == PLANNING and usual
-        return Subject(self.api, self.name, self.port, predict, dict(session), result.untrained, settings.seed, plans)
+        rest = dict(session), result.untrained, settings.seed, plans, self.saying
+        return Subject(self.api, self.name, self.port, predict, *rest)
 
     def _to_be_trained_on(self, audit: Audit | None, result: TrainResult, taken: int, number: int) -> bool:
         if audit is None or audit.undeclared:

@@ -62,6 +62,8 @@ ANYWHERE = 1_024
 # an untrained policy
 WIDE = 0.5
 NO_SAMPLER = "no sampler is connected"
+PROMISING = "computes the promise by whole virtual episodes"
+COMPARING = "computes by virtual episodes how the errors that the audit found change the return"
 
 Array = NDArray[np.float64]
 
@@ -107,9 +109,12 @@ class Subject:
     floor: float | None = None  # imagined return of an untrained policy
     seed: int = 0
     plans: bool = False  # whether the policy is the planner of the latest model, which samplers can make
+    # called with a few words before virtual episodes, which may take minutes
+    saying: Callable[[str], None] = lambda _: None
 
     def promise(self) -> Promise:
         """Compute the policy's promise in the latest model."""
+        self.saying(PROMISING)
         return promise_of(self.port, self.predict, self.seed, self.session, self.floor)
 
 
@@ -313,6 +318,7 @@ def _consequence(
     """
     if len(beside.errors) == beside.elsewhere or view.model_version is None:
         return None
+    subject.saying(COMPARING)
     shifted = beside.together(subject.port.spec(), inputs)
     weights = shifted.draws(DRAWS, np.random.default_rng(subject.seed), beside.surprising)
     changes = changes_of(

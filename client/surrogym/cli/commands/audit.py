@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -98,8 +99,7 @@ def command(
         _require_fit(predict, port.spec(), f"{policy} does not fit {name!r}")
         session = session_of(card, view)
         floor = _floor(port, seed, session) if card.untrained is None else card.untrained
-        subject = Subject(api, name, port, predict, session, floor, seed)
-        update(None, "computing the promise")
+        subject = Subject(api, name, port, predict, session, floor, seed, saying=partial(update, None))
         if env is None:
             found = hand_over(subject, asked, lambda view: update(None, words_of_audit(view)))
         else:

@@ -336,6 +336,7 @@ def _train(
         progress("train", quiet=quiet) as update,
         recording(update) as record,
     ):
+        update(None, "begins; the first process on a machine compiles for a minute")
         try:
             training = AuditedTraining(
                 api,
