@@ -18,6 +18,7 @@ def words_of_result(
     *,
     asked: int | None = None,
     closed_loop: bool = False,
+    fits_planner: bool = False,
     server: str | None = None,
     env_option: str = "",
 ) -> str:
@@ -28,6 +29,7 @@ def words_of_result(
         handover: the promise and whether it is trusted.
         asked: number of virtual steps that ``--steps`` gave; None without it.
         closed_loop: whether ``--improve`` was given.
+        fits_planner: whether a planner could act in this environment.
         server: address that the next command needs; None if it needs none.
         env_option: option of the next command that names the environment, with a space before it.
     """
@@ -39,7 +41,7 @@ def words_of_result(
     return (
         f"{result.path}: {taken if result.virtual_steps else 'made without training'} in {result.seconds:.1f} s"
         f"{_imagined(result.imagined_return)}{cut}{rounds}"
-        f"{_given_up(result.networks - 1)}{_gaining(result)}; next: surrogym evaluate {path}{options}"
+        f"{_given_up(result.networks - 1, fits_planner)}{_gaining(result)}; next: surrogym evaluate {path}{options}"
         f"{'' if handover is None else chr(10) + words_of_handover(handover)}"
     )
 
@@ -111,8 +113,11 @@ def words_of(now: dict[str, Any]) -> str:
     return f"{doing}{_imagined(now['imagined_return'])}{penalty}{_known(now.get('visited_confidence'))}"
 
 
-def _given_up(networks: int) -> str:
-    return f"; {networks} network{'s' * (networks > 1)} replaced because of slow learning" if networks else ""
+def _given_up(networks: int, fits_planner: bool) -> str:
+    if not networks:
+        return ""
+    way = " (--algorithm planner plans with the model instead)" if fits_planner else ""
+    return f"; {networks} network{'s' * (networks > 1)} replaced because of slow learning{way}"
 
 
 def _gaining(result: TrainResult) -> str:
