@@ -60,3 +60,8 @@ def test_set_points_are_session_options_of_a_training():
 def test_a_set_point_that_is_no_pair_of_coordinate_and_value_is_refused(given: str):
     with pytest.raises(CommandError, match="--set-point: expected COORDINATE=VALUE, such as level=12, got"):
         SessionOptions(set_points=[given]).fields()
+
+
+def test_two_set_points_of_one_coordinate_are_refused():
+    with pytest.raises(CommandError, match="--set-point: expected one value for each coordinate, got two for level"):
+        SessionOptions(set_points=["level=12", "flow=1", "level=13"]).fields()

@@ -151,13 +151,16 @@ class SessionOptions:
 
         Raises:
             CommandError: an option of particles was given with another variant than ``probabilistic``, or a set point
-                is not COORDINATE=VALUE.
+                is not COORDINATE=VALUE, or two are of one coordinate.
         """
         from surrogym_shared.wire import OF_PARTICLES
 
         given = {name: value for name, value in vars(self).items() if value is not None and value is not False}
         if pairs := given.pop("set_points", None):
-            given["set_points"] = dict(map(_set_point, pairs))
+            named = list(map(_set_point, pairs))
+            given["set_points"] = dict(named)
+            if twice := [name for i, (name, _) in enumerate(named) if name in dict(named[:i])]:
+                raise CommandError(f"--set-point: expected one value for each coordinate, got two for {twice[0]}")
         for name in OF_PARTICLES:
             if name in given and self.variant != "probabilistic":
                 raise CommandError(
