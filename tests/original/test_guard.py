@@ -17,7 +17,7 @@ import pytest
 from support.limited import DIARY, RAIL, SPEC, Cart, FreeCart, LateCart, NamedCart, PatientCart, SlowCart, with_limits
 from support.noting import until
 from surrogym_sampler.original.episodes import open_episode
-from surrogym_sampler.original.errors import StepFailed, StepRefused, StepTimedOut, UnknownEnvironment
+from surrogym_sampler.original.errors import EnvironmentDied, StepFailed, StepRefused, StepTimedOut, UnknownEnvironment
 from surrogym_sampler.original.isolated import IsolatedEnvironment
 from surrogym_sampler.original.limits import Guard, GuardedRollouts, GuardedSteps
 from surrogym_sampler.original.protocol import RealStep
@@ -307,6 +307,21 @@ def test_after_a_step_that_took_too_long_the_safety_fallback_stops_the_machine(d
         assert at_rest(diary)
         assert diary.read_text().endswith("close\n")
         assert environment.fallback_steps == len(states(diary)) - 3
+
+
+@pytest.mark.parametrize("then", ["act", "close"])
+def test_a_fallback_after_the_environments_own_process_was_asked_to_end_is_counted(diary: Path, then: str) -> None:
+    with IsolatedEnvironment(Cart) as environment:
+        environment.begin(0)
+        environment.act(RIGHT)
+        assert environment._process is not None
+        environment._process.terminate()  # as a service manager does, which ends all processes of a service
+        environment._process.join(20)
+        if then == "act":  # no step in a new process, whose episode has not begun
+            with pytest.raises(EnvironmentDied, match="ended with exit code 0 before act"):
+                environment.act(RIGHT)
+    assert at_rest(diary)
+    assert environment.fallback_steps == len(states(diary)) - 1 > 0
 
 
 def test_an_isolated_environment_keeps_its_declared_limits() -> None:

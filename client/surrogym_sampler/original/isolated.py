@@ -30,6 +30,7 @@ from surrogym_shared.spec import EnvironmentSpec
 
 START_LIMIT = 120.0  # seconds until the environment must be made; importing a simulator may take long
 PARENTS_BUSINESS = (signal.SIGINT, getattr(signal, "SIGHUP", signal.SIGINT))
+WITHIN_EPISODE = ("act", "save")  # requests that a new process can't answer, because its episode has not begun
 CLOSE_LIMIT = 2.0  # seconds for closing the environment, in addition to the seconds that one step may take
 
 
@@ -100,7 +101,9 @@ class IsolatedEnvironment:
         machine to rest, then the process ends by itself.
         """
         try:
-            if self._pipe is not None and self._process is not None and self._process.is_alive():
+            if self._process is not None and not self._process.is_alive():
+                self._count_last_steps()
+            elif self._process is not None:
                 with suppress(StepFailed):
                     self._call("close", (), self._step_limit + self._rest_seconds + CLOSE_LIMIT)
         except KeyboardInterrupt:
@@ -117,12 +120,19 @@ class IsolatedEnvironment:
         self.close()
 
     def _call(self, method: str, arguments: tuple[Any, ...], limit: float) -> Any:
+        if method in WITHIN_EPISODE and self._process is not None and not self._process.is_alive():
+            self._count_last_steps()
+            code = self._kill()
+            raise EnvironmentDied(
+                f"the environment's process ended with exit code {code} before {method}: see what it printed"
+            )
         pipe = self._start()
         self._number += 1
         try:
             pipe.send((self._number, method, arguments))
-            answer = _await_answer(pipe, self._number, limit)
+            answer = self._await_answer(pipe, limit)
         except (EOFError, OSError) as error:
+            self._count_last_steps()
             code = self._kill()
             raise EnvironmentDied(
                 f"the environment's process ended with exit code {code} during {method}: see what it printed"
@@ -131,7 +141,7 @@ class IsolatedEnvironment:
             self._let_fall_back()
             self._kill()
             raise StepTimedOut(f"the environment's {method} took longer than {limit:g} s and was killed; {MORE_TIME}")
-        ok, value, self._fallback_steps = answer
+        ok, value = answer
         if isinstance(value, StepRefused):
             raise value
         if ok is None:
@@ -157,9 +167,23 @@ class IsolatedEnvironment:
         assert self._process is not None
         assert self._pipe is not None
         self._process.join(self._step_limit + self._rest_seconds + CLOSE_LIMIT)
+        self._count_last_steps()
+
+    def _count_last_steps(self) -> None:
+        """Count the last steps of the fallback controller of a child process that has ended."""
         with suppress(EOFError, OSError):
-            while self._pipe.poll():
+            while self._pipe is not None and self._pipe.poll():
                 *_, self._fallback_steps = self._pipe.recv()
+
+    def _await_answer(self, pipe: Connection, limit: float) -> tuple[bool | None, Any] | None:
+        """Return the answer (ok, value) to the latest request; None after ``limit`` seconds. Answers to earlier
+        requests are skipped. Each has the number of steps of the fallback controller."""
+        deadline = time.monotonic() + limit
+        while pipe.poll(max(0.0, deadline - time.monotonic())):
+            answered, ok, value, self._fallback_steps = pipe.recv()
+            if answered == self._number:
+                return ok, value
+        return None
 
     def _start(self) -> Connection:
         if self._pipe is not None and self._process is not None and self._process.is_alive():
@@ -206,17 +230,6 @@ class IsolatedEnvironment:
             process.kill()
             process.join()
         return process.exitcode
-
-
-def _await_answer(pipe: Connection, number: int, limit: float) -> tuple[bool | None, Any, int] | None:
-    """Return the answer (ok, value, number of steps of the fallback) to request ``number``; None after ``limit``
-    seconds. Answers to earlier requests are skipped."""
-    deadline = time.monotonic() + limit
-    while pipe.poll(max(0.0, deadline - time.monotonic())):
-        answered, ok, value, fallback_steps = pipe.recv()
-        if answered == number:
-            return ok, value, fallback_steps
-    return None
 
 
 class _Ending:
