@@ -17,7 +17,14 @@ import pytest
 from support.limited import DIARY, RAIL, SPEC, Cart, FreeCart, LateCart, NamedCart, PatientCart, SlowCart, with_limits
 from support.noting import until
 from surrogym_sampler.original.episodes import open_episode
-from surrogym_sampler.original.errors import EnvironmentDied, StepFailed, StepRefused, StepTimedOut, UnknownEnvironment
+from surrogym_sampler.original.errors import (
+    EnvironmentDied,
+    FallbackFailed,
+    StepFailed,
+    StepRefused,
+    StepTimedOut,
+    UnknownEnvironment,
+)
 from surrogym_sampler.original.isolated import IsolatedEnvironment
 from surrogym_sampler.original.limits import Guard, GuardedRollouts, GuardedSteps
 from surrogym_sampler.original.protocol import RealStep
@@ -235,8 +242,9 @@ def test_a_safety_fallback_that_keeps_failing_asks_to_stop_the_machine_by_hand(
     pushed(faulty, 3)
     said = "the fallback failed, so the machine may still move: stop it by hand: OSError: no byte came"
     assert until(lambda: said in capsys.readouterr().err)
-    with pytest.raises(StepFailed, match=said):
-        faulty.act(RIGHT)
+    for go_on in (partial(faulty.act, RIGHT), faulty.begin):
+        with pytest.raises(FallbackFailed, match=said):
+            go_on()
     faulty.close()
 
 

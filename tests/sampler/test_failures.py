@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from support.moody import Line
-from surrogym_sampler.original.errors import MachineFails, StepRefused
+from surrogym_sampler.original.errors import FallbackFailed, MachineFails, StepRefused
 from surrogym_sampler.original.isolated import IsolatedEnvironment
 from surrogym_sampler.queries import Sampler, SamplerSettings
 from surrogym_sampler.queries import failures as limits
@@ -31,6 +31,18 @@ class Careful(Line):
     def step_from(self, coordinates, action):
         if coordinates[0] < 0:
             raise StepRefused("the tank would overflow")
+        return super().step_from(coordinates, action)
+
+
+class Unstoppable(Line):
+    """A machine whose fallback fails after its second step."""
+
+    steps = 0
+
+    def step_from(self, coordinates, action):
+        self.steps += 1
+        if self.steps > 2:
+            raise FallbackFailed("stop it by hand: no brake pressure")
         return super().step_from(coordinates, action)
 
 
@@ -125,6 +137,17 @@ def test_a_query_refused_by_the_environment_counts_as_no_attempt(api, line, mach
     assert (report.failed, view.queries.set_aside, view.ledger.unresolved) == (0, 0, 0)
     assert view.phase == "ready" or view.ledger.total == view.budget, "the refused ones used nothing of it"
     assert all(query.attempts == 1 for query in api.queries(line) if query.status == "refused")
+
+
+@pytest.mark.parametrize("machine", [Unstoppable, lambda: IsolatedEnvironment(Unstoppable)], ids=["here", "isolated"])
+def test_a_sampler_whose_fallback_failed_begins_no_other_query(api, line, machine):
+    environment = machine()
+    with pytest.raises(MachineFails, match=r"stop it by hand: no brake pressure; no other query was begun"):
+        Sampler(api, line, environment, UNTIL_DONE).run()
+    environment.close()
+    view = api.surrogate(line)
+    assert (view.queries.answered, view.queries.pending, view.queries.leased) == (2, 4, 0)
+    assert view.ledger.unresolved == 1
 
 
 def test_a_design_whose_initial_queries_are_all_refused_reports_it(api, line):

@@ -9,13 +9,14 @@ OriginalError
 ├── SnapshotGone            a query begins at a snapshot that can't be used; the design chooses another query
 ├── SnapshotNotKept         a state can't be saved or written; no query will begin there
 ├── UnusableFolder          snapshots can't be kept in this folder; nothing was begun
-├── MachineFails            the environment failed at several different queries in a row; the sampler stops
+├── MachineFails            the environment failed at several queries in a row, or its fallback did; the sampler stops
 ├── LimitsLeft              more rollouts left a limit than is allowed; the sampler stops
 ├── EvaluationFailed        the environment or the policy failed after real steps had been taken
 └── StepFailed              the environment did not give a step; the query fails, the sampler continues
     ├── StepTimedOut        the step took too long, and the environment was killed; the next step starts it anew
     ├── EnvironmentDied     the environment's process ended; the next step starts it anew
     ├── StepRefused         the environment refused the step before it moved; the design chooses another query
+    ├── FallbackFailed      the fallback of declared limits gave up, so the machine may move; the sampler stops
     └── RequestRefused      the environment's program answered with an error, and keeps running
 """
 
@@ -68,7 +69,8 @@ class UnusableFolder(OriginalError):
 
 
 class MachineFails(OriginalError):
-    """The environment failed at several different queries in a row. The claimed queries were returned to the queue."""
+    """The environment failed at several different queries in a row, or its fallback failed. The claimed queries were
+    returned to the queue."""
 
 
 class LimitsLeft(OriginalError):
@@ -110,6 +112,11 @@ class StepRefused(StepFailed):
         ...     if coordinates[0] + action[0] > 1.0:
         ...         raise StepRefused("the tank would overflow")
     """
+
+
+class FallbackFailed(StepFailed):
+    """The fallback controller of declared limits failed too often in a row, so the machine may still move. The
+    environment takes no further steps."""
 
 
 class RequestRefused(StepFailed):

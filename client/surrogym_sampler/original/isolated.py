@@ -18,6 +18,7 @@ from surrogym_sampler.original.errors import (
     MORE_TIME,
     RAISED,
     EnvironmentDied,
+    FallbackFailed,
     StepFailed,
     StepRefused,
     StepTimedOut,
@@ -142,7 +143,7 @@ class IsolatedEnvironment:
             self._kill()
             raise StepTimedOut(f"the environment's {method} took longer than {limit:g} s and was killed; {MORE_TIME}")
         ok, value = answer
-        if isinstance(value, StepRefused):
+        if isinstance(value, StepFailed):
             raise value
         if ok is None:
             self._await_end()
@@ -310,8 +311,8 @@ def _answer(environment: Environment, method: str, arguments: tuple[Any, ...]) -
     try:
         value = getattr(environment, method)(*arguments)
         return True, value.model_dump() if isinstance(value, EnvironmentSpec) else value
-    except StepRefused as refused:
-        return False, StepRefused(str(refused))
+    except (StepRefused, FallbackFailed) as error:  # the sampler acts on these
+        return False, type(error)(str(error))
     except Exception as error:
         return False, sentence(error)
     except (SystemExit, KeyboardInterrupt, GeneratorExit) as error:

@@ -20,7 +20,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from surrogym_sampler.original.episode import Episode, Moment
-from surrogym_sampler.original.errors import RAISED, StepFailed, StepRefused, UnknownEnvironment, sentence
+from surrogym_sampler.original.errors import (
+    RAISED,
+    FallbackFailed,
+    StepFailed,
+    StepRefused,
+    UnknownEnvironment,
+    sentence,
+)
 from surrogym_sampler.original.factories import load_factory
 from surrogym_sampler.original.protocol import (
     Array,
@@ -190,6 +197,7 @@ class Watchdog:
         self._due: float | None = None
         self._wanted = self._closed = False
         self._fallen = ""  # why the watchdog ended the episode; empty if it did not
+        self._given_up = False  # whether the fallback controller failed too often in a row; it stays so
         # Number of steps of the fallback controller in this episode, and of its latest steps in a row that raised an
         # error.
         self._steps = self._errors = 0
@@ -213,9 +221,15 @@ class Watchdog:
         return 0.0 if self._waits else rest_seconds(self._spec)
 
     def check(self) -> None:
-        """Raise ``StepFailed`` if the watchdog has ended the episode."""
+        """Raise ``StepFailed`` if the watchdog has ended the episode, ``FallbackFailed`` if its fallback gave up."""
+        self.check_fallback()
         if self._fallen:
             raise StepFailed(self._fallen)
+
+    def check_fallback(self) -> None:
+        """Raise ``FallbackFailed`` if the fallback controller gave up, so that a person has to stop the machine."""
+        if self._given_up:
+            raise FallbackFailed(self._fallen)
 
     def begin(self, coordinates: Array) -> None:
         """Note that an episode starts at coordinates (C,), where the machine rests until its first action."""
@@ -286,7 +300,7 @@ class Watchdog:
             self._due += self._period
             moves = self._errors < MOST_ERRORS
             if not moves:
-                self._fallen = f"{FAILED}: {sentence(error)}"
+                self._fallen, self._given_up = f"{FAILED}: {sentence(error)}", True
                 say(self._fallen)
         if not moves or self._steps >= MOST_STEPS or time.monotonic() >= self._end:
             self._due = None
@@ -364,6 +378,7 @@ class GuardedRollouts:
 
     def begin(self, seed: int | None = None) -> Array:
         with self._watchdog:
+            self._watchdog.check_fallback()
             return self._started(self._environment.begin(seed))
 
     def act(self, action: Array) -> RealStep:
@@ -388,6 +403,7 @@ class GuardedRollouts:
 
     def restore(self, snapshot: bytes) -> Array:
         with self._watchdog:
+            self._watchdog.check_fallback()
             return self._started(self._environment.restore(snapshot))
 
     def close(self) -> None:
@@ -423,10 +439,12 @@ class GuardedEpisode(Episode):
 
     def reset(self, seed: int) -> Moment:
         with self._watchdog:
+            self._watchdog.check_fallback()
             return self._started(self._episode.reset(seed))
 
     def place(self, coordinates: Array) -> Moment:
         with self._watchdog:
+            self._watchdog.check_fallback()
             return self._started(self._episode.place(coordinates))
 
     def step(self, action: Array) -> Moment:

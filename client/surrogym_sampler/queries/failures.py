@@ -30,6 +30,11 @@ class Failures:
         self._later = 0  # number of failures after FIRST_FEW different queries failed; each lengthens the delay
         self._answered = False  # whether any query was answered since the sampler started
         self._last = ""
+        self._gave_up = ""  # why the machine has to be stopped by hand; empty if it has not
+
+    def gave_up(self, error: str) -> None:
+        """Note that the fallback of the declared limits failed, so that no other query may begin."""
+        self._gave_up = error
 
     def answered(self) -> None:
         self._queries, self._later, self._answered = set(), 0, True
@@ -51,8 +56,12 @@ class Failures:
 
         Raises:
             MachineFails: the machine failed at too many different queries in a row; or it never answered, and failed at
-                all queries that there are.
+                all queries that there are; or it has to be stopped by hand.
         """
+        if self._gave_up:
+            raise MachineFails(
+                f"{self._gave_up}; no other query was begun: stop the machine, repair it, and start the sampler again"
+            )
         failed = len(self._queries)
         only_these = failed > 1 and self._queries.issuperset(waiting)
         if failed >= MANY or (not self._answered and (failed >= FIRST_FEW or only_these)):

@@ -18,7 +18,14 @@ from surrogym_client.errors import InvalidInput, LeaseExpired, NotThere
 from surrogym_client.surrogates.waiting import ENDED
 from surrogym_client.transport.api import Api
 from surrogym_client.transport.connection import AWAY, ONE_ATTEMPT, Retries
-from surrogym_sampler.original.errors import QueryRefused, SnapshotGone, StepFailed, StepRefused, message_of
+from surrogym_sampler.original.errors import (
+    FallbackFailed,
+    QueryRefused,
+    SnapshotGone,
+    StepFailed,
+    StepRefused,
+    message_of,
+)
 from surrogym_sampler.original.periods import is_timed
 from surrogym_sampler.original.protocol import (
     Environment,
@@ -164,7 +171,7 @@ class Sampler:
             UnknownSurrogate: there is no surrogate of this name, or it was deleted.
             ServerUnreachable, Unavailable: the server, or its storage, did not answer for too long.
             UnknownEnvironment: the environment can't be made, or does not fit the surrogate.
-            MachineFails: the environment failed at several queries in a row.
+            MachineFails: the environment failed at several queries in a row, or its fallback failed.
             LimitsLeft: more rollouts left a limit than the allowed share of episodes explains.
         """
         self._started, self._broken_off = time.monotonic(), False
@@ -307,6 +314,8 @@ class Sampler:
             outcome = "refused"
         except StepFailed as failed:
             error = message_of(failed) or "no reason given"
+            if isinstance(failed, FallbackFailed):
+                self._failures.gave_up(error)
         except Exception as raised:  # an environment that runs in this process may raise anything
             error = f"{type(raised).__name__}: {message_of(raised)}"
         except BaseException:  # Ctrl-C: the real steps taken so far are still sent
