@@ -172,10 +172,13 @@ def test_environment_names_that_cannot_be_loaded_are_refused(own_module, name, m
             "import sys; sys.exit('no licence')",
             r"ends called sys.exit while it was imported: SystemExit: no licence \(ends.py:1",
         ),
+        ("def f(:", r"ends can't be imported: SyntaxError: .* \(ends.py, line 1\); correct it$"),
         ("import sys; Cart = sys.exit", "ends:Cart called sys.exit while it was made: SystemExit"),
     ],
 )
-def test_the_error_for_an_environment_module_that_calls_exit_names_it(tmp_path, monkeypatch, code, message):
+def test_the_error_for_an_environment_module_that_calls_exit_or_is_no_python_names_it(
+    tmp_path, monkeypatch, code, message
+):
     """The command ended without a word."""
     (tmp_path / "ends.py").write_text(code)
     monkeypatch.syspath_prepend(str(tmp_path))

@@ -23,6 +23,10 @@ def load_factory(name: str) -> Any:
         factory = getattr(importlib.import_module(module_name), attribute)
     except (ImportError, AttributeError, ValueError) as error:
         raise UnknownEnvironment(f"expected package.module:factory, got {name!r}: {error}") from error
+    except SyntaxError as error:
+        raise UnknownEnvironment(
+            f"{module_name} can't be imported: {type(error).__name__}: {error}; correct it"
+        ) from error
     except SystemExit as error:
         raise UnknownEnvironment(
             f"{module_name} called sys.exit while it was imported: {sentence(error)}; remove the call"
