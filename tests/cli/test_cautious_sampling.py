@@ -8,18 +8,23 @@ import shlex
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import typer
 
 from support.controllers import network
-from support.limited import DIARY, SPEC, NamedCart
+from support.limited import DIARY, LIMITS, SPEC, Cart, NamedCart
 from support.programs import FALLS_BACK, KEEPS_LIMITS, program
 from support.rail import SPEC as RAIL
 from support.rated import CHANGE
 from surrogym.cli.commands import sample
 from surrogym_client.transport import Api
-from surrogym_shared.spec import with_history
+from surrogym_sampler.original.episodes import open_episode
+from surrogym_shared.archives import stored as archive
+from surrogym_shared.spec import Term, with_history
 from surrogym_shared.wire import Query
+from surrogym_trainer.evaluation.evaluator import EvaluationSettings, evaluate
+from surrogym_trainer.policies import PolicyCard
 
 CART = ("--env", "support.limited:PatientCart")
 
@@ -227,3 +232,21 @@ def test_violations_and_fallbacks_of_evaluations_are_in_ledger_policy_and_report
     assert on_server("report", cart, "--out", str(page)).code == 0
     assert f"evaluations: {sentence}" in page.read_text()
     assert f"Limits in real episodes: {sentence}." in page.read_text()
+
+
+def test_the_evaluate_command_fails_if_too_many_episodes_left_a_limit(
+    surrogym: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    spec = SPEC.model_copy(update={"limits": LIMITS.model_copy(update={"fallback": (Term.constant(1.0),)})})
+    stopped = evaluate(
+        lambda shown: np.ones((len(shown), 1)),
+        lambda: open_episode("cart:Cart", spec, lambda: Cart(spec)),
+        EvaluationSettings(10),
+    )
+    (tmp_path / "policy.zip").write_bytes(archive({}))
+    (tmp_path / "policy.json").write_text(PolicyCard(spec=spec).model_dump_json())
+    monkeypatch.setattr("surrogym_trainer.policies.files.load_policy", lambda *_, **__: None)
+    monkeypatch.setattr("surrogym_trainer.evaluation.evaluator.evaluate", lambda *_: stopped)
+    ended = surrogym("evaluate", "policy.zip", "--env", "support.limited:Cart", "--episodes", "10")
+    assert ended.code == 1
+    assert "2 of 2 episodes left a limit" in ended.out

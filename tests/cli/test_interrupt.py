@@ -14,10 +14,12 @@ from surrogym.cli.commands.train import _keeping
 from surrogym_client.transport import Api
 from surrogym_sampler.original.errors import EvaluationFailed
 from surrogym_shared.archives import stored
+from surrogym_shared.limits import KeptEpisodes
 from surrogym_trainer.evaluation import EvaluationInterrupted
 from surrogym_trainer.policies import load_policy
 
 INTERRUPTED = 130
+LEFT = KeptEpisodes(2, 1, 3, 1, 6, {"rail": -0.1}, 0.01)  # one of two episodes left the rail
 
 
 @pytest.fixture
@@ -66,8 +68,8 @@ def test_an_interrupted_training_saves_its_policy(
 @pytest.mark.parametrize(
     ("ending", "code", "words"),
     [
-        (EvaluationInterrupted(7), INTERRUPTED, "interrupted after 7 real steps"),
-        (EvaluationFailed(7, RuntimeError("no motor")), 1, "failed after 7 real steps: RuntimeError: no motor"),
+        (EvaluationInterrupted(7, LEFT), INTERRUPTED, "interrupted after 7 real steps"),
+        (EvaluationFailed(7, RuntimeError("no motor"), LEFT), 1, "failed after 7 real steps: RuntimeError: no motor"),
     ],
 )
 def test_an_interrupted_or_failed_evaluation_reports_its_real_steps(
@@ -82,9 +84,18 @@ def test_an_interrupted_or_failed_evaluation_reports_its_real_steps(
 
     monkeypatch.setattr("surrogym_trainer.policies.files.load_policy", lambda *_, **__: None)
     monkeypatch.setattr("surrogym_trainer.evaluation.evaluator.evaluate", ends)
+    reported, report = [], Api.report_steps
+
+    def reports(api, *given, **fields):
+        reported.append((fields["episodes"], fields["limits"]))
+        return report(api, *given, **fields)
+
+    monkeypatch.setattr(Api, "report_steps", reports)
     ended = on_server("evaluate", "policy.zip", "--env", "Pendulum-v1")
     with Api(server_process.url) as api:
         assert api.surrogate(name).ledger.evaluation == 7
+    [(episodes, counts)] = reported
+    assert (episodes, counts.violations, counts.fallbacks, counts.fallback_episodes) == (2, 1, 3, 1)
     assert (ended.code, ended.out) == (code, "")
     assert words in ended.err
 

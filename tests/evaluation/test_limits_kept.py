@@ -10,6 +10,7 @@ import pytest
 from support.limited import RAIL, SPEC, Cart, PatientCart, with_limits
 from support.rated import RATED, RatedRail
 from surrogym_sampler.original.episodes import open_episode
+from surrogym_sampler.original.errors import EvaluationFailed
 from surrogym_shared.limits import KeptEpisodes
 from surrogym_shared.spec import Limits, Term
 from surrogym_trainer.evaluation.evaluator import Evaluation, EvaluationSettings, evaluate, limits_kept
@@ -95,3 +96,29 @@ def test_an_evaluation_of_a_machine_ends_early_if_the_limits_are_left_more_often
         always, lambda: open_episode("cart:Cart", spec, lambda: PatientCart(spec)), EvaluationSettings(10)
     )
     assert len(simulated.returns) == 10, "nothing is damaged in a simulator"
+
+
+class Breaks(PatientCart):
+    """A cart that breaks in its 150th step."""
+
+    taken = 0
+
+    def step(self, action):
+        self.taken += 1
+        if self.taken == 150:
+            raise OSError("a wheel broke")
+        return super().step(action)
+
+
+def test_an_evaluation_that_fails_still_says_how_its_episodes_kept_the_limits() -> None:
+    spec = with_limits(Limits(keep=(RAIL,), fallback=(Term.constant(1.0),)))  # a fallback that drives off the rail
+    with pytest.raises(EvaluationFailed, match="a wheel broke") as failed:
+        evaluate(
+            lambda shown: np.ones((len(shown), 1)),
+            lambda: open_episode("cart:Cart", spec, lambda: Breaks(spec)),
+            EvaluationSettings(10, parallel=1),
+        )
+    kept = failed.value.limits
+    assert kept is not None
+    assert kept.steps == 149
+    assert 1 < kept.violations <= kept.fallback_episodes <= kept.episodes < 10

@@ -24,6 +24,10 @@ from __future__ import annotations
 
 import os
 import traceback
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from surrogym_shared.limits import KeptEpisodes
 
 MORE_TIME = "a larger --step-limit gives it more time"
 # Errors of a user's environment that are caught. KeyboardInterrupt is not: the user pressed Ctrl-C.
@@ -79,14 +83,15 @@ class LimitsLeft(OriginalError):
 
 
 class EvaluationFailed(OriginalError):
-    """An evaluation failed after ``steps`` real steps; ``__cause__`` is the error."""
+    """An evaluation failed after ``steps`` real steps; ``__cause__`` is the error. ``limits`` counts how the episodes
+    so far kept declared limits."""
 
-    def __init__(self, steps: int, cause: BaseException) -> None:
+    def __init__(self, steps: int, cause: BaseException, limits: KeptEpisodes | None = None) -> None:
         super().__init__(f"the evaluation failed after {steps} real steps: {sentence(cause)}")
-        self.steps = steps
-        self._arguments = (steps, cause)
+        self.steps, self.limits = steps, limits
+        self._arguments = (steps, cause, limits)
 
-    def __reduce__(self) -> tuple[type[EvaluationFailed], tuple[int, BaseException]]:
+    def __reduce__(self) -> tuple[type[EvaluationFailed], tuple[int, BaseException, KeptEpisodes | None]]:
         return type(self), self._arguments
 
 

@@ -183,11 +183,12 @@ def for_set_points(result: Evaluation, spec: EnvironmentSpec | None, points: Map
 
 
 class EvaluationInterrupted(KeyboardInterrupt):
-    """Ctrl-C interrupted an evaluation; ``steps`` is the number of real steps begun by then."""
+    """Ctrl-C interrupted an evaluation; ``steps`` is the number of real steps begun by then, and ``limits`` counts how
+    the episodes so far kept declared limits."""
 
-    def __init__(self, steps: int) -> None:
+    def __init__(self, steps: int, limits: KeptEpisodes | None = None) -> None:
         super().__init__()
-        self.steps = steps
+        self.steps, self.limits = steps, limits
 
 
 def evaluate(
@@ -234,11 +235,11 @@ def evaluate(
                 begin(opened[0].spec)
             return run.on(opened, heed)
     except KeyboardInterrupt:
-        raise EvaluationInterrupted(run.begun) from None
+        raise EvaluationInterrupted(run.begun, run.kept) from None
     except RAISED as error:
         if run.begun == 0 and not isinstance(error, SystemExit):
             raise
-        raise EvaluationFailed(run.begun, error) from error
+        raise EvaluationFailed(run.begun, error, run.kept) from error
 
 
 def _open(
@@ -356,6 +357,14 @@ class _Run:
             self._tell()
             between_steps()
         return replace(_account(self._tallies), seeded=self._seeded)
+
+    @property
+    def kept(self) -> KeptEpisodes | None:
+        """How the episodes with at least one whole step kept declared limits so far; None without such an episode."""
+        moved = [tally for tally in self._tallies if tally.length]
+        if not moved or (spec := moved[0].episode.spec).limits is None:
+            return None
+        return limits_kept(spec, [np.stack(tally.path) for tally in moved], [tally.fallbacks for tally in moved])
 
     def _begin(self, free: Sequence[Episode]) -> list[_Tally]:
         """Begin the next episodes, one in each free instance, until all have begun."""

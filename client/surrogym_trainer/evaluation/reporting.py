@@ -16,6 +16,7 @@ import numpy as np
 
 from surrogym_shared import wire
 from surrogym_shared.checks import MAX_MEASURED
+from surrogym_shared.limits import KeptEpisodes
 from surrogym_shared.logs.drafting import wrapped
 from surrogym_shared.logs.writing import EVALUATED, npz_of_steps
 from surrogym_shared.spec import EnvironmentSpec
@@ -60,14 +61,14 @@ def as_reported(
         lengths=result.lengths.tolist(),
         success=None if result.success is None else result.success.tolist(),
         traces=[_trace(rank, settings.first_seed + at, result.traces[at]) for rank, at in shown.items()],
-        limits=counts_of_limits(result),
+        limits=counts_of_limits(result.limits),
         idempotency_key=key,
     )
 
 
-def counts_of_limits(result: Evaluation) -> wire.LimitCounts | None:
-    """Return how the episodes kept their limits, in the form in which a server counts it; None without limits."""
-    if (kept := result.limits) is None:
+def counts_of_limits(kept: KeptEpisodes | None) -> wire.LimitCounts | None:
+    """Return how episodes kept their limits, in the form in which a server counts it; None without limits."""
+    if kept is None:
         return None
     return wire.LimitCounts(
         violations=kept.violations, fallbacks=kept.fallbacks, fallback_episodes=kept.fallback_episodes

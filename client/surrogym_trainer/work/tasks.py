@@ -248,7 +248,7 @@ def _counted(
         raise
     episodes = len(result.returns)  # fewer than asked for, if limits were left too often
     said = f"{counted(episodes, 'episode')} from seed {settings.first_seed}"
-    note(result.steps, episodes, said, counts_of_limits(result))
+    note(result.steps, episodes, said, counts_of_limits(result.limits))
     return result
 
 

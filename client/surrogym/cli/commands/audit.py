@@ -148,7 +148,7 @@ def by_episodes(
     note, taken, episodes, kept = f"audit, {count} from seed {settings.first_seed}", 0, 0, None
     try:
         result = evaluate(acting, opener, settings, trained_for=spec)
-        taken, episodes, kept = result.steps, len(result.returns), counts_of_limits(result)
+        taken, episodes, kept = result.steps, len(result.returns), counts_of_limits(result.limits)
     except (EvaluationFailed, EvaluationInterrupted) as error:
         taken = error.steps
         raise

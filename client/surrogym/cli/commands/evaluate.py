@@ -204,6 +204,8 @@ def command(
     give(summary, lambda: "\n".join([_words(reports, None if elsewhere else promise), *more]), as_json=output.as_json)
     if steps is not None:
         steps.require_stored()
+    if any(len(one.returns) < settings.episodes for _, one in reports):
+        raise typer.Exit(1)  # too many episodes left a limit, so that the others were not begun
 
 
 def _aimed(card: PolicyCard) -> list[str]:
@@ -366,7 +368,7 @@ def _reports(
         result = run(load, *first, what=actions or str(policy))
         episodes = len(result.returns)  # fewer than asked for, if limits were left too often
         note = f"{counted(episodes, 'episode')} from seed {settings.first_seed}"
-        enter(result.steps, episodes, f"{note}, {actions}" if actions else note, counts_of_limits(result))
+        enter(result.steps, episodes, f"{note}, {actions}" if actions else note, counts_of_limits(result.limits))
         reports.append((controller, result))
     return reports
 
@@ -425,13 +427,18 @@ def _run(
     what: str,
     opener: Callable[[], Episode],
     settings: EvaluationSettings,
-    enter: Callable[[int, int, str], None],
+    enter: Callable[..., None],
     *,
     quiet: bool,
 ) -> Evaluation:
     """Run the episodes of one controller. If they fail or are interrupted, report the real steps taken so far."""
     from surrogym_sampler.original.errors import EvaluationFailed
     from surrogym_trainer.evaluation.evaluator import EvaluationInterrupted, evaluate
+    from surrogym_trainer.evaluation.reporting import counts_of_limits
+
+    def cut(ending: EvaluationFailed | EvaluationInterrupted, note: str) -> None:
+        # With limits, the episodes so far are counted as well, because they may have left one.
+        enter(ending.steps, ending.limits.episodes if ending.limits else 0, note, counts_of_limits(ending.limits))
 
     try:
         with terminations_as_interrupts(), progress("evaluate", quiet=quiet) as update:
@@ -440,14 +447,14 @@ def _run(
             remark = partial(say, quiet=quiet)
             return evaluate(load(), opener, settings, tell, remark, trained_for, announce)
     except EvaluationFailed as failure:
-        enter(failure.steps, 0, "failed")
+        cut(failure, "failed")
         raise
     except EvaluationInterrupted as interruption:
         say(
             f"interrupted after {interruption.steps} real steps; no result was kept; the same command starts from the "
             "beginning"
         )
-        enter(interruption.steps, 0, "interrupted")
+        cut(interruption, "interrupted")
         raise
 
 
