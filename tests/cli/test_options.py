@@ -44,6 +44,12 @@ def test_a_recommended_command_repeats_the_typed_options_without_secrets(line: s
     assert again.output == said + "\n"
 
 
+def test_a_planner_takes_no_number_of_virtual_steps():
+    with pytest.raises(CommandError, match=r"expected no virtual steps with --algorithm planner, .* got 100"):
+        SearchOptions(algorithm="planner", steps=100).hyperparameters()
+    assert SearchOptions(algorithm="planner").hyperparameters() == {}
+
+
 def test_limits_are_a_setting_of_the_planner_alone():
     options = SearchOptions(algorithm="Planner", limits=["level<=11", "x+v>=1"], chosen=["horizon=20"])
     assert options.hyperparameters() == {"horizon": 20, "limits": ["level<=11", "x+v>=1"]}

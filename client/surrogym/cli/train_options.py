@@ -83,8 +83,14 @@ class SearchOptions:
                 found[name] = json.loads(value)
             except ValueError:
                 found[name] = value
+        planned = (self.algorithm or "").lower() == "planner"
+        if planned and self.steps is not None:
+            raise CommandError(
+                "--steps: expected no virtual steps with --algorithm planner, because nothing is trained, got "
+                f"{self.steps}"
+            )
         if self.limits:
-            if (self.algorithm or "").lower() != "planner":
+            if not planned:
                 raise CommandError(
                     "--limit: expected --algorithm planner, because trained policies keep the limits that the "
                     f"specification declares, got {self.algorithm or 'another search'}"

@@ -27,11 +27,6 @@ class Planner(PolicySearch):
 
     def search(self, task: SearchTask) -> Found:
         settings = task.settings
-        if settings.total_steps not in (None, self.suggested_steps):
-            raise ValueError(
-                f"algorithm PLANNER: expected no number of virtual steps, because nothing is trained, got "
-                f"{settings.total_steps}"
-            )
         if settings.integral:
             raise ValueError(
                 "algorithm PLANNER: expected no integral, because a planner corrects lasting disturbances itself, got "

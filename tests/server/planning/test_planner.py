@@ -315,12 +315,6 @@ def test_a_training_by_planner_writes_a_file_that_any_reader_of_policies_runs(ha
         controller_of(result.path, pendulum())
 
 
-def test_a_planner_refuses_a_number_of_virtual_steps(hanging: LocalSurrogate, tmp_path):
-    with pytest.raises(ValueError, match="expected no number of virtual steps, because nothing is trained, got 100"):
-        train(hanging, tmp_path / "planner.zip", TrainSettings(algorithm="planner", total_steps=100))
-    assert not (tmp_path / "planner.zip").exists()
-
-
 def turning(speed: float) -> EnvironmentSpec:
     """A pendulum that is to turn at a speed."""
     error = Quantity(term=Term.linear(speed=0.5) + Term.constant(-0.5 * speed))
