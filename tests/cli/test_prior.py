@@ -65,6 +65,7 @@ def sampled(server_process, name):
     with Api(server_process.url) as api:
         api.create_surrogate(name, hinge_spec(design={"budget": 0}, sampling_period=PERIOD))
         sent(api, name, 8)
+        assert until(lambda: api.surrogate(name).round), "the fit without a prior"
         yield name
         api.delete_surrogate(name)
 

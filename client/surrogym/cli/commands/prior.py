@@ -141,7 +141,8 @@ class _Target:
             if is_new and (used or not _asked(view)):
                 real, used = self._real_steps(), view.samples
                 if self._updated(prior, real, update, present) and prior.file is not None:
-                    stored, fitted = self.calls.put(name, prior.file.to_bytes()), view.round
+                    fitted = self.api.surrogate(name).round  # a fit without this prior may have ended meanwhile
+                    stored = self.calls.put(name, prior.file.to_bytes())
                 continue
             if used and _has_ended(view, fitted):
                 return stored, view
