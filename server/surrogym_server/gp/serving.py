@@ -28,6 +28,7 @@ from surrogym_server.gp.posterior import Posterior
 from surrogym_server.tensors import CPU, in_blocks
 
 BLOCK = 262_144  # greatest number of covariances computed at once, so that they fit into the processor's cache
+GPU_BLOCK = 1 << 25  # the same on a GPU, which idles between small blocks; one array of them takes 256 MiB
 MIN_ROWS = 64  # inputs are predicted in blocks of at least this many rows, even if their covariances exceed ``BLOCK``
 # Exponents of the kernel are computed from differences of inputs, not by matrix products, if products could cause a
 # rounding error of the mean above this share of the prior standard deviation.
@@ -151,7 +152,8 @@ class Serving:
     @property
     def rows(self) -> int:
         """Number of rows of x that are predicted at once."""
-        return max(MIN_ROWS, BLOCK // max(1, self.exponents.shape[1]))
+        block = BLOCK if self.exponents.device == CPU else GPU_BLOCK
+        return max(MIN_ROWS, block // max(1, self.exponents.shape[1]))
 
     def mean(self, x: Tensor) -> Tensor:
         """Return the predicted means (m, O), in O columns, at m points x (m, width) with the ``width`` inputs of the

@@ -72,6 +72,13 @@ def test_a_served_block_has_fewer_rows_if_the_processes_have_more_points(outputs
     assert many.rows < few.rows
 
 
+def test_a_served_block_is_larger_on_a_gpu_which_idles_between_small_ones(outputs):
+    """A tensor of the device "meta" stands for one on a GPU: it has a size, and nothing is computed."""
+    here = Serving.of(outputs, COLUMNS, WIDTH)
+    there = replace(here, exponents=here.exponents.to("meta"))
+    assert there.rows == serving.GPU_BLOCK // here.exponents.shape[1] > 100 * here.rows
+
+
 def test_a_function_applied_in_blocks_of_rows_gives_the_joined_results():
     sizes = []
 
