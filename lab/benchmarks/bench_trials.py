@@ -4,11 +4,12 @@ a person gives.
 Each run starts a server and a sampler, registers the machine within a budget of real steps, and runs
 ``surrogym train``: it makes a planner, or policies that try episodes with what the design leaves of the budget. A
 policy that is not trusted then is audited with whole episodes. It is evaluated in real episodes, from which nothing is
-learned. The machines of ``examples/machines`` are programs whose seed draws the
+learned. Tasks of the demo are machines, too. Those of ``examples/machines`` are programs whose seed draws the
 parameters; their lags are those that ``surrogym doctor --history 60`` proposes, with larger ranges. Prints one line for
 each run, and appends it to ``trials.csv``; a run that is there is not repeated.
 
     python lab/benchmarks/bench_trials.py --seeds 200 201 202 203 204 --machines belt furuta
+    python lab/benchmarks/bench_trials.py --seeds 200 201 202 203 204 --machines pendulum acrobot
 """
 
 from __future__ import annotations
@@ -36,6 +37,7 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 import numpy as np
 
 from support.server import running_server
+from surrogym.demo.tasks import TASKS
 from surrogym_client.transport import Api
 from surrogym_sampler import original
 from surrogym_sampler.original.episodes import RolloutEpisode
@@ -101,12 +103,24 @@ MACHINES = {
     "invertedpendulum2": Machine("InvertedDoublePendulum-v5", 120),
     "reacher": Machine("Reacher-v5", 200),
     **{f"swingup-{kind.replace(' ', '-')}": _swing_up(kind, actions) for kind, actions in SWING_UPS.items()},
+    "swingup-noise-1": _swing_up("noise 1"),
 }
+# tasks of the demo, and their largest number of real steps without audits
+BUDGETS = {
+    "pendulum": 18,
+    "cartpole": 26,
+    "mountaincar": 130,
+    "swingup": 75,
+    "swingup-narrow": 100,
+    "acrobot": 100,
+    "invertedpendulum": 30,
+}
+CLEAN = {task: Machine(TASKS[task].environment, budget) for task, budget in BUDGETS.items()}
 
 
 def main() -> None:
     made = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    made.add_argument("--machines", nargs="+", default=tuple(MACHINES), choices=tuple(MACHINES))
+    made.add_argument("--machines", nargs="+", default=tuple(MACHINES), choices=(*MACHINES, *CLEAN))
     made.add_argument("--seeds", nargs="+", type=int, required=True)
     made.add_argument("--budget", type=int, help="largest number of real steps, instead of the machine's")
     made.add_argument("--episodes", type=int, default=100)
@@ -127,7 +141,7 @@ def main() -> None:
 
 
 def _run(machine: str, seed: int, budget: int | None, episodes: int, folder: Path) -> dict[str, Any]:
-    made, begun = MACHINES[machine], time.monotonic()
+    made, begun = (MACHINES | CLEAN)[machine], time.monotonic()
     name, spec = made.name.format(seed=seed), folder / "spec.json"
     spec.write_text(specification(made, name, seed, budget or made.budget).model_dump_json())
     policy = folder / "policy.zip"
@@ -153,11 +167,11 @@ def _run(machine: str, seed: int, budget: int | None, episodes: int, folder: Pat
         minutes = (time.monotonic() - begun) / 60
         with Api(server.url) as api:
             view = api.surrogate(machine)
-            trials = [len(query.actions) for query in api.queries(machine) if query.policy]
+            trials = [len(query.actions) for query in api.queries(machine) if query.policy and query.purpose != "audit"]
             reached = np.array([sample.next_coordinates for sample in api.samples(machine)])
             left = 0 if view.spec.limits is None else int(past(view.spec, reached).sum())
         found = surrogym("evaluate", str(policy), *where, "--episodes", str(episodes))
-    if machine.startswith("swingup-"):
+    if machine.startswith("swingup-") and machine in MACHINES:
         found["success_rate"] = _upright(
             machine.removeprefix("swingup-").replace("-", " "), seed, policy, spec, episodes
         )
@@ -168,6 +182,7 @@ def _run(machine: str, seed: int, budget: int | None, episodes: int, folder: Pat
         "steps": view.ledger.total,
         "trials": len(trials),
         "audit": view.ledger.audit + view.ledger.evaluation,
+        "resets": view.ledger.resets,
         "virtual_steps": trained["virtual_steps"],
         "minutes": round(minutes, 1),
         "mean": round(found["mean"], 2),

@@ -75,7 +75,7 @@ def test_an_audit_rollout_fails_by_one_unpredicted_termination():
     """An episode ends at most once. So one misplaced end fails a rollout, where it takes two to fail single steps."""
     beside = replace(compared(np.zeros((3, 1)), misplaced=1), cut_short=True)
     assert judge(beside, PROMISE, PROMISE, UNTRAINED).faults == (
-        "the episode ended after 3 steps, where the model predicted no end",
+        "a rollout ended at a step where the model predicted no end",
     )
 
 

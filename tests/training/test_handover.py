@@ -30,8 +30,8 @@ from surrogym_sampler.original.episode import Episode
 from surrogym_sampler.original.episodes import open_episode
 from surrogym_sampler.original.rollouts import answering, keeping_limits
 from surrogym_sampler.queries import Sampler, SamplerSettings
-from surrogym_shared.network import Network
-from surrogym_shared.spec import Design, EnvironmentSpec, ModelChoice
+from surrogym_shared.network import Layer, Network
+from surrogym_shared.spec import Design, EnvironmentSpec, ModelChoice, Uniform
 from surrogym_trainer.evaluation.evaluator import EvaluationSettings, evaluate
 from surrogym_trainer.policies.card import PolicyCard, read_card, write_card
 from surrogym_trainer.policies.integrals import with_integrals
@@ -206,6 +206,34 @@ def test_the_audit_of_a_reset_only_environment_is_a_whole_episode(server_process
         audited = [query for query in place.api.queries(place.name) if query.purpose == "audit"]
         assert [query.kind for query in audited] == ["rollout"]
         assert place.api.surrogate(place.name).ledger.audit == handover.audit.steps
+
+
+def test_an_audit_by_resets_takes_as_many_rollouts_of_the_policy_as_reach_its_states(
+    server_process: ServerProcess,
+) -> None:
+    """The policy stays where an episode begins, so one rollout reaches few of its states."""
+    starts = {"x": Uniform(low=-0.9, high=0.9)}
+    spec = rail.SPEC.model_copy(update={"start": starts, "time_limit": 200, "max_rollout": 50})
+    stay = Network(np.zeros(1), np.ones(1), (Layer(np.zeros((1, 1)), np.zeros(1)),), -np.ones(1), np.ones(1))
+    with placed(server_process.url, spec, Wide()) as place:
+        audit = hand_over(replace(place.subject(), predict=stay), AUDIT).audit
+        queries = [query for query in place.api.queries(place.name) if query.purpose == "audit"]
+    assert audit is not None
+    assert len(queries) in (2, 4)
+    assert all(query.policy for query in queries)
+    assert {len(query.actions) for query in queries} == {42 // len(queries)}
+    assert audit.steps == len(queries) * (42 // len(queries))
+    assert audit.passed, audit.faults
+    assert audit.untested < 0.2
+
+
+class Wide(rail.Rail):
+    """The rail, whose episodes begin anywhere."""
+
+    def reset(self, *, seed: int | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.x *= 4.5
+        return np.array([self.x, self.x]), {}
 
 
 class Paying(rail.Rail):

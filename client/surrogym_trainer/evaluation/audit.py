@@ -62,7 +62,7 @@ class Compared:
             error on left-out samples, which includes the noise. For the reward, it is at least the error that matters
             for the return.
         misplaced: number of steps whose termination was predicted wrongly.
-        cut_short: whether the steps are one rollout that ended earlier than the model predicted.
+        cut_short: whether the steps are rollouts, one of which ended earlier than the model predicted.
         unanswered: number of chosen states at which the original environment failed to take the step.
         elsewhere: number of steps in states that the policy does not visit; they come last.
         claimed_alone: error (O,) of the model on left-out samples. A tolerance does not enlarge it.
@@ -195,7 +195,7 @@ def judge(
       policy's return leaves the promised interval, see ``Consequence``. A shared part without an effect on the return
       is not a fault.
 
-    A rollout has at most one end, so a single one that was not predicted is a fault. A step that the original
+    A rollout has at most one end, so a single end that was not predicted is a fault. A step that the original
     environment fails to take is a fault, because the policy would need it.
 
     Args:
@@ -219,7 +219,7 @@ def judge(
     if compared.unanswered:
         faults.insert(0, unanswered(compared.unanswered, n + compared.unanswered))
     if compared.cut_short:
-        faults.append(f"the episode ended after {n} step{'s' * (n > 1)}, where the model predicted no end")
+        faults.append("a rollout ended at a step where the model predicted no end")
     elif compared.misplaced >= MISPLACED_ENDS:
         faults.append(f"{compared.misplaced} of {n} steps ended where the model predicted no end, or the reverse")
     slack = SLACK * max(earned(before, floor), earned(after, floor))

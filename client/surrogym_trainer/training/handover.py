@@ -22,6 +22,7 @@ from surrogym_shared.spec import LONGEST_ROLLOUT, EnvironmentSpec
 from surrogym_shared.starts import not_declared
 from surrogym_shared.states import LEAST_AUDITED
 from surrogym_shared.wire import QueryView, SampleView, SurrogateView
+from surrogym_shared.wire.queries import MAX_POLICY
 from surrogym_shared.wrapping import Step, undeclared_turns
 from surrogym_trainer.evaluation.audit import (
     AUDIT_STEPS,
@@ -51,6 +52,7 @@ from surrogym_trainer.policies.predict import Predict
 from surrogym_trainer.training.trials import encoded
 
 MOST_AUDITS = 3  # largest number of audits in one training
+ROLLOUTS = 1, 2, 4, 8  # numbers of rollouts that an audit chooses from if the environment can't be set to states
 WAY_LANES = 16  # an audit takes real steps at states from this number of virtual episodes of the policy
 # at most this number of steps of each virtual episode is compared with the log from which the model was learned
 MOST_OF_A_WAY = 200
@@ -343,17 +345,16 @@ def _asked(subject: Subject, settings: AuditSettings, q: Array, u: Array, *, cla
 
     If the design ``claims`` to know the whole sampling range, one of every ``ELSEWHERE`` queries is in a gap
     between its samples instead, because an error of the model in the gap may have kept the policy away. If the
-    environment can't be set to a state, there is one query: the actions of one virtual episode, or the policy
-    itself where only policies can steer, or if it is a planner. The episode is whole if the surrogate's audits may take
-    that many steps. Returns the queries' ids, and the ids of those in gaps.
+    environment can't be set to a state, the queries are rollouts in which the policy acts, see ``_rollouts``, or the
+    actions of virtual episodes if samplers can't compute the policy. Returns the queries' ids, and the ids of those in
+    gaps.
     """
     spec, rng = subject.port.spec(), np.random.default_rng(settings.seed)
     if spec.query == "rollout":
-        policy = subject.predict
-        acting = encoded(policy, subject.port) if spec.needs_trials and isinstance(policy, Network) else None
-        view, replan = subject.api.surrogate(subject.name), subject.plans
-        steps = length_of_rollout(view, settings.steps, LONGEST_EPISODE if acting or replan else LONGEST_ROLLOUT)
-        rollouts = [way_of(subject, 1, steps)[1].tolist()]
+        policy, replan = subject.predict, subject.plans
+        acting = encoded(policy, subject.port) if isinstance(policy, Network) else None
+        acting = None if acting is None or len(acting) > MAX_POLICY else acting
+        rollouts = _rollouts(subject, settings.steps, q, LONGEST_EPISODE if acting or replan else LONGEST_ROLLOUT)
         queries = subject.api.add_queries(subject.name, rollouts=rollouts, policy=acting, replan=replan, audit=True)
         return {query.id for query in queries}, set()
     elsewhere = settings.steps // ELSEWHERE if claims else 0
@@ -369,14 +370,31 @@ def _asked(subject: Subject, settings: AuditSettings, q: Array, u: Array, *, cla
     return set(numbers), set(numbers[len(chosen) :])
 
 
-def length_of_rollout(view: SurrogateView, steps: int, most: int = LONGEST_ROLLOUT) -> int:
-    """Return the number of real steps of an audit that begins with a reset: a whole episode or, if that is shorter, one
-    audit's share of the steps that all audits may take. It is at least ``steps``, unless an episode is shorter, and at
-    most ``most``, unless the specification allows longer rollouts."""
-    spec = view.spec
-    longest = min(spec.time_limit or LONGEST_EPISODE, spec.max_rollout or most)
-    share = max(view.budget, LEAST_AUDITED) // MOST_AUDITS
-    return min(longest, max(min(share, _left_for_audits(view)), steps + spec.unknown_steps))
+def _rollouts(subject: Subject, steps: int, q: Array, most: int) -> list[list[list[float]]]:
+    """Return the actions, (T, F) each, that are expected in the rollouts of an audit.
+
+    One rollout knows the ways from one start, so there may be several, of equal length: the fewest that are expected to
+    come near to all of the states q (m, C) that the policy visits but half of ``MOST_UNTESTED``. They take one audit's
+    share of the steps that all audits may take, or two shares if one is not enough; at least ``steps``, unless episodes
+    are shorter. If no number of rollouts is enough, those of one share that leave fewest states are taken. ``most`` is
+    the greatest length of a rollout where the specification has none.
+    """
+    view, spec = subject.api.surrogate(subject.name), subject.port.spec()
+    longest, unknown = min(spec.time_limit or LONGEST_EPISODE, spec.max_rollout or most), spec.unknown_steps
+    left = _left_for_audits(view)
+    share = max(min(max(view.budget, LEAST_AUDITED) // MOST_AUDITS, left), steps + unknown)
+    ways, best, least = ways_of(subject, max(ROLLOUTS), min(longest, 2 * share)), [], np.inf
+    for total in (share, min(2 * share, left)):
+        for count in ROLLOUTS:
+            if count > 1 and total // count < steps + unknown:
+                break
+            parts = [(states[: total // count], actions[: total // count]) for states, actions in ways[:count]]
+            far = untested(spec, q, np.concatenate([states[unknown:] for states, _ in parts]))
+            if not best or (total == share and far < least):
+                best, least = parts, far
+            if far <= MOST_UNTESTED / 2:
+                return [actions.tolist() for _, actions in parts]
+    return [actions.tolist() for _, actions in best]
 
 
 def _left_for_audits(view: SurrogateView) -> int:
@@ -397,7 +415,16 @@ def _in_gaps(subject: Subject, count: int) -> tuple[Array, Array]:
 
 
 def way_of(subject: Subject, episodes: int, steps: int, start_box: float = 0.0) -> tuple[Array, Array]:
-    """Return the states (m, C) and actions (m, F) of a policy in whole virtual episodes.
+    """Return the states (m, C) and actions (m, F) of all episodes of ``ways_of``, the first steps of all before the
+    second ones."""
+    ways = ways_of(subject, episodes, steps, start_box)
+    order = np.argsort(np.concatenate([np.arange(len(states)) for states, _ in ways]), kind="stable")
+    states, actions = (np.concatenate(parts)[order] for parts in zip(*ways, strict=True))
+    return states, actions
+
+
+def ways_of(subject: Subject, episodes: int, steps: int, start_box: float = 0.0) -> list[tuple[Array, Array]]:
+    """Return the states (T, C) and actions (T, F) of a policy in each of several whole virtual episodes.
 
     Each episode follows a function of its own, sampled from the model's posterior. Actions are in the original
     environment's units.
@@ -411,23 +438,25 @@ def way_of(subject: Subject, episodes: int, steps: int, start_box: float = 0.0) 
     spec = subject.port.spec()
     options = {**subject.session, **WHOLE, "start_box": start_box, "variant": "pathwise", "seed": subject.seed}
     lanes = Lanes(subject.port, session_request(episodes, "same_step", options))
-    states, actions, running = [], [], np.ones(episodes, dtype=bool)
+    states, actions, running, lengths = [], [], np.ones(episodes, dtype=bool), np.zeros(episodes, dtype=int)
     try:
         observation = lanes.reset(subject.seed).observation
         for _ in range(steps):
             action = subject.predict(observation)
-            states.append(np.array(subject.api.session_coordinates(lanes.view.id))[running])
-            actions.append(decode_actions(spec, action, episodes)[running])
+            states.append(np.array(subject.api.session_coordinates(lanes.view.id)))
+            actions.append(decode_actions(spec, action, episodes))
+            lengths += running
             step = lanes.step(action)
             if step.lost is not None:
-                return way_of(subject, episodes, steps, start_box)
+                return ways_of(subject, episodes, steps, start_box)
             observation = step.result.observation
             running &= ~(step.result.terminated | step.result.truncated)
             if not running.any():
                 break
     finally:
         lanes.close()
-    return np.concatenate(states), np.concatenate(actions)
+    q, u = np.stack(states, 1), np.stack(actions, 1)
+    return [(q[lane, :length], u[lane, :length]) for lane, length in enumerate(lengths)]
 
 
 def _not_possible(subject: Subject) -> str | None:
