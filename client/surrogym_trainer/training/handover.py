@@ -383,7 +383,8 @@ def _rollouts(subject: Subject, steps: int, q: Array, most: int) -> list[list[li
     longest, unknown = min(spec.time_limit or LONGEST_EPISODE, spec.max_rollout or most), spec.unknown_steps
     left = _left_for_audits(view)
     share = max(min(max(view.budget, LEAST_AUDITED) // MOST_AUDITS, left), steps + unknown)
-    ways, best, least = ways_of(subject, max(ROLLOUTS), min(longest, 2 * share)), [], np.inf
+    ways = ways_of(subject, max(ROLLOUTS), min(longest, 2 * share))
+    best, least = ways[:0], np.inf
     for total in (share, min(2 * share, left)):
         for count in ROLLOUTS:
             if count > 1 and total // count < steps + unknown:
