@@ -331,11 +331,17 @@ def limit_of(spec: EnvironmentSpec, text: str) -> Limit:
             of the sum over the sampling ranges, or an episode may start beyond the limit or within its margin.
     """
     names, sides = spec.coordinate_names, LIMIT.fullmatch(text.strip()) if len(text) <= LONGEST else None
+    angles = [c.name for c in spec.coordinates if c.kind == "angle"]
     weights, value = ({}, math.nan) if sides is None else (_weights(sides["sum"], names), _number(sides["value"]))
     require(
         any(weights.values()) and math.isfinite(value + sum(weights.values())),
         f"limit {text!r}: expected a sum of coordinates, <= or >=, and a number, such as {names[0]}<=1 or "
         f"0.3*{names[0]}+{names[-1]}>=-1, with the coordinates {', '.join(names)}",
+    )
+    require(
+        weights.keys().isdisjoint(angles),
+        f"limit {text!r}: expected coordinates that are no angles, because an angle jumps from pi to -pi, got "
+        f"{', '.join(angles)}",
     )
     ranges = {c.name: limits(c.sampling) for c in spec.coordinates}
     low, high = np.sum([sorted(weight * end for end in ranges[name]) for name, weight in weights.items()], axis=0)

@@ -97,3 +97,8 @@ def test_start_visited_replaces_the_default_start_box_unless_both_are_given():
     both = TrainSettings(start_visited=0.5, start_box=0.25).learning
     assert (both["start_box"], both["start_visited"]) == (0.25, 0.5)
     assert "time_limit" not in TrainSettings(start_visited=0.5, horizon=20).judging, "policies run whole episodes"
+
+
+def test_a_horizon_that_no_planner_supports_is_refused_before_the_search_begins():
+    with pytest.raises(ValueError, match="horizon: expected a whole number of steps from 1 to 200, got 500"):
+        search_for(TrainSettings("PLANNER", hyperparameters={"horizon": 500}))

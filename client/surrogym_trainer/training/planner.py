@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 
 from surrogym_shared.port import ModelPort, SurrogatePort, horizon_of
-from surrogym_shared.spec.base import MAX_INEQUALITIES
+from surrogym_shared.spec.base import MAX_INEQUALITIES, MOST_HORIZON
 from surrogym_shared.surrogate_file import RealSamples, SurrogateFile
 from surrogym_trainer.policies.card import UnusablePolicy
 from surrogym_trainer.policies.planner_files import PlannerFile
@@ -24,6 +24,14 @@ class Planner(PolicySearch):
 
     suggested_steps = 1
     resumable = False  # it computes its values anew from the latest model
+
+    def __post_init__(self) -> None:
+        """Check the horizon, before the server's package is imported to plan."""
+        if self.horizon is not None and not (type(self.horizon) is int and 1 <= self.horizon <= MOST_HORIZON):
+            raise ValueError(
+                f"algorithm PLANNER: horizon: expected a whole number of steps from 1 to {MOST_HORIZON}, got "
+                f"{self.horizon!r}"
+            )
 
     def search(self, task: SearchTask) -> Found:
         settings = task.settings

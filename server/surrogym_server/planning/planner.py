@@ -19,11 +19,10 @@ from surrogym_server.models.port import DynamicsModel, with_set_points
 from surrogym_server.planning.grid import solve, unfit
 from surrogym_server.planning.pending import PendingActions
 from surrogym_server.planning.state_filter import StateFilter, apart
-from surrogym_shared.spec import BoxAction, Limit
+from surrogym_shared.spec import MOST_HORIZON, BoxAction, Limit
 
 Floats = NDArray[np.float64]
 
-MOST_HORIZON = 200
 ROUNDS, ROLLOUTS, ELITE = 3, 24, 4
 SPREAD = 0.3  # standard deviation of the changes of a continuous action, as a share of half its range
 NARROWING = 0.5  # factor of this standard deviation from one round to the next

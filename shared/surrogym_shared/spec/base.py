@@ -15,6 +15,7 @@ MAX_TERM_PARTS = 64
 MAX_DISCRETE_ACTIONS = 4096
 MAX_INEQUALITIES = 16  # largest number of inequalities that must hold together (a group), and of groups
 MOST_PLANNED = 4  # largest number of coordinates of an environment in which a planner acts
+MOST_HORIZON = 200  # largest number of steps of each rollout of a planner
 MOST_PLANNED_ENTRIES = 3  # largest number of entries of a continuous action that a planner chooses
 LONGEST_ROLLOUT = 200  # largest number of real steps of one query, if a specification gives no number
 MAX_ROLLOUT_QUERY = 4_096  # largest number of real steps of one query
