@@ -25,12 +25,13 @@ from surrogym_shared.distributions import Bounded, Choices
 from surrogym_shared.spec import EnvironmentSpec, MultiDiscreteAction
 from surrogym_trainer.evaluation import imagined_returns
 from surrogym_trainer.policies import UnusablePolicy, load_policy
+from surrogym_trainer.policies.defaults import EXPLORATION
 from surrogym_trainer.training import TrainingInterrupted, TrainProgress, TrainSettings, train
 from surrogym_trainer.training import search as trainings
 from surrogym_trainer.training.checks import Checks
 from surrogym_trainer.training.fast_ppo import learner as learners
 from surrogym_trainer.training.fast_ppo import search as searches
-from surrogym_trainer.training.fast_ppo.learner import Learner, noisy
+from surrogym_trainer.training.fast_ppo.learner import Learner, noisy, restored
 from surrogym_trainer.training.fast_ppo.rollouts import Collector, RewardScale, Rollout
 from surrogym_trainer.training.search import search_for, with_algorithm
 
@@ -219,6 +220,22 @@ def test_fastppo_refines_its_policy_from_the_declared_starts(surrogate, tmp_path
     assert list(dict.fromkeys(now.stage for now in seen)) == ["learn", "refine"], "each stage has lines of its own"
     further = replace(settings, prolong=True, start_from=refined.path)
     assert train(surrogate, tmp_path / "further.zip", further).imagined_return >= refined.imagined_return
+
+
+def test_a_training_with_long_episodes_that_nothing_ends_is_one_long_cycle_and_keeps_its_noise(tmp_path: Path):
+    """Each rollout has 64 steps of each lane, and the cycle takes three times the steps."""
+    spec = pendulum().model_copy(update={"time_limit": 321})
+    port = LocalSurrogate(spec, learn(definition_from_spec(spec), random_steps(spec, 12, seed=0)).model)
+    settings = TrainSettings(total_steps=512, num_envs=4, prolong=True, hyperparameters={"n_epochs": 2})
+    trained = train(port, tmp_path / "long.zip", settings)
+    assert trained.settings["n_steps"] == 64
+    first, *others = trained.settings["cycles"]
+    assert (first["stage"], first["virtual_steps"]) == ("learn", 3 * 512)
+    assert [one["stage"] for one in others] == ["refine"]
+    learner = restored(trained.path, spec, (64, 64))
+    learner.further[:] = -9.0
+    learner.keep_noise(0.5)
+    assert np.exp(learner.further) == pytest.approx(0.5 * EXPLORATION * 2, rel=1e-5), "half of 0.5 times 2 N m"
 
 
 def test_fastppo_continues_from_a_saved_policy(surrogate, tmp_path: Path):

@@ -122,7 +122,8 @@ class Learner:
         self.actor = layers_of(actor, self.parameters[: ends[0]])
         self.critic = layers_of(critic, self.parameters[ends[0] : ends[1]])
         self.further = self.parameters[ends[1] :]  # (F,) log standard deviations of continuous actions
-        self.further[:] = np.log(EXPLORATION * reach)
+        self._explores: Array = np.log(EXPLORATION * reach)
+        self.further[:] = self._explores
         sizes = (np.array(one, dtype=np.int64) for one in (actor, critic, ends, counts))
         self._fixed = *sizes, self.activation == "relu", centre, reach
         self._update = compiled_update()
@@ -148,6 +149,10 @@ class Learner:
         rows = batch.observations, batch.actions, batch.log_probabilities, batch.advantages, batch.returns
         moments, constants = (self._first, self._second), (self._updates, *astuple(objective), rate)
         self._update(self.parameters, *moments, *self._fixed, *rows, *constants)
+
+    def keep_noise(self, share: float) -> None:
+        """Raise the standard deviations of continuous actions to at least this share of their first values."""
+        np.maximum(self.further, self._explores + np.float32(np.log(share)), out=self.further)
 
     def take_up(self, learned: LearnedNetwork) -> None:
         """Take over parameters, statistics and Adam's moments of another learner of the same network."""

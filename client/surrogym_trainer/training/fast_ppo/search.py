@@ -57,6 +57,11 @@ FINE = 0.1  # learning rate in the stage ``refine``, as a share of that in the s
 # the stage ``refine`` first collects observations, without learning, in at most this share of the suggested steps
 LOOKS = 1 / 8
 CRITIC_ROLLOUTS = 8  # then only the critic learns, in this number of rollouts
+STEPS = 16  # number of steps of each lane in a rollout
+# Episodes of more than ``LONG`` steps that nothing ends have settings of their own (decision 105): the number of steps
+# of each lane in a rollout; the share of its first standard deviation that the actions' noise keeps in the stage
+# ``learn``; and the length of a cycle of this stage, as a multiple of the suggested number of steps.
+LONG, LONG_STEPS, LONG_NOISE, LONG_CYCLE = 320, 64, 0.6, 3
 STAGE_SEED = 2_000_003  # the seed of the actions' noise grows by this number from one stage to the next
 
 
@@ -74,10 +79,12 @@ class FastPpo(PolicySearch):
     2. *refine*: whole episodes from the declared starts, in one cycle. Inputs are standardised by the observations that
        the policy meets, and the critic is a new one.
 
-    If the user chose the number of steps, they form one cycle of the first stage.
+    If nothing ends the environment's long episodes, the stage *learn* has other starts, a larger discount horizon and
+    longer cycles, and keeps its noise. If the user chose the number of steps, they form one cycle of the first stage.
     """
 
-    n_steps: int = 16  # number of steps of each lane in a rollout
+    # number of steps of each lane in a rollout; None takes ``STEPS``, or ``LONG_STEPS`` if nothing ends long episodes
+    n_steps: int | None = None
     n_epochs: int = 10
     batch_size: int | None = None  # None takes a batch of about 1,024 steps
     learning_rate: float | None = None  # None lets the learning rate fall from 3e-3 to a fiftieth of that
@@ -125,14 +132,18 @@ class _Training:
         start = settings.start_from
         self._saved = None if start is None else restored(start, self._spec, units_of(self._spec))
         self._num_envs = settings.num_envs or LANES
-        self._rollout = self._num_envs * search.n_steps  # number of virtual steps in a rollout
+        self._learning = learn(task)  # the first stage
+        long = self._learning.long
+        self._steps = search.n_steps or (LONG_STEPS if long else STEPS)
+        self._rollout = self._num_envs * self._steps  # number of virtual steps in a rollout
         self._batch = search.batch_size or even_batch(self._rollout)
         self._objective = Objective(search.clip_range, search.vf_coef, search.max_grad_norm)
-        self._planned = max(task.steps // self._rollout, 1)  # number of planned rollouts
-        self._cycle = max(self._planned // CYCLES, 1) if task.prolong else self._planned
+        planned = task.steps * (LONG_CYCLE if long and task.prolong else 1)
+        self._planned = max(planned // self._rollout, 1)  # number of planned rollouts
+        self._cycle = max(self._planned // CYCLES, 1) if task.prolong and not long else self._planned
         # numbers of rollouts of the stage ``refine``: those that only collect observations, of an episode in each lane,
         # and those of its cycle
-        episode = -(-(self._spec.time_limit or LONGEST_EPISODE) // search.n_steps)
+        episode = -(-(self._spec.time_limit or LONGEST_EPISODE) // self._steps)
         self._looks = max(min(episode, int(LOOKS * self._planned)), 1)
         self._refining = max(int(REFINING * self._cycle), 1)
         # number of rollouts left before the stage ``refine``
@@ -168,7 +179,7 @@ class _Training:
 
     def _learn(self, learner: Learner, hold: int) -> None:
         """Train a network in cycles, as long as it gains; its noise stays the same for ``hold`` steps."""
-        own, stage = 0, learn(self._task)
+        own, stage = 0, self._learning
         self._gaining = True
         with self._open(stage):
             while self._gaining and self._left > 0 and not self._checks.saturated:
@@ -213,6 +224,8 @@ class _Training:
             remaining, rate = 1 - (own + number) / (own + rollouts), self._search.learning_rate
             rate = decaying(remaining) if rate is None else rate
             self._update(learner, rows, FINE * rate if fine else rate)
+            if stage.long:
+                learner.keep_noise(LONG_NOISE)
             if number == rollouts // 2 and not fine:
                 self._check(learner)
                 before = self._checks.returns_of_best
@@ -271,7 +284,7 @@ class _Training:
 
     def _collect(self, learner: Learner, hold: int = 1) -> Batch:
         """Collect a rollout, check the policy if a check is due, and report the progress."""
-        rollout = self._collector.collect(learner, self._search.n_steps, hold)
+        rollout = self._collector.collect(learner, self._steps, hold)
         self._checks.saw(rollout.earned)
         self._lost += rollout.lost
         before, self._taken = self._taken, self._taken + 1
@@ -299,8 +312,9 @@ class _Training:
         return checked(self._task.port, learner.policy(), self._task.settings)
 
     def _found(self, *, whole: bool) -> Found:
-        stage = learn(self._task)
-        chosen = {"gamma": self._gamma_of(stage), "batch_size": self._batch, "net_arch": units_of(self._spec)}
+        stage = self._learning
+        chosen: dict[str, Any] = {"n_steps": self._steps, "gamma": self._gamma_of(stage), "batch_size": self._batch}
+        chosen |= {"net_arch": units_of(self._spec), "start_box": stage.settings.learning["start_box"]}
         ran_with = {**asdict(self._search), **chosen, "num_envs": self._num_envs, "cycles": self._cycles}
         if "time_limit" in stage.settings.session:
             ran_with["time_limit"] = stage.settings.session["time_limit"]
@@ -340,6 +354,8 @@ class Stage:
     name: str
     settings: TrainSettings  # settings of the stage's episodes
     gamma: float  # discount factor
+    # whether nothing ends the environment's episodes of more than ``LONG`` steps, so that noise and cycles are larger
+    long: bool = False
 
 
 def learn(task: SearchTask) -> Stage:
@@ -350,6 +366,10 @@ def learn(task: SearchTask) -> Stage:
     episode includes the critic's value of its last state, so short episodes don't change what is optimal. Starts and
     lengths that the user chose are kept, and so are those of the preset ``paper``. The discount factor is then that of
     whole episodes.
+
+    If nothing ends long episodes, the stage is ``long``: all of its episodes begin anywhere, and the discount horizon
+    is a short episode. Most of the return then comes from staying where the reward is. A policy learns early to stay
+    there, and only much later the way there, which half an episode's sight and noise that has fallen do not find.
     """
     spec, settings = task.port.spec(), task.settings
     ways = settings.start_box, settings.start_visited, settings.horizon
@@ -360,6 +380,8 @@ def learn(task: SearchTask) -> Stage:
     length = min(max(limit // SHORTER, SHORTEST), limit)
     session = {**settings.session, "time_limit": length}
     short = replace(settings, session=session, judge=settings.judging)
+    if limit > LONG and spec.termination == () and spec.limits is None:
+        return Stage("learn", replace(short, start_box=1.0), 1 - 1 / length, long=True)
     return Stage("learn", short, 1 - 1 / (SIGHT * length))
 
 
