@@ -32,7 +32,7 @@ from surrogym_server.convert import definition_from_spec
 from surrogym_server.gp import Hyperparameters, Output, Posterior, Serving, condition
 from surrogym_server.models.gaussian_process.model import GaussianProcessModel
 from surrogym_server.tensors import in_blocks
-from surrogym_server.virtual import VirtualSettings, create, reset, step
+from surrogym_server.virtual import VirtualSettings, create, in_fastest_form, reset, step
 
 POINTS, OUTPUTS, INPUTS = 125, 4, 4
 BATCHES = (1, 1_024, 8_192)
@@ -148,7 +148,9 @@ def pendulum_model() -> GaussianProcessModel:
 
 
 def stepping(model: GaussianProcessModel, lanes: int, **chosen: Any) -> Call:
+    """Steps in the form that a session of this model takes, unless ``compiled`` is given."""
     settings = VirtualSettings(lanes, **chosen)
+    settings = settings if "compiled" in chosen else in_fastest_form(settings, model)
     state, _ = reset(model.definition, settings, create(model.definition, settings, 0))
     u = np.random.default_rng(0).uniform(-2, 2, (lanes, 1))
     return lambda: step(model, settings, state, u)
@@ -165,6 +167,7 @@ def particles(model: GaussianProcessModel, count: int, seconds: float) -> Row:
     bare = [products(s, PARTICLE_LANES * count, list(s.processes)) for s in stages]
     subjects = {
         "AUR-P": timed(stepping(model, PARTICLE_LANES, particles=count, **AUR_P)),
+        "in torch": timed(stepping(model, PARTICLE_LANES, particles=count, compiled=False, **AUR_P)),
         "products": timed(lambda: [call() for call in bare]),
     }
     made = measure(subjects, seconds)
