@@ -232,7 +232,11 @@ def test_a_machine_with_a_dead_time_gets_a_planner_that_acts_in_its_audit(
         queries = [query for query in api.queries(waiting) if query.purpose == "audit"]
         samples = [sample for sample in api.samples(waiting) if sample.query_id == queries[0].id]
     assert result.algorithm == "PLANNER"
-    assert said == [PROMISING, COMPARING, PROMISING], "a planner's virtual episodes may take minutes"
+    named = [words for words in said if "%" not in words]
+    assert named == [PROMISING, COMPARING, PROMISING], "a planner's virtual episodes may take minutes"
+    shares = [words.removeprefix(f"{PROMISING}: ") for words in said if "%" in words]
+    assert len(shares) == 2 * min(EPISODE, 100), "of the steps of both promises' episodes"
+    assert shares[-1] == "100 %"
     assert view.phase == "over_budget", "nothing of the budget is left to trials"
     assert handover.audit is not None
     assert handover.audit.passed

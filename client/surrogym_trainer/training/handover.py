@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -117,7 +118,22 @@ class Subject:
     def promise(self) -> Promise:
         """Compute the policy's promise in the latest model."""
         self.saying(PROMISING)
-        return promise_of(self.port, self.predict, self.seed, self.session, self.floor)
+        return promise_of(self.port, self._counting(), self.seed, self.session, self.floor)
+
+    def _counting(self) -> Predict:
+        """Return the policy, which says for each per cent of an episode that it has come so far. A network acts at the
+        server, where nothing is counted, and takes seconds; a planner takes minutes."""
+        if isinstance(self.predict, Network):
+            return self.predict
+        limit, calls = self.port.spec().time_limit or LONGEST_EPISODE, itertools.count(1)
+
+        def act(observations: NDArray[np.floating[Any]]) -> NDArray[Any]:
+            now = next(calls)
+            if 100 * now // limit > 100 * (now - 1) // limit:
+                self.saying(f"{PROMISING}: {min(100 * now // limit, 100)} %")
+            return self.predict(observations)
+
+        return act
 
 
 def hand_over(
