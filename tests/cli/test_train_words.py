@@ -106,11 +106,12 @@ def test_the_training_result_reports_networks_that_were_replaced_because_they_di
     assert "; 2 networks replaced because of slow learning; next" in words_of_result(replace(RESULT, networks=3))
 
 
-def test_the_training_result_says_why_a_planner_stands_in_for_networks():
-    said = words_of_result(replace(RESULT, algorithm="PLANNER"))
-    assert "; a planner, because networks learned slowly and earn clearly less in the surrogate; next" in said
-    assert "planner" not in words_of_result(replace(RESULT, networks=2))
-    assert "--start-from" not in words_of_interruption(replace(RESULT, algorithm="PLANNER"), "cart")
+def test_a_training_that_learned_slowly_names_the_planner_where_one_fits():
+    said = words_of_result(replace(RESULT, networks=2), fits_planner=True)
+    assert (
+        "; 1 network replaced because of slow learning (--algorithm planner plans with the model instead); next" in said
+    )
+    assert "planner" not in words_of_result(RESULT, fits_planner=True)
 
 
 def test_the_command_recommended_after_an_interrupted_training_repeats_its_improve_and_rounds_options():

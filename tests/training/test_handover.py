@@ -35,8 +35,7 @@ from surrogym_shared.spec import Design, EnvironmentSpec, ModelChoice, Uniform
 from surrogym_trainer.evaluation.evaluator import EvaluationSettings, evaluate
 from surrogym_trainer.policies.card import PolicyCard, read_card, write_card
 from surrogym_trainer.policies.integrals import with_integrals
-from surrogym_trainer.policies.planner_files import PlannerFile
-from surrogym_trainer.training import TrainResult, TrainSettings, audited, train
+from surrogym_trainer.training import TrainSettings
 from surrogym_trainer.training.audited import AuditedTraining
 from surrogym_trainer.training.handover import NO_SAMPLER, AuditSettings, Subject, hand_over, judge_episodes, way_of
 
@@ -480,26 +479,6 @@ def test_the_result_of_a_training_contains_a_failed_audit(line: Place, tmp_path:
     assert result.path.exists()
     assert not handover.trusted
     assert line.api.surrogate(line.name).ledger.audit == 8, "no budget is left to learn more"
-
-
-@pytest.mark.parametrize("networks", [1, 2])
-def test_a_planner_stands_in_for_networks_that_learned_slowly_and_earn_less(
-    line: Place, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, networks: int
-) -> None:
-    """The network has 64 steps, so it earns little; whether one was replaced is what this test sets."""
-
-    def short(port: Any, out: Path, settings: TrainSettings, progress: Any) -> TrainResult:
-        if settings.algorithm == "PLANNER":
-            return train(port, out, settings, progress)
-        return replace(train(port, out, replace(settings, total_steps=64), progress), networks=networks)
-
-    monkeypatch.setattr(audited, "train", short)
-    training = AuditedTraining(line.api, line.name, line.port, tmp_path / "p.zip", TrainSettings())
-    result, handover = training.train()
-    assert PlannerFile.is_at(result.path) is (result.algorithm == "PLANNER") is (networks == 2)
-    assert result.virtual_steps > 0
-    assert handover.promise is not None
-    assert handover.promise.median == pytest.approx(result.imagined_return, abs=1.0)
 
 
 @pytest.mark.parametrize("own", [True, False], ids=["its own surrogate", "another surrogate"])

@@ -16,7 +16,7 @@ from surrogym_trainer.policies.files import load_policy
 from surrogym_trainer.policies.integrals import with_integrals
 from surrogym_trainer.training.closed_loop import Candidates, ClosedLoop, LoopSettings, visit
 from surrogym_trainer.training.handover import MOST_AUDITS, AuditSettings, Handover, Subject, hand_over
-from surrogym_trainer.training.search import PLANNING, can_plan, search_for, with_algorithm
+from surrogym_trainer.training.search import PLANNING, search_for, with_algorithm
 from surrogym_trainer.training.settings import (
     TrainingInterrupted,
     TrainProgress,
@@ -30,15 +30,10 @@ from surrogym_trainer.training.settings import (
 from surrogym_trainer.training.trainer import train
 from surrogym_trainer.training.trials import Trials, allows_trials, is_waiting_for_trials
 
-PLANNED = "compares the network, which learned slowly, with a planner"
-
 
 @dataclass
 class AuditedTraining:
     """Train a policy, audit it, and hand it over.
-
-    If a network learned slowly and was replaced, a planner is made, too, and the one that earns clearly more in the
-    model is handed over.
 
     After each audit, one of these things happens.
 
@@ -114,26 +109,11 @@ class AuditedTraining:
         if rounds and tries and self._may_try(rounds):
             return Trials(*inputs, rounds, self.progress, self.waiting, self.candidates).train()
         if rounds is None or not rounds.queries:
-            return self._or_planned(train(self.port, self.out, self._chosen, self.progress))
+            return train(self.port, self.out, self._chosen, self.progress)
         loop = ClosedLoop(*inputs, rounds, self.progress, self.waiting, self.candidates)
         result = loop.train()
         self._unspent = loop.unspent
         return self._best(result)
-
-    def _or_planned(self, result: TrainResult) -> TrainResult:
-        """Return the result of a training, or that of a planner if the training had to replace a network, which had
-        learned slowly, and a planner earns clearly more in the model."""
-        if result.networks == 1 or not can_plan(self.settings, self.port.spec()):
-            return result
-        self.candidates.keep(result)
-        self.saying(PLANNED)
-        try:
-            planned = train(self.port, self.out, replace(self._chosen, algorithm=PLANNING), None)
-        except TrainingInterrupted as interruption:
-            raise self.candidates.after_ctrl_c(self.port, interruption.result, self._chosen) from None
-        except ValueError:  # the model does not allow planning
-            return result
-        return self._best(_joined(result, planned))
 
     def _may_try(self, rounds: LoopSettings) -> bool:
         """Whether policies try episodes: with a number of real steps, the rounds of a ready design take none."""
@@ -197,8 +177,6 @@ class AuditedTraining:
     def _train_on(self, result: TrainResult) -> TrainResult:
         """Train further, from the current policy, in the model that includes the audit's samples."""
         now = self._chosen
-        if result.algorithm == PLANNING:
-            now = replace(now, algorithm=PLANNING)
         if search_for(now).resumable:
             now = replace(now, start_from=self.out, trust_policy=False)
         try:

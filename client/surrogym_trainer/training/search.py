@@ -163,13 +163,7 @@ def with_algorithm(settings: TrainSettings, spec: EnvironmentSpec) -> TrainSetti
 def _is_planned(settings: TrainSettings, spec: EnvironmentSpec) -> bool:
     """Whether a planner is the default: the environment can only be reset, and has so many coordinates because some
     repeat actions, through which a planner looks. Networks stay at a local optimum there, or need two to three times
-    the real steps (decision 101)."""
-    return spec.access == "reset" and len(spec.coordinates) > MOST_PLANNED and can_plan(settings, spec)
-
-
-def can_plan(settings: TrainSettings, spec: EnvironmentSpec) -> bool:
-    """Whether a planner may stand in for a training with these settings, as far as the specification says. A setting
-    that only a training has asks for a network."""
+    the real steps (decision 101). A setting that only a training has asks for a network."""
     of_planner = {field.name for field in fields(cast("Any", SEARCHES.get(PLANNING)))}
     plain = TrainSettings(
         seed=settings.seed,
@@ -179,7 +173,9 @@ def can_plan(settings: TrainSettings, spec: EnvironmentSpec) -> bool:
         hyperparameters={name: value for name, value in settings.hyperparameters.items() if name in of_planner},
     )
     return (
-        spec.fits_planner
+        spec.access == "reset"
+        and spec.fits_planner
+        and len(spec.coordinates) > MOST_PLANNED
         and spec.design.model in (None, FAMILY)
         and settings == plain
         and find_spec("surrogym_server") is not None

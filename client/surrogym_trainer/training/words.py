@@ -18,6 +18,7 @@ def words_of_result(
     *,
     asked: int | None = None,
     closed_loop: bool = False,
+    fits_planner: bool = False,
     server: str | None = None,
     env_option: str = "",
 ) -> str:
@@ -28,6 +29,7 @@ def words_of_result(
         handover: the promise and whether it is trusted.
         asked: number of virtual steps that ``--steps`` gave; None without it.
         closed_loop: whether ``--improve`` was given.
+        fits_planner: whether a planner could act in this environment.
         server: address that the next command needs; None if it needs none.
         env_option: option of the next command that names the environment, with a space before it.
     """
@@ -39,7 +41,7 @@ def words_of_result(
     return (
         f"{result.path}: {taken if result.virtual_steps else 'made without training'} in {result.seconds:.1f} s"
         f"{_imagined(result.imagined_return)}{cut}{rounds}"
-        f"{_given_up(result)}{_gaining(result)}; next: surrogym evaluate {path}{options}"
+        f"{_given_up(result.networks - 1, fits_planner)}{_gaining(result)}; next: surrogym evaluate {path}{options}"
         f"{'' if handover is None else chr(10) + words_of_handover(handover)}"
     )
 
@@ -92,9 +94,7 @@ def words_of_range(left: RangeLeft) -> str:
 def words_of_interruption(result: TrainResult, asked: str) -> str:
     """Return a text about the policy that was saved at Ctrl-C, and about how to continue its training. ``asked`` holds
     the arguments of the command: the surrogate and its options."""
-    from surrogym_trainer.training.search import PLANNING
-
-    if not result.virtual_steps or result.algorithm == PLANNING:  # no network, so nothing can be continued
+    if not result.virtual_steps:  # nothing was trained, so nothing can be continued
         return (
             f"interrupted; the policy is in {result.path}, not audited; to make it again: surrogym train {asked} --out "
             f"{result.path}"
@@ -113,13 +113,11 @@ def words_of(now: dict[str, Any]) -> str:
     return f"{doing}{_imagined(now['imagined_return'])}{penalty}{_known(now.get('visited_confidence'))}"
 
 
-def _given_up(result: TrainResult) -> str:
-    from surrogym_trainer.training.search import PLANNING
-
-    if result.algorithm == PLANNING and result.virtual_steps:
-        return "; a planner, because networks learned slowly and earn clearly less in the surrogate"
-    networks = result.networks - 1
-    return f"; {networks} network{'s' * (networks > 1)} replaced because of slow learning" if networks else ""
+def _given_up(networks: int, fits_planner: bool) -> str:
+    if not networks:
+        return ""
+    way = " (--algorithm planner plans with the model instead)" if fits_planner else ""
+    return f"; {networks} network{'s' * (networks > 1)} replaced because of slow learning{way}"
 
 
 def _gaining(result: TrainResult) -> str:

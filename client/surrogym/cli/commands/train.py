@@ -104,6 +104,7 @@ def command(
         words_of_result,
         asked=search.steps,
         closed_loop=bool(loop.improve),
+        fits_planner=spec.fits_planner,
         server=named,
         env_option=env_option(spec.environment),
     )
