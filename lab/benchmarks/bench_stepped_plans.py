@@ -23,8 +23,8 @@ from bench_priors import scaled
 from mujoco.rollout import Rollout
 
 from surrogym_sampler import original
-from surrogym_sampler.original.protocol import Array
-from surrogym_sampler.priors.calibration import adjustable, calibrate, layers, read_parameters
+from surrogym_sampler.original.protocol import Array, RealStep
+from surrogym_sampler.priors.calibration import RealTransitions, adjustable, calibrate, layers, read_parameters
 from surrogym_shared.spec import EnvironmentSpec
 
 EPISODE, PLANS, ELITE, ROUNDS, HORIZON, HELD = 1_000, 64, 8, 2, 40, 5
@@ -54,7 +54,7 @@ def run(task: str, seed: int, count: int) -> None:
     names = tuple(own.parameters())
     factors = 1 + rng.choice([-1, 1], len(names)) * rng.uniform(0.2, 0.3, len(names))
     plant = scaled(opened(task, access="reset"), names, factors)
-    truth, real = adjustable(plant).parameters(), taken(plant, rng, count)
+    truth, real = adjustable(plant).parameters(), transitions(taken(plant, rng, count))
     before = np.array([own.parameters()[name] for name in names])
 
     def step(values: Any, q: Any, u: Any) -> Any:
@@ -78,6 +78,11 @@ def run(task: str, seed: int, count: int) -> None:
             f"{task} {seed}: planned in the simulator, {words}: {earned:.0f}; {time.process_time() - begun:.0f} s",
             flush=True,
         )
+
+
+def transitions(steps: list[RealStep]) -> RealTransitions:
+    columns = ("coordinates", "action", "next_coordinates")
+    return RealTransitions(*(np.array([getattr(step, name) for step in steps]) for name in columns))
 
 
 def episode(task: str, plant: Any, physics: Any, seed: int) -> float:

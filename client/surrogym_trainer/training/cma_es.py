@@ -18,17 +18,14 @@ from numpy.typing import NDArray
 from surrogym_sampler.original.protocol import LONGEST_EPISODE
 from surrogym_shared.network import Network
 from surrogym_shared.port import SurrogatePort
-from surrogym_trainer.evaluation.imagined import (
-    Imagined,
-    imagine,
-    observation_statistics,
-)
+from surrogym_trainer.evaluation.imagined import STATISTICS_LANES, Imagined, imagine, observation_statistics
 from surrogym_trainer.training.checks import checked
 from surrogym_trainer.training.search import Found, PolicySearch, SearchTask
 from surrogym_trainer.training.settings import CHECKS, TrainProgress, TrainSettings
 
 # largest number of parameters with a full covariance; with more, it is diagonal (separable CMA-ES)
 FULL_COVARIANCE = 200
+SMALLEST = 1e-6  # an entry of observations with a smaller standard deviation is not scaled
 
 
 @dataclass(frozen=True)
@@ -100,9 +97,11 @@ class _Distribution:
     def __init__(self, port: SurrogatePort, settings: TrainSettings, choices: CmaEs) -> None:
         self.choices = choices
         self._port, self._settings, self._spec = port, settings, port.spec()
-        mean, deviation = observation_statistics(port, settings.seed)
-        self._mean, self._deviation = np.array(mean), np.array(deviation)
+        self._seen = _Statistics(STATISTICS_LANES, *map(np.array, observation_statistics(port, settings.seed)))
         size = Network.size(self._spec, choices.units)
+        self._scale = np.ones(size)
+        if choices.units == 0:
+            self._scale[-self._spec.action.size :] /= np.sqrt(len(self._spec.observation))
         kind = CMA if size <= FULL_COVARIANCE else SepCMA
         self._cma = kind(_first(settings, size), choices.sigma, population_size=choices.population, seed=settings.seed)
 
@@ -118,7 +117,10 @@ class _Distribution:
         drawn = [self._cma.ask() for _ in range(choices.population)]
         everyone = self._network(np.stack(drawn))
 
+        visited: list[NDArray[Any]] = []
+
         def predict(observation: NDArray[Any]) -> NDArray[Any]:
+            visited.append(observation)
             actions = everyone(observation.reshape(choices.population, choices.starts, -1))
             return actions.reshape(len(observation), *actions.shape[2:])
 
@@ -126,6 +128,8 @@ class _Distribution:
         starts = np.random.default_rng([self._settings.seed, number]).integers(2**62, size=choices.starts)
         seeds = [int(seed) for seed in np.tile(starts, choices.population)]
         seen = imagine(self._port, predict, lanes, seeds, **self._settings.session)
+        if choices.units == 0:
+            self._seen = self._seen.with_all(np.concatenate(visited))
         scores = seen.returns.reshape(choices.population, choices.starts).mean(1)
         self._cma.tell([(x, -float(score)) for x, score in zip(drawn, scores, strict=True)])
         return seen
@@ -135,7 +139,23 @@ class _Distribution:
         return float(checked(self._port, self.policy, self._settings).mean())
 
     def _network(self, vector: NDArray[np.float64]) -> Network:
-        return Network.of(self._spec, self._mean, self._deviation, self.choices.units, vector)
+        return Network.of(self._spec, self._seen.mean, self._seen.deviation, self.choices.units, vector * self._scale)
+
+
+@dataclass(frozen=True)
+class _Statistics:
+    """Mean (D,) and standard deviation (D,) of each of D entries over ``count`` observations."""
+
+    count: int
+    mean: NDArray[np.float64]
+    deviation: NDArray[np.float64]
+
+    def with_all(self, more: NDArray[Any]) -> _Statistics:
+        """Return the statistics with more observations (N, D)."""
+        share, off = len(more) / (self.count + len(more)), more.mean(0) - self.mean
+        square = (1 - share) * self.deviation**2 + share * more.var(0) + share * (1 - share) * off**2
+        deviation = np.where(square > SMALLEST**2, np.sqrt(square), 1.0)
+        return _Statistics(self.count + len(more), self.mean + share * off, deviation)
 
 
 def _first(settings: TrainSettings, size: int) -> NDArray[np.float64]:
