@@ -88,6 +88,7 @@ OTHERWISE = {
     "docs/how-to/drift.md": "tests/cli/test_watch.py and test_renew.py run the commands",
     "docs/how-to/controller-c.md": "tests/deployment compiles its program and runs the vectors",
     "docs/how-to/priors.md": "tests/docs/test_how_to.py runs its programs, tests/cli/test_prior.py the command",
+    "docs/how-to/contacts.md": "tests/docs/test_how_to.py runs its program without the training, which takes minutes",
     "docs/how-to/history.md": "tests/docs/test_how_to.py runs its programs",
     "docs/how-to/limits.md": "tests/docs/test_how_to.py runs its program",
     "docs/how-to/planner.md": "tests/plugins/test_policy_searches.py makes and loads a planner",

@@ -93,6 +93,27 @@ def test_cma_es_continues_from_a_saved_network(surrogate, tmp_path: Path):
         train(surrogate, tmp_path / "third.zip", wider)
 
 
+@pytest.mark.parametrize("units", [0, 4])
+def test_cma_es_begins_with_the_saved_policy_itself(surrogate, tmp_path: Path, units):
+    """Also with another seed, whose observations of the sampling range have other statistics."""
+    choices = {**SMALL, "units": units}
+    first = train(surrogate, tmp_path / "first.zip", small(total_steps=1_000, hyperparameters=choices))
+    again = small(start_from=first.path, seed=1, total_steps=320, hyperparameters=choices | {"sigma": 1e-12})
+    second = train(surrogate, tmp_path / "second.zip", again)
+    np.testing.assert_allclose(Network.load(second.path).vector, Network.load(first.path).vector, atol=1e-9)
+    if units:
+        np.testing.assert_array_equal(Network.load(second.path).mean, Network.load(first.path).mean)
+
+
+def test_a_linear_policy_of_cma_es_is_scaled_by_the_observations_that_candidates_saw(tmp_path: Path):
+    surrogate = local(cartpole().model_copy(update={"time_limit": 10}))
+    linear, other = (small(total_steps=640, hyperparameters=SMALL | {"units": units}) for units in (0, 4))
+    visited, anywhere = (
+        Network.load(train(surrogate, tmp_path / "p.zip", one).path).deviation for one in (linear, other)
+    )
+    assert (visited < anywhere).all()  # starts are near the upright pole
+
+
 def test_unknown_cma_es_hyperparameters_are_refused(surrogate, tmp_path: Path):
     with pytest.raises(ValueError, match="population, starts, units, sigma, got gamma"):
         train(surrogate, tmp_path / "policy.zip", small(hyperparameters={"gamma": 0.9}))

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from contextlib import suppress
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -31,7 +32,11 @@ SMALLEST = 1e-6  # an entry of observations with a smaller standard deviation is
 @dataclass(frozen=True)
 class CmaEs(PolicySearch):
     """Policy search by CMA-ES over the parameters of a network. The result is the mean of the distribution in
-    the generation in which the mean has the best imagined return."""
+    the generation in which the mean has the best imagined return.
+
+    A linear policy (``units=0``) standardises observations by all that its candidates saw so far, as H. Mania et al. do
+    ("Simple random search", 2018). Any other policy standardises them by the sampling range.
+    """
 
     population: int = 24  # number of candidates in each generation
     starts: int = 16  # number of episodes of each candidate
@@ -97,13 +102,17 @@ class _Distribution:
     def __init__(self, port: SurrogatePort, settings: TrainSettings, choices: CmaEs) -> None:
         self.choices = choices
         self._port, self._settings, self._spec = port, settings, port.spec()
-        self._seen = _Statistics(STATISTICS_LANES, *map(np.array, observation_statistics(port, settings.seed)))
+        mean, deviation = map(np.array, observation_statistics(port, settings.seed))
         size = Network.size(self._spec, choices.units)
-        self._scale = np.ones(size)
-        if choices.units == 0:
-            self._scale[-self._spec.action.size :] /= np.sqrt(len(self._spec.observation))
+        first, self._scale = np.zeros(size), np.ones(size)
+        if choices.units == 0:  # a bias changes the outputs no more than a weight does
+            self._scale[len(mean) * (size // (len(mean) + 1)) :] /= np.sqrt(len(mean))
+        if settings.start_from is not None:
+            start = _loaded(settings.start_from, size)
+            mean, deviation, first = start.mean, start.deviation, start.vector / self._scale
+        self._seen = _Statistics(STATISTICS_LANES, mean, deviation)
         kind = CMA if size <= FULL_COVARIANCE else SepCMA
-        self._cma = kind(_first(settings, size), choices.sigma, population_size=choices.population, seed=settings.seed)
+        self._cma = kind(first, choices.sigma, population_size=choices.population, seed=settings.seed)
 
     @property
     def policy(self) -> Network:
@@ -116,11 +125,11 @@ class _Distribution:
         choices = self.choices
         drawn = [self._cma.ask() for _ in range(choices.population)]
         everyone = self._network(np.stack(drawn))
-
         visited: list[NDArray[Any]] = []
 
         def predict(observation: NDArray[Any]) -> NDArray[Any]:
-            visited.append(observation)
+            if choices.units == 0:
+                visited.append(observation)
             actions = everyone(observation.reshape(choices.population, choices.starts, -1))
             return actions.reshape(len(observation), *actions.shape[2:])
 
@@ -128,7 +137,7 @@ class _Distribution:
         starts = np.random.default_rng([self._settings.seed, number]).integers(2**62, size=choices.starts)
         seeds = [int(seed) for seed in np.tile(starts, choices.population)]
         seen = imagine(self._port, predict, lanes, seeds, **self._settings.session)
-        if choices.units == 0:
+        if visited:
             self._seen = self._seen.with_all(np.concatenate(visited))
         scores = seen.returns.reshape(choices.population, choices.starts).mean(1)
         self._cma.tell([(x, -float(score)) for x, score in zip(drawn, scores, strict=True)])
@@ -158,14 +167,12 @@ class _Statistics:
         return _Statistics(self.count + len(more), self.mean + share * off, deviation)
 
 
-def _first(settings: TrainSettings, size: int) -> NDArray[np.float64]:
-    if settings.start_from is None:
-        return np.zeros(size)
-    vector = Network.load(settings.start_from).vector
-    if len(vector) != size:
+def _loaded(path: Path, size: int) -> Network:
+    """Return a saved network, which has ``size`` parameters."""
+    network = Network.load(path)
+    if len(network.vector) != size:
         raise ValueError(
-            f"{settings.start_from}: expected a network with {size} parameters, as this training has, got "
-            f"{len(vector)}: "
+            f"{path}: expected a network with {size} parameters, as this training has, got {len(network.vector)}: "
             "start without it"
         )
-    return vector
+    return network

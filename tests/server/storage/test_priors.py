@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import pytest
 
-from surrogym_server.errors import UnknownSurrogate
+from surrogym_server.errors import LeaseExpired, UnknownSurrogate
 from surrogym_server.storage.records import NewDesign
 from surrogym_server.storage.sql import Storage
 
@@ -60,6 +60,21 @@ def test_storing_a_prior_withdraws_pending_queries_and_makes_a_fit_due(
     storage.priors.put(name, BLOB, ABOUT)
     assert not storage.queries.list(name, ("pending",))
     assert name in storage.designs.due()
+
+
+def test_a_fit_that_runs_while_a_prior_is_stored_is_not_kept(
+    storage: Storage, make: Callable[..., str], answer_all: Callable[[str], None], design: Callable[..., NewDesign]
+):
+    name = make()
+    answer_all(name)
+    without = storage.designs.begin(name, "me", SECONDS)
+    assert without is not None
+    storage.priors.put(name, BLOB, ABOUT)
+    with pytest.raises(LeaseExpired):
+        storage.designs.commit(without, design())
+    beside = storage.designs.begin(name, "me", SECONDS)
+    assert beside is not None
+    assert storage.designs.commit(beside, design()) == 1
 
 
 def test_removing_a_prior_makes_a_fit_without_it_due(
