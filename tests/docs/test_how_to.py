@@ -160,7 +160,7 @@ def test_the_how_to_program_for_contacts_calibrates_and_trains_in_the_simulator(
     pytest.importorskip("mujoco")
     (program,) = programs("contacts.md")
     small = "from surrogym_trainer.training import checks\nchecks.CHECK_EPISODES = 1\n"
-    short = program.replace("3_000_000", "1").replace("range(3)", "range(1)").replace('limit": 500', 'limit": 5')
+    short = program.replace("3_000_000", "1").replace("range(2)", "range(1)").replace('limit": 500', 'limit": 5')
     values, policy = run(tmp_path, "-c", small + short).splitlines()
     assert "'gear.bthigh': 119.99" in values
     assert policy.startswith("gait-0.zip ")
