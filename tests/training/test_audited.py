@@ -111,6 +111,15 @@ def test_after_a_failed_audit_with_unchanged_promised_return_the_policy_is_untru
     assert not handover.trusted
 
 
+def test_a_policy_is_untrusted_if_no_second_audit_follows_a_failed_one(monkeypatch, tmp_path: Path) -> None:
+    """The sampler has gone, or the audits have taken all their steps: a ready design alone was trusted then."""
+    unaudited = Handover(promise(97.5), None, True, "the design is ready; not audited: no sampler is connected")
+    trainings, _, handover = run(monkeypatch, tmp_path, found(95.6, -21.6, passed=False), unaudited)
+    assert trainings.made == 2
+    assert not handover.trusted
+    assert handover.reason.startswith("the audit before failed, and the policy trained since has none")
+
+
 def test_training_ends_if_the_audit_found_that_the_machine_is_not_as_declared(monkeypatch, tmp_path: Path) -> None:
     """The next audit may have begun at a declared start, and the promise would have been trusted."""
     failed = found(95.6, -21.6, passed=False)

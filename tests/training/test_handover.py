@@ -227,6 +227,19 @@ def test_an_audit_by_resets_takes_as_many_rollouts_of_the_policy_as_reach_its_st
     assert audit.untested < 0.2
 
 
+def test_a_policy_whose_audit_has_no_steps_left_is_handed_over_without_one(server_process: ServerProcess) -> None:
+    """A training that had ended with its third audit refused was lost in an error."""
+    with placed(server_process.url, rail.SPEC, rail.Rail()) as place:
+        for length in (20, 20, 20, 20, 20, 20, 5):
+            place.api.add_queries(place.name, rollouts=[[[0.0]] * length], audit=True)
+        before = len(place.api.queries(place.name))
+        handover = hand_over(place.subject(), AUDIT)
+        assert len(place.api.queries(place.name)) == before
+    assert handover.audit is None
+    assert handover.promise is not None
+    assert "at most 3 more real steps of audits, got 8" in handover.reason
+
+
 class Wide(rail.Rail):
     """The rail, whose episodes begin anywhere."""
 

@@ -88,12 +88,16 @@ class AuditedTraining:
             ValueError: the settings don't fit the search.
             SurrogymClientError: the server can't be reached, or refuses a request.
         """
-        result = self._first()
+        result, failed = self._first(), False
         self.candidates.keep(result)
         try:
             for number in range(1, MOST_AUDITS + 1):
                 taken = self.api.surrogate(self.name).ledger.total
                 handover = hand_over(self._subject(result), self.audit, self.waiting)
+                if failed and handover.audit is None:  # the next audit was not possible: a ready design is not enough
+                    reason = f"the audit before failed, and the policy trained since has none: {handover.reason}"
+                    handover = replace(handover, trusted=False, reason=reason)
+                failed = handover.audit is not None and not handover.audit.passed
                 if number == MOST_AUDITS or not self._to_be_trained_on(handover.audit, result, taken, number):
                     break
                 result = self._train_on(result)

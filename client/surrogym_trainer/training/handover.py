@@ -163,6 +163,8 @@ def _handed_over(
         found = take(subject, audit, before, progress)
     except NobodyAnswers:
         return _unaudited(subject, before, NO_SAMPLER)
+    except BeyondBudget as refusal:  # a policy that was trained for minutes is not lost
+        return _unaudited(subject, before, str(refusal))
     if found is None:
         return _unaudited(subject, before, "none of its queries was answered")
     trusted, reason = _verdict(found, subject.floor)

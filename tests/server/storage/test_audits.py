@@ -11,6 +11,7 @@ from support.queries import steps
 from surrogym_server.errors import BeyondBudget
 from surrogym_server.storage.records import NewSample
 from surrogym_server.storage.sql import Storage
+from surrogym_shared.nouns import Query
 from surrogym_shared.states import LEAST_AUDITED
 
 Make = Callable[..., str]
@@ -48,3 +49,19 @@ def test_the_reward_range_of_a_surrogate_covers_all_its_samples(
     assert storage.samples.reward_range(name) is None
     storage.samples.add(name, "a", [by_hand(reward=reward) for reward in (2.0, -1.5, 0.0)], key="k")
     assert storage.samples.reward_range(name) == (-1.5, 2.0)
+
+
+def test_steps_that_an_audits_rollout_did_not_take_are_left_for_other_audits(
+    storage: Storage, make: Make, answer: Callable[..., NewSample]
+) -> None:
+    """A rollout that ended early counted with all its expected steps, unlike in the ledger."""
+    name = make(queries=0, budget=3)
+    storage.queries.enqueue(name, [Query.rollout([[0.0]] * (LEAST_AUDITED - 4))], purpose="audit")
+    [query] = storage.queries.claim(name, "a", 1, 60.0)
+    with pytest.raises(BeyondBudget, match="at most 4 more"):
+        storage.queries.enqueue(name, [Query.rollout([[0.0]] * 5)], purpose="audit")
+    storage.samples.add(name, "a", [answer(query, step=step, terminated=step == 1) for step in range(2)])
+    assert storage.ledger.read(name).audit == 2
+    with pytest.raises(BeyondBudget, match=f"at most {LEAST_AUDITED - 2} more"):
+        storage.queries.enqueue(name, [Query.rollout([[0.0]] * (LEAST_AUDITED - 1))], purpose="audit")
+    storage.queries.enqueue(name, [Query.rollout([[0.0]] * (LEAST_AUDITED - 2))], purpose="audit")

@@ -28,7 +28,13 @@ from surrogym_server.storage.records import (
 from surrogym_server.storage.sql import surrogates as surrogate_rows
 from surrogym_server.storage.sql.database import NOW, Database, conflict_insert, constant, damaged
 from surrogym_server.storage.sql.models import insert_model
-from surrogym_server.storage.sql.queries import IS_INCOMPLETE, begin_initial, insert_queries, queue_initial
+from surrogym_server.storage.sql.queries import (
+    IS_INCOMPLETE,
+    begin_initial,
+    insert_queries,
+    queue_initial,
+    spoken_for,
+)
 from surrogym_server.storage.sql.rows import append_event, checksum, find, hold, recall, remember, set_columns, touch
 from surrogym_server.storage.sql.surrogates import NO_RIGHT
 from surrogym_server.storage.sql.tables import occupancies, priors, queries, samples, surrogates
@@ -252,7 +258,7 @@ def _lasting(expires: float, seconds: float) -> dict[str, float]:
 def _unspoken(connection: Connection, record: SurrogateRecord) -> int:
     """Return the number of real steps that the budget has left; negative if the budget was lowered, or if samplers
     reported more samples than it allows."""
-    return record.budget - surrogate_rows.spoken_for(connection, record.id) - record.extra_queries
+    return record.budget - spoken_for(connection, record.id) - record.extra_queries
 
 
 def _to_raise(connection: Connection, record: SurrogateRecord, queries: int, *, allowed: bool) -> int:

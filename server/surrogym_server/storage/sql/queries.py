@@ -30,6 +30,7 @@ from surrogym_server.errors import (
     UnknownQuery,
 )
 from surrogym_server.storage.records import (
+    FREE,
     LeasedQuery,
     NewSample,
     QueryRecord,
@@ -98,7 +99,7 @@ class Queries:
         """
         body = fingerprint(purpose, *(asdict(query) for query in new_queries))
         with self._database.write() as connection:
-            surrogate = hold(connection, name)
+            surrogate = hold(connection, name, surrogates.c.budget)
             before: list[int] | None = recall(connection, surrogate, "enqueue", key, body)
             if before is not None:
                 return before
@@ -214,17 +215,32 @@ class Queries:
 def _require_room(connection: Connection, surrogate: Row[Any], steps: int) -> None:
     """Raise ``BeyondBudget`` if the surrogate's audits, with ``steps`` more real steps, would take more than its budget
     and more than ``LEAST_AUDITED`` steps."""
-    sums = sa.select(sa.func.coalesce(sa.func.sum(queries.c.steps), 0), sa.func.max(surrogates.c.budget))
-    own = (queries.c.surrogate_id == surrogates.c.id) & (queries.c.purpose == "audit")
-    join = sums.select_from(surrogates.outerjoin(queries, own)).where(surrogates.c.id == surrogate.id)
-    before, budget = connection.execute(join).one()
-    limit = max(int(budget), LEAST_AUDITED)
+    before = spoken_for(connection, surrogate.id, audits=True)
+    limit = max(int(surrogate.budget), LEAST_AUDITED)
     if before + steps > limit:
         raise BeyondBudget(
-            f"expected at most {max(0, limit - int(before))} more real steps of audits, got {steps}: all audits "
+            f"expected at most {max(0, limit - before)} more real steps of audits, got {steps}: all audits "
             f"together may take {limit}, the larger of the budget and {LEAST_AUDITED}; raise the budget with surrogym "
             "change --budget"
         )
+
+
+def spoken_for(connection: Connection, surrogate_id: int, *, audits: bool = False) -> int:
+    """Return the number of real steps that count towards the budget, or those of ``audits``: samples, and steps of
+    unanswered queries.
+
+    Queries that were set aside count, because steps may have been taken; refused queries don't.
+    """
+
+    def counts(table: sa.Table) -> sa.ColumnElement[bool]:
+        own = table.c.purpose == "audit" if audits else table.c.purpose.not_in(FREE)
+        return (table.c.surrogate_id == surrogate_id) & own
+
+    sampled = sa.select(sa.func.count()).where(counts(samples))
+    steps = sa.select(sa.func.coalesce(sa.func.sum(queries.c.steps), 0)).where(
+        counts(queries), queries.c.status.not_in(("answered", "refused"))
+    )
+    return int(connection.execute(sa.select(sampled.scalar_subquery() + steps.scalar_subquery())).scalar_one())
 
 
 def _lease_expired(query_id: int) -> LeaseExpired:

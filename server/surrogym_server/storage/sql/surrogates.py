@@ -17,7 +17,6 @@ from sqlalchemy.engine import Connection, Row
 
 from surrogym_server.errors import UnknownSurrogate
 from surrogym_server.storage.records import (
-    FREE,
     LedgerRecord,
     NewSurrogate,
     QueryCounts,
@@ -27,7 +26,14 @@ from surrogym_server.storage.records import (
 )
 from surrogym_server.storage.sql.database import BATCH, NOW, Database, conflict_insert, damaged
 from surrogym_server.storage.sql.models import newest_of
-from surrogym_server.storage.sql.queries import begin_initial, end_initial, is_unbegun, queue_initial, requeue_set_aside
+from surrogym_server.storage.sql.queries import (
+    begin_initial,
+    end_initial,
+    is_unbegun,
+    queue_initial,
+    requeue_set_aside,
+    spoken_for,
+)
 from surrogym_server.storage.sql.rows import (
     IS_THERE,
     NAMED,
@@ -259,21 +265,6 @@ def withdraw_unbegun(
         gone.append(row.id)
     connection.execute(sa.delete(queries).where(queries.c.id.in_(gone)))
     return changes
-
-
-def spoken_for(connection: Connection, surrogate_id: int) -> int:
-    """Return the number of real steps that count towards the budget: samples, and steps of unanswered queries, except
-    those of logs and audits.
-
-    Queries that were set aside count, because steps may have been taken; refused queries don't.
-    """
-    sampled = sa.select(sa.func.count()).where(samples.c.surrogate_id == surrogate_id, samples.c.purpose.not_in(FREE))
-    steps = sa.select(sa.func.coalesce(sa.func.sum(queries.c.steps), 0)).where(
-        queries.c.surrogate_id == surrogate_id,
-        queries.c.status.not_in(("answered", "refused")),
-        queries.c.purpose.not_in(FREE),
-    )
-    return int(connection.execute(sa.select(sampled.scalar_subquery() + steps.scalar_subquery())).scalar_one())
 
 
 def _apply(connection: Connection, surrogate: Row[Any], changes: dict[str, Any]) -> None:
