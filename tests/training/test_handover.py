@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 from uuid import uuid4
 
 import numpy as np
@@ -35,7 +36,7 @@ from surrogym_shared.spec import Design, EnvironmentSpec, ModelChoice, Uniform
 from surrogym_trainer.evaluation.evaluator import EvaluationSettings, evaluate
 from surrogym_trainer.policies.card import PolicyCard, read_card, write_card
 from surrogym_trainer.policies.integrals import with_integrals
-from surrogym_trainer.training import TrainSettings
+from surrogym_trainer.training import TrainSettings, handover
 from surrogym_trainer.training.audited import AuditedTraining
 from surrogym_trainer.training.handover import NO_SAMPLER, AuditSettings, Subject, hand_over, judge_episodes, way_of
 
@@ -225,6 +226,25 @@ def test_an_audit_by_resets_takes_as_many_rollouts_of_the_policy_as_reach_its_st
     assert audit.steps == len(queries) * (42 // len(queries))
     assert audit.passed, audit.faults
     assert audit.untested < 0.2
+
+
+@pytest.mark.parametrize(("steps", "longest", "sizes"), [(100, 5, [5] * 8), (8, 5, [5] * 2), (64, 200, [16] * 4)])
+def test_an_audit_of_more_steps_or_shorter_rollouts_takes_more_rollouts(
+    monkeypatch: pytest.MonkeyPatch, steps: int, longest: int, sizes: list[int]
+) -> None:
+    """An audit of 100 steps by rollouts of 5 was one rollout, and a longer audit reached fewer starts.
+
+    Each episode of the policy stays at its start, and every second start is the same, so four show all states.
+    """
+    starts = np.array([-0.9, -0.3, 0.3, 0.9] * 2) if longest > 5 else np.zeros(8)
+    ways = [(np.full((200, 1), start), np.zeros((200, 1))) for start in starts]
+    monkeypatch.setattr(handover, "ways_of", lambda _subject, _episodes, most: [(q[:most], u[:most]) for q, u in ways])
+    spec = rail.SPEC.model_copy(update={"time_limit": 200, "max_rollout": longest})
+    subject = Mock()
+    subject.api.surrogate.return_value = Mock(budget=10, ledger=Mock(audit=0))
+    subject.port.spec.return_value = spec
+    states = np.concatenate([q for q, _ in ways]) + np.linspace(0, 0.01, 1_600)[:, None]
+    assert [len(actions) for actions in handover._rollouts(subject, steps, states, 200)] == sizes
 
 
 def test_a_policy_whose_audit_has_no_steps_left_is_handed_over_without_one(server_process: ServerProcess) -> None:

@@ -278,7 +278,7 @@ class LoopOptions:
             min=2,
             max=256,
             help="Number of real steps with which an audit begins; as many again follow, up to 40 in all, while they "
-            "leave the promise undecided.",
+            "leave the promise undecided. An environment that can only be reset takes at least as many, in rollouts.",
         ),
     ] = 8
 

@@ -392,26 +392,28 @@ def _rollouts(subject: Subject, steps: int, q: Array, most: int) -> list[list[li
     """Return the actions, (T, F) each, that are expected in the rollouts of an audit.
 
     One rollout knows the ways from one start, so there may be several, of equal length: the fewest that are expected to
-    come near to all of the states q (m, C) that the policy visits but half of ``MOST_UNTESTED``. They take one audit's
-    share of the steps that all audits may take, or two shares if one is not enough; at least ``steps``, unless episodes
-    are shorter. If no number of rollouts is enough, those of one share that leave fewest states are taken. ``most`` is
-    the greatest length of a rollout where the specification has none.
+    come near to all of the states q (m, C) that the policy visits but half of ``MOST_UNTESTED``, and have ``steps``
+    learned steps in all. They take one audit's share of the steps that all audits may take, or two shares if one is not
+    enough. If no number of rollouts is enough, those of one share that miss fewest steps, then fewest states, are
+    taken. ``most`` is the greatest length of a rollout where the specification has none.
     """
     view, spec = subject.api.surrogate(subject.name), subject.port.spec()
     longest, unknown = min(spec.time_limit or LONGEST_EPISODE, spec.max_rollout or most), spec.unknown_steps
     left = _left_for_audits(view)
     share = max(min(max(view.budget, LEAST_AUDITED) // MOST_AUDITS, left), steps + unknown)
     ways = ways_of(subject, max(ROLLOUTS), min(longest, 2 * share))
-    best, least = ways[:0], np.inf
+    shortest = min(longest, min(steps, AUDIT_STEPS) + unknown)  # a longer audit may have more rollouts, not fewer
+    best, least = ways[:0], (0, np.inf)
     for total in (share, min(2 * share, left)):
         for count in ROLLOUTS:
-            if count > 1 and total // count < steps + unknown:
+            if count > 1 and total // count < shortest:
                 break
             parts = [(states[: total // count], actions[: total // count]) for states, actions in ways[:count]]
-            far = untested(spec, q, np.concatenate([states[unknown:] for states, _ in parts]))
-            if not best or (total == share and far < least):
-                best, least = parts, far
-            if far <= MOST_UNTESTED / 2:
+            learned = np.concatenate([states[unknown:] for states, _ in parts])
+            missing, far = max(steps - len(learned), 0), untested(spec, q, learned)
+            if not best or (total == share and (missing, far) < least):
+                best, least = parts, (missing, far)
+            if not missing and far <= MOST_UNTESTED / 2:
                 return [actions.tolist() for _, actions in parts]
     return [actions.tolist() for _, actions in best]
 

@@ -40,7 +40,8 @@ def command(
             min=2,
             max=256,
             help="Number of real steps to begin with; as many again follow, up to 40 in all, while they leave the "
-            "promise undecided. They don't count towards the budget.",
+            "promise undecided. An environment that can only be reset takes at least as many, in rollouts. They don't "
+            "count towards the budget.",
         ),
     ] = 8,
     env: Annotated[
