@@ -79,6 +79,15 @@ def test_a_sampler_answers_a_rollout_design_by_resets_and_action_sequences(api, 
         assert all(before.next_coordinates == after.coordinates for before, after in pairwise(steps))
 
 
+def test_rollouts_from_resets_are_claimed_one_by_one(api, asked):
+    """Ctrl-C of an audit left four rollouts, which a sampler had claimed, to the machine."""
+    api.add_queries(asked, rollouts=[[LEFT]])
+    settings = SamplerSettings(name="worker", batch=4, once=True, wait_seconds=5.0)
+    assert Sampler(api, asked, Rail(), settings).run().answered == 1
+    queries = api.surrogate(asked).queries
+    assert (queries.pending, queries.leased) == (1, 0)
+
+
 class Elsewhere(Rail):
     """A rail whose reset leaves the wagon far to the left."""
 
@@ -468,7 +477,7 @@ def test_a_rollout_of_many_steps_is_answered_whole(api):
     api.create_surrogate(name, Long().spec())
     api.add_queries(name, rollouts=[[LEFT, RIGHT] * 300])
     told = []
-    settings = SamplerSettings(name="worker", batch=8, once=True, wait_seconds=5.0)
+    settings = SamplerSettings(name="worker", max_queries=len(api.queries(name)), wait_seconds=5.0)
     Sampler(api, name, Long(), settings, lambda *one: told.append(one[1:])).run()
     assert set(told) == {("answered", "")}
     (query,) = [query for query in api.queries(name) if len(query.actions) == 600]

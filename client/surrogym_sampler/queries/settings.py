@@ -27,7 +27,7 @@ class SamplerSettings:
 
     Attributes:
         name: name of the sampler; it is stored with each sample.
-        batch: number of queries to claim at once.
+        batch: number of queries to claim at once; rollouts from resets are claimed one by one.
         wait_seconds: seconds that a claim waits for queries.
         lease_seconds: seconds for which a claimed query is reserved for this sampler.
         once: whether to stop after the first claim that returns queries.

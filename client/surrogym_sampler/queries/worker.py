@@ -485,13 +485,15 @@ class Sampler:
         """Return the number of queries to claim next; 0 if the sampler has to stop.
 
         Dropped queries don't count, because other samplers answer them. ``running`` is the number of queries whose
-        steps are being taken.
+        steps are being taken. Rollouts from resets, which take long, are claimed one by one: others can then be
+        withdrawn, or answered by another sampler.
         """
         s = self._settings
         if self._out_of_time():
             return 0
         begun = self._done + self._pipeline.under_way + running
-        return s.batch if s.max_queries is None else min(s.batch, s.max_queries - begun)
+        batch = 1 if self._own.access == "reset" else s.batch
+        return batch if s.max_queries is None else min(batch, s.max_queries - begun)
 
     @property
     def _done(self) -> int:

@@ -121,7 +121,9 @@ def command(
     max_queries: MaxQueries = None,
     time_limit: TimeLimit = None,
     step_limit: StepLimit = 30.0,
-    batch: Annotated[int, typer.Option(min=1, max=256, help="Number of queries to claim at once.")] = 4,
+    batch: Annotated[
+        int, typer.Option(min=1, max=256, help="Number of queries to claim at once. Rollouts from resets: always one.")
+    ] = 4,
     worker: Annotated[str | None, typer.Option(help="Name of this sampler. [default: host and process]")] = None,
     wait: Wait = 0.0,
     exit_with_parent: ExitWithParent = False,
