@@ -131,7 +131,7 @@ def _bar(title: str) -> Iterator[Update]:
             return Text(task.fields["words"], no_wrap=True, overflow="ellipsis")
 
     class Elapsed(ProgressColumn):
-        """The duration so far, which goes on when the bar is full, because an audit may follow."""
+        """The duration so far. It goes on when the bar is full: an audit may follow."""
 
         def render(self, task: Task) -> Text:
             return Text(str(timedelta(seconds=int(task.elapsed or 0))), style="progress.elapsed")
