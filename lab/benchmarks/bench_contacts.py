@@ -4,11 +4,12 @@
     python lab/benchmarks/bench_contacts.py --tasks Swimmer-v5 Hopper-v5 HalfCheetah-v5 --seeds 14 15 --searches 3
 
 The simulator is the task's MuJoCo file. For each seed, all masses, damping, friction and gears of the plant are the
-file's, times factors drawn evenly from 0.7 to 1.3. The plant takes ``--steps`` random steps from resets, on which the
-simulator is calibrated. A row has its errors (of the standard deviation of the changes) before and after, the largest
-relative error of a parameter that the steps determine, and the number of 90 % intervals with the true value. With
-``--searches N``, N searches by CMA-ES train linear policies in the calibrated simulator, and in the simulator as it is.
-The one with the best return in that simulator takes 20 real episodes, whose mean return is printed.
+file's, times factors drawn evenly from 0.7 to 1.3 (``--off 0.3``). The plant takes ``--steps`` random steps from
+resets, on which the simulator is calibrated. A row has its errors (of the standard deviation of the changes) before
+and after, the largest relative error of a parameter that the steps determine, and the number of 90 % intervals with
+the true value. With ``--searches N``, N searches by CMA-ES train linear policies in the calibrated simulator, and in
+the simulator as it is. The one with the best return in that simulator takes 20 real episodes, whose mean return is
+printed.
 """
 
 from __future__ import annotations
@@ -39,7 +40,6 @@ from surrogym_trainer.policies import load_policy
 from surrogym_trainer.training import TrainSettings, checks, train
 
 FILES = Path(gymnasium.envs.mujoco.__file__).parent / "assets"
-OFF = 0.3
 FILE = {
     "Swimmer-v5": "swimmer.xml",
     "Hopper-v5": "hopper.xml",
@@ -69,6 +69,7 @@ def main() -> None:
     made.add_argument("--seeds", nargs="+", type=int, required=True)
     made.add_argument("--steps", type=int, default=100, help="real steps for the calibration")
     made.add_argument("--searches", type=int, default=0, help="policy searches in each simulator")
+    made.add_argument("--off", type=float, default=0.3, help="largest relative error of a parameter")
     made.add_argument("--arms", nargs="+", default=["calibrated", "as it is"], help="simulators of the searches")
     options = made.parse_args()
     torch.set_num_threads(1)
@@ -102,7 +103,7 @@ def specification(task: str) -> EnvironmentSpec:
 def run(task: str, spec: EnvironmentSpec, seed: int, options: argparse.Namespace) -> None:
     rng, begun, own = np.random.default_rng([seed, 58]), time.process_time(), describe(task).spec
     usual = adjustable(original.make(task, spec=own)).parameters()
-    factors = rng.uniform(1 - OFF, 1 + OFF, len(usual))
+    factors = rng.uniform(1 - options.off, 1 + options.off, len(usual))
 
     def plant() -> Any:
         return scaled(original.make(task, spec=own), tuple(usual), factors)
