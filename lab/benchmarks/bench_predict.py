@@ -73,7 +73,7 @@ def compiled(posteriors: Sequence[Posterior]) -> Serving:
 
 def products(serving: Serving, rows: int, wanted: Sequence[int]) -> Call:
     """The matrix products of ``rows`` predictions and of the variances of the columns ``wanted``, and nothing else."""
-    z = torch.rand(rows, serving.exponents.shape[0], dtype=torch.float64)
+    z = torch.rand(rows, serving.exponents.shape[0], dtype=torch.float64, device=serving.exponents.device)
 
     def block(z: torch.Tensor) -> tuple[torch.Tensor, ...]:
         k = z @ serving.exponents

@@ -7,10 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any, TypeVar
 
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 T = TypeVar("T")
@@ -40,6 +41,37 @@ def to_device(value: T, device: torch.device) -> T:
             result = replace(value, **moved)
     found: T = result
     return found
+
+
+def sent(values: NDArray[Any], device: torch.device) -> Tensor:
+    """Return an array as a tensor on a device. The program does not wait for the copy; on the CPU nothing is copied."""
+    tensor = torch.from_numpy(values)
+    if device == CPU:
+        return tensor
+    # Only from memory that the system can't move does CUDA copy while the program goes on.
+    return (tensor.pin_memory() if device.type == "cuda" else tensor).to(device, non_blocking=True)
+
+
+def fetched(*tensors: Tensor | None) -> tuple[Any, ...]:
+    """Return tensors of one device as NumPy arrays, and None for None. The program waits for the device once, for one
+    copy of all tensors; on the CPU nothing is copied."""
+    if all(t is None or t.device == CPU for t in tensors):
+        return tuple(None if t is None else t.numpy() for t in tensors)
+    # The widest numbers come first, so that each array begins at a multiple of its numbers' size.
+    given = sorted((t for t in tensors if t is not None), key=lambda t: -t.element_size())
+    data = torch.cat([t.flatten().view(torch.uint8) for t in given]).cpu().numpy()
+    arrays, begin = {}, 0
+    for t in given:
+        raw = data[begin : (begin := begin + t.nbytes)]
+        arrays[id(t)] = raw.view(str(t.dtype).removeprefix("torch.")).reshape(t.shape)
+    return tuple(None if t is None else arrays[id(t)] for t in tensors)
+
+
+@lru_cache(maxsize=1_024)
+@torch.inference_mode(False)
+def constant(values: tuple[Any, ...], device: torch.device) -> Tensor:
+    """Return numbers (nested tuples) as a float64 tensor on a device, copied there once. It must not be changed."""
+    return torch.tensor(values, dtype=torch.float64, device=device)
 
 
 def cached(make: Callable[[Any], T]) -> cached_property[T]:

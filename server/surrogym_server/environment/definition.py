@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
@@ -279,6 +280,11 @@ class EnvironmentDefinition:
         if self.moves_observation:
             return (*self.observation_names, REWARD)
         return (*(self.coordinates[i].name for i in self.moving), REWARD)
+
+    @cached_property
+    def encoders(self) -> dict[Any, Any]:
+        """What ``features.encode`` has made for each feature map: its encoder, and the places of its features."""
+        return {}
 
     @cached
     def observe(self) -> TermSet:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from functools import lru_cache
 
 import torch
 from torch import Tensor
@@ -29,12 +30,18 @@ def quantile(distribution: Distribution, p: Tensor) -> Tensor:
             return low + (high - low) * p
         case Normal(mean=mean, std=std):
             low, high = distribution.limits
-            edges = torch.tensor([low, high], dtype=p.dtype, device=p.device)
-            below, above = torch.special.ndtr((edges - mean) / std)
+            below, above = _shares_below((low, high), mean, std)
             value: Tensor = mean + std * torch.special.ndtri(below + (above - below) * p)
             return torch.clamp(value, low, high)
         case Fixed(value=constant):
             return torch.full_like(p, constant)
+
+
+@lru_cache(maxsize=1_024)
+def _shares_below(ends: tuple[float, float], mean: float, std: float) -> list[float]:
+    """Return the shares of a normal distribution, not limited, that lie below each of two ends."""
+    shares: list[float] = torch.special.ndtr((torch.tensor(ends, dtype=torch.float64) - mean) / std).tolist()
+    return shares
 
 
 def log_density(distribution: Distribution, value: Tensor) -> Tensor:

@@ -139,12 +139,17 @@ def encode(
 
     ``lead`` (..., L) are the next values of the L leading coordinates (see ``leading``), needed if the map reads them.
     """
-    encoder = Encoder.of(definition, (feature_map,))
+    if (found := definition.encoders.get(feature_map)) is None:
+        with torch.inference_mode(False):
+            encoder = Encoder.of(definition, (feature_map,))
+            places = torch.tensor(encoder.inputs(feature_map), dtype=torch.long, device=definition.device)
+        found = definition.encoders[feature_map] = encoder, places
+    encoder, places = found
     x = encoder(q, u)
     if feature_map.lead:
         assert lead is not None
         x = encoder.with_lead(x, lead)
-    return x[..., list(encoder.inputs(feature_map))]
+    return x[..., places]
 
 
 @dataclass(frozen=True)

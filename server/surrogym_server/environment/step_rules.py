@@ -31,7 +31,7 @@ def settle(definition: EnvironmentDefinition, q: Tensor) -> Tensor:
             speed = inside[..., stopped]
             into_low = (inside[..., index] <= low) & (speed < 0)
             into_high = (inside[..., index] >= high) & (speed > 0)
-            inside[..., stopped] = torch.where(into_low | into_high, 0.0, speed)
+            inside[..., stopped] = speed.masked_fill(into_low | into_high, 0.0)
         if coordinate.kind == "angle":
             inside[..., index] = wrap(inside[..., index])
     return inside

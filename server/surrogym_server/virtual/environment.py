@@ -15,6 +15,7 @@ from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import InvalidInput, NotReset
 from surrogym_server.models.abilities import ArraySteps
 from surrogym_server.models.port import DynamicsModel
+from surrogym_server.tensors import fetched, sent
 from surrogym_server.virtual.dynamics import Moved, move_mean, move_particles
 from surrogym_server.virtual.lanes import ENDED, EVERY, NEW, RUNNING, Chosen, LaneState
 from surrogym_server.virtual.noise import Purpose, normal_noise
@@ -101,14 +102,13 @@ def create(definition: EnvironmentDefinition, settings: VirtualSettings, seed: i
     """Create the state of N lanes that have not been reset yet. ``seed`` determines all their random numbers."""
     count, size = settings.num_envs, len(definition.coordinates)
     particles = settings.particles if settings.variant == "probabilistic" else 0
-    zeros = torch.zeros(count, dtype=torch.int64, device=definition.device)
-    none = zeros.new_zeros(count, 0, dtype=torch.float64)
+    none = torch.zeros(count, 0, dtype=torch.float64, device=definition.device)
     return LaneState(
-        seed=torch.full_like(zeros, seed),
-        lane=torch.arange(count, device=definition.device),
-        episode=zeros - 1,
-        elapsed=zeros,
-        phase=torch.full_like(zeros, NEW, dtype=torch.int8),
+        seed=np.full(count, seed),
+        lane=np.arange(count),
+        episode=np.full(count, -1),
+        elapsed=np.zeros(count, dtype=np.int64),
+        phase=np.full(count, NEW, dtype=np.int8),
         q=none.new_zeros(count, size),
         particles=none.new_zeros(count, particles, size),
         path=none,
@@ -135,7 +135,8 @@ def reset(
     if seed is not None:
         lanes = _seeded(lanes, seed, chosen)
     lanes = _begin(definition, settings, lanes, chosen)
-    return lanes, _observe(definition, settings, lanes)
+    (observation,) = fetched(_observe(definition, settings, lanes))
+    return lanes, observation
 
 
 @torch.inference_mode()  # autograd records nothing, which makes a step a sixth faster
@@ -151,6 +152,10 @@ def step(
     """Step all N lanes (parallel environments), or those that ``mask`` (N,) selects, under actions u (N, F), in torch.
     This is the reference implementation of ``virtual.step``, with the same arguments and errors.
 
+    On a device the program waits for a step once, when it fetches the results; and once more if autoreset in mode
+    same_step then begins episodes. A boolean mask, a number or a list that would go to or from the device before that
+    would make it wait too.
+
     If ``particle_steps`` are given, they predict the steps of particles in compiled code.
     """
     definition = model.definition
@@ -158,8 +163,7 @@ def step(
     active = lanes.take(moving)
     if settings.variant == "pathwise":
         active = with_paths(model, active, settings.functions)
-    action = torch.from_numpy(u).to(definition.device)
-    action = action if isinstance(moving, slice) else action[moving]
+    action = definition.within_rates(active.q, sent(u[moving], definition.device))
     moved = _move(model, settings, active, action, stds, particle_steps)
     if settings.residual is not None:
         moved = with_residual(model, settings.residual, active, action, moved)
@@ -167,36 +171,48 @@ def step(
     left = _left(definition, active.q, moved, untrusted)
     if left is not None:
         moved = _paid_outside(definition, settings, active, moved, left)
-    active, cut = _advanced(settings, active, moved, untrusted)
+    active = replace(active, elapsed=active.elapsed + 1, q=moved.q, particles=moved.particles)
     after = lanes.put(moving, active)
-    terminated, truncated = _scatter(moving, moved.terminated), _scatter(moving, cut)
-    final_lanes = np.zeros(0, dtype=np.int64)
-    final_observation = np.zeros((0, len(definition.observation_names)), dtype=np.float32)
-    if settings.autoreset_mode == "same_step":
-        beginning = terminated | truncated
-        if bool(beginning.any()):
-            final_lanes = _array(beginning.nonzero()[:, 0])
-            final_observation = _observe(definition, settings, after.take(beginning))
     if beginning is not None:
         after = _begin(definition, settings, after, beginning)
-    reward = _array(_scatter(moving, moved.reward))
-    penalised = moved.reward is not moved.reward_mean
+    observation, reward, reward_mean, std, over, doubtful, early = fetched(
+        _observe(definition, settings, after),
+        moved.reward,
+        None if moved.reward is moved.reward_mean else moved.reward_mean,
+        moved.std if stds else None,
+        moved.terminated,
+        untrusted,
+        left,
+    )
+    cut = _cut(settings, active, doubtful)
+    after = replace(after, phase=after.phase.copy())
+    after.phase[moving] = np.where(over | cut, ENDED, RUNNING)
+    terminated, truncated = (_scatter(moving, len(lanes), flags) for flags in (over, cut))
+    final_lanes = np.zeros(0, dtype=np.int64)
+    if settings.autoreset_mode == "same_step":
+        beginning = terminated | truncated
+        final_lanes = beginning.nonzero()[0]
+    final_observation = observation[final_lanes]
+    if len(final_lanes):
+        after = _begin(definition, settings, after, final_lanes)
+        (observation[final_lanes],) = fetched(_observe(definition, settings, after.take(final_lanes)))
+    reward = _scatter(moving, len(lanes), reward)
     return after, LaneTransition(
-        observation=_observe(definition, settings, after),
+        observation=observation,
         reward=reward,
-        terminated=_array(terminated),
-        truncated=_array(truncated),
+        terminated=terminated,
+        truncated=truncated,
         final_lanes=final_lanes,
         final_observation=final_observation,
-        reset_lanes=np.zeros(len(reward), dtype=bool) if beginning is None else _array(beginning),
-        reward_mean=_array(_scatter(moving, moved.reward_mean)) if penalised else reward.copy(),
-        std=None if moved.std is None or not stds else _array(_scatter(moving, moved.std)),
-        untrusted=None if untrusted is None else _array(_scatter(moving, untrusted)),
-        left=None if left is None else _array(_scatter(moving, left)),
+        reset_lanes=np.zeros(len(lanes), dtype=bool) if beginning is None else beginning,
+        reward_mean=reward.copy() if reward_mean is None else _scatter(moving, len(lanes), reward_mean),
+        std=None if std is None else _scatter(moving, len(lanes), std),
+        untrusted=None if doubtful is None else _scatter(moving, len(lanes), doubtful),
+        left=None if early is None else _scatter(moving, len(lanes), early),
     )
 
 
-def divided(settings: VirtualSettings, lanes: LaneState, chosen: Chosen) -> tuple[Chosen, Tensor | None]:
+def divided(settings: VirtualSettings, lanes: LaneState, chosen: Bools | slice) -> tuple[Bools | slice, Bools | None]:
     """Divide the chosen lanes (parallel environments) into those that this step moves and those that it resets.
 
     Returns:
@@ -207,16 +223,16 @@ def divided(settings: VirtualSettings, lanes: LaneState, chosen: Chosen) -> tupl
         NotReset: a chosen lane has no running episode, and autoreset does not start one in this step.
     """
     running = lanes.phase == RUNNING
-    if bool(running.all()):
+    if running.all():
         return chosen, None
     if isinstance(chosen, slice):
-        chosen = torch.ones_like(running)
+        chosen = np.ones_like(running)
     waiting = chosen & (lanes.phase == ENDED)
     refused = chosen & ~running
     if settings.autoreset_mode == "next_step":
         refused = refused & ~waiting
-    if bool(refused.any()):
-        which = refused.nonzero()[:, 0].tolist()
+    if refused.any():
+        which = refused.nonzero()[0].tolist()
         shown = f"{which[:8]}{' and more' if len(which) > 8 else ''}"
         raise NotReset(f"lanes {shown} have no running episode; reset these lanes before you step them")
     return chosen & ~waiting, waiting
@@ -302,85 +318,74 @@ def _paid_outside(
     """
     lacking = torch.ones_like(moved.reward)
     if settings.time_limit is not None:
-        lacking = (settings.time_limit - before.elapsed).clamp(min=1).to(moved.reward.dtype)
+        lacking = sent((settings.time_limit - before.elapsed).clip(min=1).astype(np.float64), definition.device)
     lost = paid_outside(definition, settings) * lacking
     mean = torch.where(left, lost, moved.reward_mean)
     reward = mean if moved.reward is moved.reward_mean else torch.where(left, lost, moved.reward)
     return replace(moved, reward_mean=mean, reward=reward, terminated=moved.terminated | left)
 
 
-def _advanced(
-    settings: VirtualSettings, before: LaneState, moved: Moved, untrusted: Tensor | None
-) -> tuple[LaneState, Tensor]:
-    """Return the state of N lanes after their step, and a mask (N,) of the lanes that are truncated: by the time limit,
-    or because they are in ``untrusted``. As in Gymnasium, a step may both terminate and truncate."""
-    elapsed = before.elapsed + 1
-    cut = torch.zeros_like(moved.terminated) if settings.time_limit is None else elapsed >= settings.time_limit
-    cut = cut if untrusted is None else cut | untrusted
-    # The flag is 1 where the episode ended, and ENDED is RUNNING + 1.
-    phase = (moved.terminated | cut).to(torch.int8).add_(RUNNING)
-    return replace(before, elapsed=elapsed, phase=phase, q=moved.q, particles=moved.particles), cut
+def _cut(settings: VirtualSettings, after: LaneState, untrusted: Bools | None) -> Bools:
+    """Return a mask (N,) of the lanes that are truncated after their step: by the time limit, or because they are in
+    ``untrusted`` (N,). As in Gymnasium, a step may both terminate and truncate."""
+    cut = np.zeros(len(after), dtype=bool) if settings.time_limit is None else after.elapsed >= settings.time_limit
+    return cut if untrusted is None else cut | untrusted
 
 
 def _begin(definition: EnvironmentDefinition, settings: VirtualSettings, lanes: LaneState, chosen: Chosen) -> LaneState:
-    if not isinstance(chosen, slice) and not bool(chosen.any()):
-        return lanes
+    """Begin new episodes in the lanes that ``chosen``, a mask or indices, selects."""
     fresh = lanes.take(chosen)
-    fresh = replace(fresh, episode=fresh.episode + 1, elapsed=torch.zeros_like(fresh.elapsed))
+    if not len(fresh):
+        return lanes
+    begun = np.full_like(fresh.phase, RUNNING)
+    fresh = replace(fresh, episode=fresh.episode + 1, elapsed=np.zeros_like(fresh.elapsed), phase=begun)
     q = start_coordinates(definition, fresh, settings.start_box, settings.start_visited, settings.visited)
     particles = fresh.particles
     if settings.variant == "probabilistic":
         particles = start_particles(definition, fresh, q, settings.particles, settings.spread)
-    phase = torch.full_like(fresh.phase, RUNNING)
-    return lanes.put(chosen, replace(fresh, phase=phase, q=q, particles=particles))
+    return lanes.put(chosen, replace(fresh, q=q, particles=particles))
 
 
-def _seeded(lanes: LaneState, seed: int | Sequence[int], chosen: Chosen) -> LaneState:
+def _seeded(lanes: LaneState, seed: int | Sequence[int], chosen: Bools | slice) -> LaneState:
     outside = [s for s in ([seed] if isinstance(seed, int) else seed) if not 0 <= s < 2**63]
     if outside:
         raise InvalidInput(f"seed: expected a whole number from 0 to 2^63 - 1, got {outside[0]}")
     if isinstance(seed, int):
-        seeds, numbers = torch.full_like(lanes.seed, seed), torch.arange(len(lanes), device=lanes.seed.device)
+        seeds, numbers = np.full_like(lanes.seed, seed), np.arange(len(lanes))
     else:
         if len(seed) != len(lanes):
             raise InvalidInput(
                 f"seed: expected a whole number, or {len(lanes)} of them, one for each lane, got a list of {len(seed)}"
             )
-        seeds, numbers = torch.tensor(list(seed), device=lanes.seed.device), torch.zeros_like(lanes.lane)
-    replaced = torch.ones_like(lanes.seed, dtype=torch.bool) if isinstance(chosen, slice) else chosen
+        seeds, numbers = np.array(seed, dtype=np.int64), np.zeros_like(lanes.lane)
+    replaced = np.ones(len(lanes), dtype=bool) if isinstance(chosen, slice) else chosen
     return replace(
         lanes,
-        seed=torch.where(replaced, seeds, lanes.seed),
-        lane=torch.where(replaced, numbers, lanes.lane),
-        episode=torch.where(replaced, -1, lanes.episode),
+        seed=np.where(replaced, seeds, lanes.seed),
+        lane=np.where(replaced, numbers, lanes.lane),
+        episode=np.where(replaced, -1, lanes.episode),
     )
 
 
-def _observe(definition: EnvironmentDefinition, settings: VirtualSettings, lanes: LaneState) -> Floats:
-    return _array(definition.observe(sensed(definition, settings.sensor_noise, lanes)).to(torch.float32))
+def _observe(definition: EnvironmentDefinition, settings: VirtualSettings, lanes: LaneState) -> Tensor:
+    return definition.observe(sensed(definition, settings.sensor_noise, lanes)).to(torch.float32)
 
 
-def _array(values: Tensor) -> NDArray[Any]:
-    """Return a tensor, which may be on any device, as a NumPy array."""
-    array: NDArray[Any] = values.cpu().numpy()
-    return array
-
-
-def chosen_lanes(mask: Bools | None, lanes: LaneState) -> Chosen:
-    """Convert a mask (N,) of lanes to a selection of these lanes that can index tensors; a mask of None selects all
-    lanes. Raises ``InvalidInput`` for a mask of another length."""
+def chosen_lanes(mask: Bools | None, lanes: LaneState) -> Bools | slice:
+    """Return a mask (N,) of lanes as a selection of these lanes; a mask of None selects all lanes. Raises
+    ``InvalidInput`` for a mask of another length."""
     if mask is None:
         return EVERY
     if len(mask) != len(lanes):
         raise InvalidInput(f"mask: expected {len(lanes)} entries, one for each lane, got {len(mask)}")
-    return torch.as_tensor(mask, dtype=torch.bool, device=lanes.seed.device)
+    return np.asarray(mask, dtype=bool)
 
 
-def _scatter(chosen: Chosen, values: Tensor) -> Tensor:
-    """Return a tensor of N rows, one for each lane: the rows of ``values``, in order, in the ``chosen`` lanes, and
-    zeros in all others."""
+def _scatter(chosen: Chosen, count: int, values: NDArray[Any]) -> NDArray[Any]:
+    """Return an array with ``count`` rows, one for each lane: the rows of ``values``, in order, in the ``chosen``
+    lanes, and zeros in all others."""
     if isinstance(chosen, slice):
         return values
-    full = values.new_zeros(len(chosen), *values.shape[1:])
+    full = np.zeros((count, *values.shape[1:]), dtype=values.dtype)
     full[chosen] = values
     return full

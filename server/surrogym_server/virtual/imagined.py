@@ -59,8 +59,8 @@ def _episodes(
     lanes = replace(
         lanes,
         q=torch.from_numpy(q).repeat(count, 1),
-        phase=torch.full_like(lanes.phase, RUNNING),
-        episode=torch.zeros_like(lanes.episode),
+        phase=np.full_like(lanes.phase, RUNNING),
+        episode=np.zeros_like(lanes.episode),
     )
     states, rewards, running = [lanes.q.numpy()], [], np.ones(count, dtype=bool)
     length = np.zeros(count, dtype=np.int64)

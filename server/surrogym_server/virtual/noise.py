@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from surrogym_server.tensors import CPU
-from surrogym_server.virtual.lanes import LaneState
+from surrogym_server.tensors import CPU, sent
+from surrogym_server.virtual.lanes import Ints, LaneState
 from surrogym_server.virtual.philox import MASK, normals, philox, uniforms
 from surrogym_shared import compiled
 
@@ -49,16 +49,18 @@ def _words(lanes: LaneState, purpose: Purpose, particles: int, size: int) -> Ten
     particle. The last axis is 4 because each value of the generator's counter gives four words."""
     blocks = -(-size // 4)
     third = lanes.elapsed | (int(purpose) << STEP_BITS)
-    if lanes.seed.device == CPU and compiled.available():
+    device = lanes.q.device
+    if device == CPU and compiled.available():
         return _compiled_words(lanes, third, particles, blocks)
-    draw = torch.arange(particles * blocks, device=lanes.seed.device).reshape(1, particles, blocks)
-    seed, lane, episode, step = (x[:, None, None] for x in (lanes.seed, lanes.lane, lanes.episode, third))
-    return philox((lane & MASK, episode & MASK, step, draw), (seed & MASK, (seed >> 32) & MASK))
+    draw = torch.arange(particles * blocks, device=device).reshape(1, particles, blocks)
+    keys = np.stack([lanes.lane & MASK, lanes.episode & MASK, third, lanes.seed & MASK, (lanes.seed >> 32) & MASK])
+    lane, episode, step, low, high = sent(keys, device)[..., None, None].unbind()
+    return philox((lane, episode, step, draw), (low, high))
 
 
-def _compiled_words(lanes: LaneState, third: Tensor, particles: int, blocks: int) -> Tensor:
+def _compiled_words(lanes: LaneState, third: Ints, particles: int, blocks: int) -> Tensor:
     from surrogym_server.virtual.words import fill
 
     words = np.empty((len(lanes), particles * blocks, 4), dtype=np.int64)
-    fill(lanes.seed.numpy(), lanes.lane.numpy(), lanes.episode.numpy(), third.numpy(), words)
+    fill(lanes.seed, lanes.lane, lanes.episode, third, words)
     return torch.from_numpy(words).reshape(len(lanes), particles, blocks, 4)

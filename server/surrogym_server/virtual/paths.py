@@ -19,7 +19,7 @@ def with_paths(model: DynamicsModel, lanes: LaneState, functions: int | None = N
     stored in the lane's state: computed again in a batch with other lanes, they could differ in the last bits.
     """
     fresh = lanes.elapsed == 0
-    if not bool(fresh.any()):
+    if not fresh.any():
         return lanes
     drawing, draws = lanes.take(fresh), function_draws(model, functions)
     keyed = drawing if functions is None else replace(drawing, lane=drawing.lane % functions)

@@ -16,6 +16,7 @@ from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.step_rules import paid, placed, settle, with_lags
 from surrogym_server.errors import InvalidInput
 from surrogym_server.models.port import DynamicsModel
+from surrogym_server.tensors import constant, sent
 from surrogym_server.virtual.dynamics import Moved
 from surrogym_server.virtual.lanes import LaneState
 
@@ -62,11 +63,11 @@ class Residual:
 
     def of(self, definition: EnvironmentDefinition, lanes: LaneState, u: Tensor) -> Tensor:
         """Return the errors of all outputs, (N, O), in the step of N lanes under actions u (N, F)."""
-        x = inputs(definition, lanes.q, u)
-        x = ((x - x.new_tensor(self.centre)) / x.new_tensor(self.scale)).clamp(-FARTHEST, FARTHEST)
+        x, device = inputs(definition, lanes.q, u), definition.device
+        x = ((x - constant(self.centre, device)) / constant(self.scale, device)).clamp(-FARTHEST, FARTHEST)
         x = torch.cat([torch.ones_like(x[:, :1]), x], 1)
-        weights = x.new_tensor(self.weights)
-        return torch.einsum("nop,np->no", weights[lanes.lane % len(weights)], x)
+        weights = constant(self.weights, device)
+        return torch.einsum("nop,np->no", weights[sent(lanes.lane % len(weights), device)], x)
 
 
 def inputs(definition: EnvironmentDefinition, q: Tensor, u: Tensor) -> Tensor:

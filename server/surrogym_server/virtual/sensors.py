@@ -9,6 +9,7 @@ from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import InvalidInput
 from surrogym_server.models.abilities import LearnedNoise, offers
 from surrogym_server.models.port import DynamicsModel
+from surrogym_server.tensors import constant
 from surrogym_server.virtual.lanes import LaneState
 from surrogym_server.virtual.noise import Purpose, normal_noise
 
@@ -32,8 +33,8 @@ def driving(model: DynamicsModel, noise: SensorNoise, process: Tensor) -> Tensor
     able = offers(model, LearnedNoise)
     if not noise or able is None or model.definition.moves_observation:
         return process
-    spread = _spread(model.definition, noise)[list(model.definition.moving)]
-    learned = torch.tensor(able.noise_stds[:-1], dtype=spread.dtype, device=spread.device)
+    spread = _spread(model.definition, noise)[model.definition.moving_columns]
+    learned = constant(able.noise_stds[:-1], spread.device)
     share = MEASURED * spread.square() / learned.square().clamp_min(torch.finfo(spread.dtype).tiny)
     return process * (1 - share).clamp_min(0).sqrt()
 
@@ -50,5 +51,4 @@ def check(definition: EnvironmentDefinition, noise: SensorNoise) -> None:
 
 def _spread(definition: EnvironmentDefinition, noise: SensorNoise) -> Tensor:
     by_name = dict(noise)
-    values = [by_name.get(name, 0.0) for name in definition.coordinate_names]
-    return torch.tensor(values, dtype=torch.float64, device=definition.device)
+    return constant(tuple(by_name.get(name, 0.0) for name in definition.coordinate_names), definition.device)

@@ -10,6 +10,7 @@ from torch import Tensor
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.distributions import quantiles
 from surrogym_server.environment.step_rules import settle
+from surrogym_server.tensors import constant
 from surrogym_server.virtual.lanes import LaneState
 from surrogym_server.virtual.noise import Purpose, normal_noise, uniform_noise
 from surrogym_shared.spec import limits
@@ -57,8 +58,7 @@ def start_particles(
 ) -> Tensor:
     """Draw initial particles (N, P, C) around the first states q (N, C), with P = ``count``. They are normally
     distributed; the standard deviation is ``spread`` times the range of each coordinate (section 4 of the paper)."""
-    each = [_std(definition, i, spread) for i in range(len(definition.coordinates))]
-    std = torch.tensor(each, dtype=q.dtype, device=q.device)
+    std = constant(tuple(_std(definition, i, spread) for i in range(len(definition.coordinates))), q.device)
     noise = normal_noise(lanes, Purpose.SPREAD, count, len(definition.coordinates))
     return settle(definition, q[:, None] + std * noise)
 

@@ -59,14 +59,13 @@ def step(
         InvalidInput: the mask has a wrong length.
         NotReset: a lane was never reset, or its episode has ended and autoreset does not reset it in this step.
     """
-    if model.definition.rates:
-        asked = torch.as_tensor(u, dtype=lanes.q.dtype, device=lanes.q.device)
-        u = model.definition.within_rates(lanes.q, asked).cpu().numpy()
     move = _array_steps(model, settings)
     if move is None or settings.variant == "probabilistic":
         return environment.step(model, settings, lanes, u, mask, stds, particle_steps=move)
     from surrogym_server.virtual.compiled.step import compiled_step
 
+    if model.definition.rates:
+        u = model.definition.within_rates(lanes.q, torch.from_numpy(u)).numpy()
     return compiled_step(model, move, settings, lanes, u, mask, stds)
 
 

@@ -62,6 +62,13 @@ def test_with_functions_2_pathwise_environments_share_two_drawn_functions(model,
     np.testing.assert_array_equal(there[:2], there[2:4])
 
 
+def test_a_step_with_shared_functions_may_begin_an_episode_in_every_environment(model, started):
+    settings, lanes = started(model, 2, variant="pathwise", functions=2, time_limit=1)
+    for _ in range(2):
+        lanes, _ = moved(model, settings, lanes, 2.0, -6.0)
+    assert lanes.episode.tolist() == [1, 1]
+
+
 def test_the_next_pathwise_episode_follows_another_drawn_function(model, started):
     settings, lanes = started(model, 2, variant="pathwise", time_limit=1, autoreset_mode="same_step")
     lanes, _ = moved(model, settings, lanes, 2.0, -6.0)

@@ -20,7 +20,7 @@ from surrogym_server.models.abilities import ArraySteps, ArrayTransition
 from surrogym_server.models.port import DynamicsModel
 from surrogym_server.virtual.compiled.outcome import conclude, observe
 from surrogym_server.virtual.environment import LaneTransition, VirtualSettings, chosen_lanes, divided, paid_outside
-from surrogym_server.virtual.lanes import EVERY, RUNNING, Chosen, LaneState
+from surrogym_server.virtual.lanes import EVERY, RUNNING, LaneState
 from surrogym_server.virtual.noise import Purpose, normal_noise
 from surrogym_server.virtual.paths import with_paths
 from surrogym_server.virtual.sensors import driving, sensed
@@ -53,13 +53,13 @@ class _Changed:
 
     @classmethod
     def of(cls, lanes: LaneState) -> _Changed:
-        q, episode, elapsed, phase = (t.numpy().copy() for t in (lanes.q, lanes.episode, lanes.elapsed, lanes.phase))
-        ends = np.empty((5, len(phase)), dtype=np.bool_)
-        return cls(q, episode, elapsed, phase, np.empty((2, len(phase))), ends)
+        q, count = lanes.q.numpy().copy(), len(lanes)
+        counts = lanes.episode.copy(), lanes.elapsed.copy(), lanes.phase.copy()
+        return cls(q, *counts, np.empty((2, count)), np.empty((5, count), dtype=np.bool_))
 
     def lanes(self, before: LaneState) -> LaneState:
-        q, episode, elapsed, phase = (torch.from_numpy(a) for a in (self.q, self.episode, self.elapsed, self.phase))
-        return LaneState(before.seed, before.lane, episode, elapsed, phase, q, before.particles, before.path)
+        q, particles, path = torch.from_numpy(self.q), before.particles, before.path
+        return LaneState(before.seed, before.lane, self.episode, self.elapsed, self.phase, q, particles, path)
 
 
 def compiled_step(
@@ -108,21 +108,20 @@ def compiled_step(
 
 def _divided(
     settings: VirtualSettings, lanes: LaneState, phase: NDArray[np.int8], mask: Bools | None
-) -> tuple[Bools, Chosen, Bools | None]:
+) -> tuple[Bools, Bools | slice, Bools | None]:
     """Divide the lanes (parallel environments) that ``mask`` (N,) selects into those that this step moves and those
     that it resets; None selects all. ``phase`` (N,) says of each lane whether it was never reset, is in an episode, or
     has ended one.
 
     Returns:
-        A mask (N,) of the lanes to move; the same lanes as a tensor mask, or as the slice of all lanes if all move; and
-        a mask (N,) of the lanes to reset, None if there are none.
+        A mask (N,) of the lanes to move; the same mask, or the slice of all lanes if all move; and a mask (N,) of the
+        lanes to reset, None if there are none.
     """
     running = phase == RUNNING
     if mask is None and running.all():
         return running, EVERY, None
     moving, waiting = divided(settings, lanes, chosen_lanes(mask, lanes))
-    moved = running if isinstance(moving, slice) else moving.numpy()
-    return moved, moving, None if waiting is None else waiting.numpy()
+    return running if isinstance(moving, slice) else moving, moving, waiting
 
 
 def _moved(
@@ -131,7 +130,7 @@ def _moved(
     settings: VirtualSettings,
     lanes: LaneState,
     u: NDArray[np.floating[Any]],
-    moving: Chosen,
+    moving: Bools | slice,
     stds: bool,
 ) -> ArrayTransition:
     """Predict one step of the lanes (parallel environments) that ``moving`` selects, under actions u (N, F). The result
@@ -151,11 +150,13 @@ def _moved(
     )
 
 
-def _rows(moving: Chosen, values: NDArray[Any]) -> NDArray[Any]:
-    return np.ascontiguousarray(values if isinstance(moving, slice) else values[moving.numpy()])
+def _rows(moving: Bools | slice, values: NDArray[Any]) -> NDArray[Any]:
+    return np.ascontiguousarray(values if isinstance(moving, slice) else values[moving])
 
 
-def _fallen(definition: EnvironmentDefinition, moving: Chosen, lanes: LaneState, moved: ArrayTransition) -> Bools:
+def _fallen(
+    definition: EnvironmentDefinition, moving: Bools | slice, lanes: LaneState, moved: ArrayTransition
+) -> Bools:
     """Return for each of the K lanes that ``moving`` selects whether the fallback action of the declared limits would
     take over after the step, (K,) bool. Without limits, return an empty array."""
     if definition.limits is None:
@@ -203,9 +204,8 @@ def _begin(
     definition: EnvironmentDefinition, settings: VirtualSettings, lanes: LaneState, chosen: Bools, changed: _Changed
 ) -> None:
     """Begin new episodes in the lanes that the mask ``chosen`` (N,) selects: write their states to ``changed``."""
-    at = torch.from_numpy(chosen)
-    fresh = lanes.take(at)
-    fresh = replace(fresh, episode=fresh.episode + 1, elapsed=torch.zeros_like(fresh.elapsed))
+    fresh = lanes.take(chosen)
+    fresh = replace(fresh, episode=fresh.episode + 1, elapsed=np.zeros_like(fresh.elapsed))
     starts = settings.start_box, settings.start_visited, settings.visited
     changed.q[chosen] = start_coordinates(definition, fresh, *starts).numpy()
     changed.episode[chosen] += 1

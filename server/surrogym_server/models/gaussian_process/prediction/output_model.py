@@ -13,7 +13,7 @@ from surrogym_server.gp import NOISE_FLOOR, FitOptions, LeftOut, Posterior, nois
 from surrogym_server.gp.kernel import variance
 from surrogym_server.models.abilities import LeaveOneOutErrors
 from surrogym_server.models.gaussian_process.prediction.warp import PEAK_NOISE, Warp
-from surrogym_server.tensors import amplitude
+from surrogym_server.tensors import amplitude, constant
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class OutputModel:
         """Return the amplitude (m,) by which the output's distance from ``centre`` is scaled at each of m inputs x (m,
         d). It is 1 if the feature map has no rates (see ``gp.growth``)."""
         rates = self.feature_map.rates
-        return amplitude(x, x.new_tensor(rates)) if rates else x.new_ones(x.shape[:-1])
+        return amplitude(x, constant(rates, x.device)) if rates else x.new_ones(x.shape[:-1])
 
     def standardised(self, target: Tensor, x: Tensor) -> Tensor:
         """Return the standardised targets (m,) of the process, given the targets ``target`` (m,) at inputs x (m, d)."""

@@ -67,7 +67,7 @@ class Predictor:
         rows = min(group.serving.rows for group in self._groups if group)
         q_next, mean, spread = in_blocks(rows, partial(self._step, columns), q, u, noise, process, paths)
         reward, edges = self._rewards(q, u, q_next, mean[:, -1])
-        std = spread[:, list(self._columns)] if stds else None
+        std = spread[:, self._places] if stds else None
         of_reward = self._reward_spread(mean[:, -1], spread[:, -1], edges) if reward_std else None
         if doubt is not None:
             std = None if std is None else std * doubt[:, :-1]
@@ -110,7 +110,7 @@ class Predictor:
         """Return the mean changes (m, M), next coordinates (m, C) and mean rewards (m,) at q (m, C) and u (m, F)."""
         q_next, mean, _ = self._step((), q, u, None, None, None)
         reward, _ = self._rewards(q, u, q_next, mean[:, -1])
-        return mean[:, list(self._columns)], q_next, reward
+        return mean[:, self._places], q_next, reward
 
     @cached
     def output_of_weight(self) -> Tensor:
@@ -154,7 +154,7 @@ class Predictor:
         if self.prior is not None:
             mean = mean + self._by_prior(self.prior, q, u)
         if second is not None:
-            lead = clip(self.definition, q + mean[:, :-1])[:, leading(self.definition)]
+            lead = clip(self.definition, q + mean[:, :-1])[:, self._leading]
             following = second.predict(first.encoder.with_lead(x, lead), columns, kick, shake, paths)
             mean, spread = _sum((mean, spread), following)
         q_next = moved(self.definition, self._inverse, q, u, mean[:, :-1])
@@ -168,7 +168,7 @@ class Predictor:
         observation entry, and one for the reward. Columns of outputs that don't use the prior model are 0."""
         change, _, reward = prior.means(q, u)
         added = change.new_zeros(len(q), self._reward_column + 1)
-        added[:, [*self._columns, self._reward_column]] = torch.cat([change, reward[:, None]], 1)
+        added[:, self._places], added[:, -1] = change, reward
         return added * self.uses_prior
 
     @cached
@@ -209,13 +209,23 @@ class Predictor:
         if noise is None:
             return None
         placed = noise.new_zeros(len(noise), self._reward_column + 1)
-        placed[:, list(self._columns)] = noise
+        placed[:, self._places] = noise
         return placed
 
     @cached_property
     def _columns(self) -> tuple[int, ...]:
         """Column of each transition output in predictions: the index of its coordinate, or of its observation entry."""
         return tuple(range(len(self.transitions))) if self.definition.moves_observation else self.definition.moving
+
+    @cached
+    def _places(self) -> Tensor:
+        """``_columns`` as a tensor on the device: the program would wait for the copy of a list of indices."""
+        return torch.tensor(self._columns, dtype=torch.long, device=self.definition.device)
+
+    @cached
+    def _leading(self) -> Tensor:
+        """Indices of the leading coordinates, as a tensor on the device."""
+        return torch.tensor(leading(self.definition), dtype=torch.long, device=self.definition.device)
 
     @cached_property
     def _reward_column(self) -> int:

@@ -26,6 +26,7 @@ from surrogym_server.gp import MOST_NOISE, Hyperparameters, Posterior, condition
 from surrogym_server.models.abilities import ArraySteps, ArrayTransition, CompiledSteps, FunctionDraws
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 from surrogym_server.models.port import Transition
+from surrogym_server.tensors import fetched
 
 MODELS = 8  # number of models with different hyperparameters, from which functions are sampled
 MOST_POINTS = 128  # hyperparameters of a process with more points are certain enough, so they are not sampled
@@ -180,10 +181,12 @@ class StepsOfSeveral(ArraySteps):
 
 
 def _members(number: Tensor, count: int) -> list[tuple[int, Tensor]]:
-    """Return a pair (index of a model, indices of its rows) for each model that has rows. ``number`` (m,) is the index
-    of the model to which each row belongs; ``count`` is the number of models."""
-    rows = [(index, (number == index).nonzero()[:, 0]) for index in range(count)]
-    return [(index, which) for index, which in rows if len(which)]
+    """Return a pair (index of a model, indices of its rows) for each model that has rows, or one model without any.
+    ``number`` (m,) is the index of the model to which each row belongs; ``count`` is the number of models."""
+    belongs = number == torch.arange(count, device=number.device)[:, None]
+    (sizes,) = fetched(belongs.sum(1))  # the one wait for a device here
+    rows = torch.split(number.argsort(stable=True), sizes.tolist())
+    return [(index, which) for index, which in enumerate(rows) if len(which)] or [(0, rows[0])]
 
 
 def _join(parts: Sequence[Tensor | None], order: Tensor) -> Tensor | None:
