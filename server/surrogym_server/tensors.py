@@ -5,6 +5,7 @@ Tensors are placed on a device once; computations run on the device of their inp
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass, replace
 from functools import cached_property, lru_cache
@@ -14,9 +15,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from surrogym_server.errors import Overloaded, Unavailable
+
+logger = logging.getLogger(__name__)
+
 T = TypeVar("T")
 
 CPU = torch.device("cpu")
+GPU_BLOCK = 1 << 25  # greatest number of covariances that a GPU computes at once; one array of them takes 256 MiB
+FAILURE = getattr(torch, "AcceleratorError", ())  # the class of a GPU's errors since torch 2.8
 STEEPEST = 2.0  # a fit searches rates g of the transformation ``bend`` between minus this number and this number
 EDGE = 2.0  # the transformation ``bend`` of inputs z is exponential for |z| up to this number
 
@@ -65,6 +72,32 @@ def fetched(*tensors: Tensor | None) -> tuple[Any, ...]:
         raw = data[begin : (begin := begin + t.nbytes)]
         arrays[id(t)] = raw.view(str(t.dtype).removeprefix("torch.")).reshape(t.shape)
     return tuple(None if t is None else arrays[id(t)] for t in tensors)
+
+
+def free_bytes(device: torch.device) -> int | None:
+    """Return the memory of a GPU that this program can still take, in bytes; None for the CPU."""
+    if device.type != "cuda":
+        return None
+    free, _ = torch.cuda.mem_get_info(device)
+    return free + torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
+
+
+def gpu_failure(error: BaseException) -> Unavailable | None:
+    """Return what to tell a user of an error that torch raised because a GPU failed, and log it; None for any other
+    error."""
+    if isinstance(error, torch.OutOfMemoryError):
+        return Overloaded(
+            "the GPU has too little free memory for this request, and nothing was changed: close other sessions, or "
+            "open one with fewer lanes or particles"
+        )
+    said = str(error.args[0] if error.args else error).partition("\n")[0]
+    if isinstance(error, FAILURE) or (isinstance(error, RuntimeError) and said.startswith("CUDA error")):
+        logger.error("the GPU failed: %s", said)
+        return Unavailable(
+            f"the GPU failed ({said}), so this server's sessions can't go on: start the server again, then open new "
+            "sessions; samples, models and policies are stored"
+        )
+    return None
 
 
 @lru_cache(maxsize=1_024)

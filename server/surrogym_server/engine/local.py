@@ -34,6 +34,7 @@ from surrogym_server.engine.requests import (
     SessionInfo,
     Visited,
     carried_out,
+    check_gpu,
     check_size,
     fingerprint_of,
     info_of,
@@ -59,7 +60,7 @@ from surrogym_server.errors import DeadlineExceeded, Overloaded, SessionExpired,
 from surrogym_server.models.draws import function_draws
 from surrogym_server.models.guard import plugin_calls
 from surrogym_server.sampling.uncertainty import visited_confidence
-from surrogym_server.tensors import CPU
+from surrogym_server.tensors import CPU, gpu_failure
 from surrogym_server.virtual import expected_bytes
 from surrogym_shared import compiled
 from surrogym_shared.compiled import disk_cache
@@ -147,7 +148,12 @@ class LocalEngine(SessionEngine):
         return info_of(self._live.get(session))
 
     async def coordinates(self, session: str) -> Array:
-        coordinates: Array = self._live.get(session).lanes.q.cpu().numpy()
+        try:
+            coordinates: Array = self._live.get(session).lanes.q.cpu().numpy()
+        except RuntimeError as error:
+            if failure := gpu_failure(error):
+                raise failure from error
+            raise
         return coordinates
 
     async def submit(self, session: str) -> Visited:
@@ -203,7 +209,15 @@ class LocalEngine(SessionEngine):
         self._compiling.close()
 
     async def save(self) -> list[Saved]:
-        return [Saved(session.id, session.surrogate, session_to_bytes(session)) for session in self._live]
+        saved = []
+        for session in self._live:
+            try:
+                saved.append(Saved(session.id, session.surrogate, session_to_bytes(session)))
+            except RuntimeError as error:
+                if gpu_failure(error) is None:
+                    raise
+                logger.error("session %s is lost: %s", session.id, error)
+        return saved
 
     async def restore(self, request: Restore) -> None:
         definition = request.definition.on(self._device)
@@ -232,8 +246,9 @@ class LocalEngine(SessionEngine):
         surrogate, version = request.surrogate_id, request.opening.model
         model = self._models.get(surrogate, self._models.refresh(surrogate) if version == "latest" else version)
         settings = request.opening.settings
-        draws = function_draws(model, settings.functions)
-        return expected_bytes(request.definition, settings, draws.path_size)
+        path_size = function_draws(model, settings.functions).path_size
+        check_gpu(self._device, request.definition, settings, path_size, model.samples)
+        return expected_bytes(request.definition, settings, path_size)
 
     def _new_session(self, request: Open, digest: str) -> Session:
         definition = request.definition.on(self._device)
@@ -241,7 +256,12 @@ class LocalEngine(SessionEngine):
         version = latest if request.opening.model == "latest" else request.opening.model
         model = self._models.get(request.surrogate_id, version, self._device)
         self._compiling.wait()
-        return opened(request, definition, model, version, digest, self._place)
+        try:
+            return opened(request, definition, model, version, digest, self._place)
+        except RuntimeError as error:
+            if failure := gpu_failure(error):
+                raise failure from error
+            raise
 
     def _visits(self, session: Session, states: Array) -> Visited:
         surrogate = session.surrogate_id
@@ -567,7 +587,12 @@ def _mebibytes(nbytes: int) -> str:
 
 def _timed(work: Work, session: Session) -> tuple[tuple[Session, Outcome], float]:
     start = time.perf_counter()
-    result = work(session)
+    try:
+        result = work(session)
+    except RuntimeError as error:
+        if failure := gpu_failure(error):
+            raise failure from error
+        raise
     return result, time.perf_counter() - start
 
 

@@ -9,6 +9,7 @@ Shapes: N lanes, C coordinates, D observation entries, F action entries, T steps
 from __future__ import annotations
 
 import secrets
+from bisect import bisect_right
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -36,7 +37,8 @@ from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import InvalidInput, NotReset, SurrogymError, TooLarge
 from surrogym_server.models.guard import failure_of
 from surrogym_server.models.port import DynamicsModel, with_set_points
-from surrogym_server.virtual import VirtualSettings, create, in_fastest_form, reward_limits
+from surrogym_server.tensors import free_bytes
+from surrogym_server.virtual import VirtualSettings, create, expected_gpu_bytes, in_fastest_form, reward_limits
 from surrogym_server.virtual.sensors import check as check_sensors
 from surrogym_server.virtual.sensors import sensed
 from surrogym_shared.acting import Acted, Actor, NoiseKey, PolicyRun
@@ -232,6 +234,29 @@ def check_size(settings: VirtualSettings, max_lanes: int) -> None:
         raise TooLarge(
             f"expected at most {MAX_PATHWISE_LANES} lanes in a session of variant pathwise, got {settings.num_envs}: "
             "open fewer lanes"
+        )
+
+
+def check_gpu(
+    device: torch.device, definition: EnvironmentDefinition, settings: VirtualSettings, path_size: int, samples: int
+) -> None:
+    """Check that a session of a model of ``samples`` samples fits in the free memory of its GPU, before it takes any.
+
+    Raises:
+        TooLarge: it does not; the message has the number of lanes that fits.
+    """
+    if (free := free_bytes(device)) is None:
+        return
+
+    def needed(lanes: int) -> int:
+        return expected_gpu_bytes(definition, replace(settings, num_envs=lanes), path_size, samples)
+
+    if (nbytes := needed(settings.num_envs)) > free:
+        most = bisect_right(range(1, settings.num_envs + 1), free, key=needed)
+        raise TooLarge(
+            f"expected a session that fits in the free memory of the GPU, {free / 2**20:,.0f} MiB, got one of "
+            f"{settings.num_envs} lanes, whose steps take about {nbytes / 2**20:,.0f} MiB: "
+            + (f"open at most {most} lanes" if most else "close other sessions, or start the server with --device cpu")
         )
 
 

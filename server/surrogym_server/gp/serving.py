@@ -25,10 +25,9 @@ from torch import Tensor
 
 from surrogym_server.gp.kernel import Hyperparameters, to_mirror
 from surrogym_server.gp.posterior import Posterior
-from surrogym_server.tensors import CPU, in_blocks
+from surrogym_server.tensors import CPU, GPU_BLOCK, in_blocks
 
 BLOCK = 262_144  # greatest number of covariances computed at once, so that they fit into the processor's cache
-GPU_BLOCK = 1 << 25  # the same on a GPU, which idles between small blocks; one array of them takes 256 MiB
 MIN_ROWS = 64  # inputs are predicted in blocks of at least this many rows, even if their covariances exceed ``BLOCK``
 # Exponents of the kernel are computed from differences of inputs, not by matrix products, if products could cause a
 # rounding error of the mean above this share of the prior standard deviation.

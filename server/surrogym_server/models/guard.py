@@ -19,14 +19,15 @@ from surrogym_server.models.abilities import TakesPrior
 from surrogym_server.models.port import DynamicsModel, Learned, Transition, Warm
 from surrogym_server.models.registry import learner_of
 from surrogym_server.plugins import failed, guarded, in_one_line
+from surrogym_server.tensors import gpu_failure
 
 POINTS = 16  # number of samples at which a new model is checked
 
 
 def failure_of(definition: EnvironmentDefinition, error: BaseException) -> SurrogymError:
-    """Return an error whose message is one sentence: it names the model family whose code raised ``error``, and quotes
-    ``error``."""
-    return failed(_family(definition), PluginFailed, error)
+    """Return an error whose message is one sentence: it names the model family whose code raised ``error``, or the GPU
+    if that failed, and quotes ``error``."""
+    return gpu_failure(error) or failed(_family(definition), PluginFailed, error)
 
 
 def plugin_calls(definition: EnvironmentDefinition, *, interrupts: bool = False) -> AbstractContextManager[None]:

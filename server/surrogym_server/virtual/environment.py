@@ -15,7 +15,7 @@ from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.errors import InvalidInput, NotReset
 from surrogym_server.models.abilities import ArraySteps
 from surrogym_server.models.port import DynamicsModel
-from surrogym_server.tensors import fetched, sent
+from surrogym_server.tensors import GPU_BLOCK, fetched, sent
 from surrogym_server.virtual.dynamics import Moved, move_mean, move_particles
 from surrogym_server.virtual.lanes import ENDED, EVERY, NEW, RUNNING, Chosen, LaneState
 from surrogym_server.virtual.noise import Purpose, normal_noise
@@ -28,6 +28,9 @@ from surrogym_shared.kinds import AutoresetMode, Variant
 Floats = NDArray[np.floating[Any]]
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.integer[Any]]
+# What a step takes for a while, as measured on a CPU: bytes for each coordinate of a lane or particle, and arrays as
+# large as the weights of the lanes' sampled functions.
+STEP_BYTES, STEP_PATHS = 400, 5
 
 
 @dataclass(frozen=True)
@@ -96,6 +99,18 @@ def expected_bytes(definition: EnvironmentDefinition, settings: VirtualSettings,
     particles = settings.particles if settings.variant == "probabilistic" else 0
     path = path_size if settings.variant == "pathwise" else 0
     return 8 * settings.num_envs * (len(definition.coordinates) * (1 + particles) + path)
+
+
+def expected_gpu_bytes(
+    definition: EnvironmentDefinition, settings: VirtualSettings, path_size: int, samples: int
+) -> int:
+    """Return the approximate memory in bytes that a session of a model of ``samples`` samples takes on a GPU in a step:
+    its lanes before and after the step, what the step computes for each of them, and a block of covariances."""
+    rows = settings.num_envs * (settings.particles if settings.variant == "probabilistic" else 1)
+    path = path_size if settings.variant == "pathwise" else 0
+    covariances = min(GPU_BLOCK, rows * samples * len(definition.outputs))
+    each = rows * len(definition.coordinates) * STEP_BYTES + 8 * settings.num_envs * path * STEP_PATHS
+    return 2 * expected_bytes(definition, settings, path_size) + each + 16 * covariances
 
 
 def create(definition: EnvironmentDefinition, settings: VirtualSettings, seed: int) -> LaneState:
