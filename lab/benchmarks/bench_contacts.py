@@ -69,9 +69,8 @@ def _linear(steps: int, longest: int, population: int, starts: int, sigma: float
     return TrainSettings("CMAES", steps, session={"time_limit": longest}, hyperparameters=choices)
 
 
-def _network(steps: int, start_box: float, horizon: int | None, gamma: float, rollout: int) -> TrainSettings:
+def _network(steps: int, start_box: float, horizon: int | None, **choices: Any) -> TrainSettings:
     """A search by PPO in one cycle."""
-    choices = {"gamma": gamma, "n_steps": rollout}
     return TrainSettings("FASTPPO", steps, start_box=start_box, horizon=horizon, hyperparameters=choices)
 
 
@@ -81,9 +80,12 @@ SEARCH = {
     "Swimmer-v5": (_linear(400_000, 1_000, 12, 1, 0.3),),
     "Hopper-v5": (_linear(1_400_000, 1_000, 24, 1, 0.3),),
     "HalfCheetah-v5": (_linear(3_000_000, 500, 24, 2, 0.5),),
-    "Pusher-v5": (_network(1_500_000, 0.0, None, 0.97, 50),),
+    "Pusher-v5": (_network(1_500_000, 0.0, None, gamma=0.97, n_steps=50),),
     "ball_in_cup-catch": (TrainSettings("FASTPPO"),),
-    "finger-spin": (_network(3_000_000, 1.0, 100, 0.95, 32), _network(6_000_000, 1.0, 100, 0.95, 32)),
+    "finger-spin": (
+        _network(3_000_000, 1.0, 100, gamma=0.95, n_steps=32),
+        _network(9_000_000, 1.0, 100, gamma=0.95, n_steps=32, learning_rate=5e-4),
+    ),
 }
 SUITE = Path(__file__).parent / "larger"  # specifications of dm_control's tasks
 PERIOD = 0.02  # their sampling period, in seconds
