@@ -23,6 +23,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from surrogym_server.tensors import cached
+
 
 @dataclass(frozen=True)
 class Reflection:
@@ -99,7 +101,7 @@ class Hyperparameters:
     def has_polynomial(self) -> bool:
         return self.linear_variance > 0 or self.quadratic_variance > 0
 
-    @property
+    @cached
     def polynomial(self) -> Polynomial:
         """Polynomial part of the covariance, that is everything except the squared exponential."""
         return Polynomial.of(self.linear_variance, self.quadratic_variance, self.reflection, self.lengthscale)

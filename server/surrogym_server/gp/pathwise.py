@@ -49,11 +49,24 @@ class Pathwise:
         at_points = prior @ self._prior_at_points.T + self._noise(at_samples)
         return torch.cat([prior, -torch.cholesky_solve(at_points.T, posterior.factor).T], 1)
 
-    def residual(self, x: Tensor, weights: Tensor) -> Tensor:
+    def residual(self, x: Tensor, weights: Tensor, k: Tensor | None = None) -> Tensor:
         """Return the residuals (N,) at N inputs x (N, d): by how much the posterior sample in the same row of
-        ``weights`` (N, size) exceeds the posterior mean."""
-        k = covariance(self.posterior.hyper, x, self.posterior.x)
-        return (torch.cat([self._prior(x), k], 1) * weights).sum(1)
+        ``weights`` (N, size) exceeds the posterior mean. The prior covariances of x with the n points over sigma_f^2
+        may be given, k (N, n)."""
+        hyper = self.posterior.hyper
+        if k is None:
+            k = covariance(hyper, x, self.posterior.x) / hyper.signal_variance
+        residual, begin = torch.zeros_like(x[:, 0]), 0
+        for part in [*self._parts(x), hyper.signal_variance * k]:
+            residual.add_((part * weights[:, begin : (begin := begin + part.shape[1])]).sum(1))
+        return residual
+
+    @cached_property
+    def size_of_update(self) -> float:
+        """Sum over the n points of the standard deviation of their weights in a posterior sample, in the data: the
+        weights have the covariance (K + sigma_n^2 I)^-1."""
+        variances: Tensor = torch.cholesky_inverse(self.posterior.factor).diagonal()
+        return float(variances.clamp_min(0).sqrt().sum())
 
     def _noise(self, at_samples: Tensor) -> Tensor:
         """Return N samples of the noise at the n points, (N, n), computed from standard normal numbers ``at_samples``
@@ -85,22 +98,36 @@ class Pathwise:
     def _prior(self, x: Tensor) -> Tensor:
         """Return features of the prior at x (m, d): 2 S random Fourier features, then those of the polynomial parts.
         The scalar product of the features at two inputs approximates their prior covariance."""
-        hyper = self.posterior.hyper
-        parts = [self._waves(x)]
-        if (reflection := hyper.reflection) is not None:
-            parts = [(parts[0] + reflection.parity * self._waves(x * reflection.signs)) / math.sqrt(2)]
-        polynomial = hyper.polynomial
-        if hyper.linear_variance > 0:
-            parts += [x.new_full((len(x), 1), math.sqrt(polynomial.constant)), polynomial.linear.sqrt() * x]
-        if hyper.quadratic_variance > 0:
-            parts.append(polynomial.quadratic.sqrt() * x.square())
-        return torch.cat(parts, 1)
+        return torch.cat(self._parts(x), 1)
 
-    def _waves(self, x: Tensor) -> Tensor:
-        """Return random Fourier features (m, 2 S) of the squared exponential at x (m, d)."""
+    def _parts(self, x: Tensor) -> list[Tensor]:
+        """Return the features of the prior at x (m, d) in parts, in the order of ``_prior``: cosines and sines, with a
+        reflection those of functions that have it, then the polynomial parts."""
+        hyper, phase = self.posterior.hyper, x @ self._frequencies
+        variance = hyper.signal_variance / FREQUENCIES
+        if (reflection := hyper.reflection) is None:
+            parts = [phase.cos(), phase.sin()]
+        else:
+            phase, image = phase.chunk(2, 1)
+            parts = [torch.add(f(phase), f(image), alpha=reflection.parity) for f in (torch.cos, torch.sin)]
+            variance /= 2
+        parts = [waves.mul_(math.sqrt(variance)) for waves in parts]
+        polynomial, powers = hyper.polynomial, []
+        if hyper.linear_variance > 0:
+            powers += [x.new_full((len(x), 1), math.sqrt(polynomial.constant)), polynomial.linear.sqrt() * x]
+        if hyper.quadratic_variance > 0:
+            powers.append(polynomial.quadratic.sqrt() * x.square())
+        return [*parts, torch.cat(powers, 1)] if powers else parts
+
+    @cached
+    def _frequencies(self) -> Tensor:
+        """Frequencies of the features in units of the inputs, (d, S), or with a reflection these and then those at the
+        mirror image, (d, 2 S)."""
         hyper = self.posterior.hyper
-        phase = (x / hyper.lengthscale) @ frequencies(x.shape[1], x.device)
-        return math.sqrt(hyper.signal_variance / FREQUENCIES) * torch.cat([phase.cos(), phase.sin()], 1)
+        scaled = frequencies(len(hyper.lengthscale), hyper.lengthscale.device) / hyper.lengthscale[:, None]
+        if hyper.reflection is None:
+            return scaled
+        return torch.cat([scaled, hyper.reflection.signs[:, None] * scaled], 1)
 
 
 @cache

@@ -19,11 +19,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
 from surrogym_server.gp.kernel import Hyperparameters, to_mirror
+from surrogym_server.gp.pathwise import Pathwise
 from surrogym_server.gp.posterior import Posterior
 from surrogym_server.tensors import CPU, GPU_BLOCK, in_blocks
 
@@ -35,6 +37,9 @@ MEAN_TOLERANCE = 1e-8
 # Exponents of the kernel are also computed from differences of inputs if products could cause a rounding error of the
 # variance above this share of the prior variance.
 VARIANCE_TOLERANCE = 5e-10
+# And for sampled functions if products could cause a typical rounding error of a value above this share of the prior
+# standard deviation. The random features of such a function have an error of some percent.
+FUNCTION_TOLERANCE = 1e-7
 
 
 @dataclass(frozen=True)
@@ -74,6 +79,14 @@ class _Process:
     scale: float
     mean_by_differences: bool
     variance_by_differences: bool
+    pathwise: Pathwise
+
+    @cached_property
+    def function_by_differences(self) -> bool:
+        """Whether products would round the values of sampled functions too much."""
+        posterior = self.pathwise.posterior
+        error = posterior.hyper.signal_variance * _exponent_error(posterior) * self.pathwise.size_of_update
+        return error / _least_deviation(posterior.hyper) > FUNCTION_TOLERANCE
 
     def exponent(self, x: Tensor) -> Tensor:
         """Return the exponents of the squared exponentials of inputs x (m, width) with all n points, (m, n), computed
@@ -83,26 +96,28 @@ class _Process:
         exponent: Tensor = distance.square_().mul_(-0.5)
         return exponent
 
-    def std(self, x: Tensor, z: Tensor, squared: Tensor, smooth: Tensor) -> Tensor:
-        """Return the standard deviation without noise, (m,), in the output's unit. Overwrites this output's columns of
+    def correlations(self, x: Tensor, z: Tensor, smooth: Tensor, *, differences: bool) -> Tensor:
+        """Return the prior covariances with the n points over sigma_f^2, (m, n). Overwrites this output's columns of
         ``smooth``.
 
         Args:
             x: all inputs of the model at m points, (m, width).
             z: [x, x^2, 1], (m, D).
-            squared: z^2, (m, D).
             smooth: squared exponentials with the points of all processes, (m, S).
+            differences: whether the exponents have to be computed from differences.
         """
-        k = smooth[:, self.span]
-        if self.variance_by_differences and not self.mean_by_differences:
-            k = self.exponent(x).exp_()
-        prior = squared @ self.prior
+        k = self.exponent(x).exp_() if differences and not self.mean_by_differences else smooth[:, self.span]
         if self.mirror is not None:
             k, images = k.chunk(2, 1)
             k.add_(images, alpha=self.parity)
+        return k if self.polynomial is None else k.addmm_(z, self.polynomial)
+
+    def std(self, z: Tensor, squared: Tensor, k: Tensor) -> Tensor:
+        """Return the standard deviation without noise, (m,), in the output's unit, from z = [x, x^2, 1] (m, D), its
+        elementwise square, and the result k (m, n) of ``correlations``."""
+        prior = squared @ self.prior
+        if self.mirror is not None:
             prior.add_((z @ self.mirror).exp_(), alpha=self.parity * self.signal_variance)
-        if self.polynomial is not None:
-            k.addmm_(z, self.polynomial)
         v = torch.linalg.solve_triangular(self.factor, k.T, upper=False)
         variance = prior - torch.linalg.vector_norm(v, dim=0).square_()
         std: Tensor = variance.clamp_min_(0).sqrt_().mul_(self.scale)
@@ -159,19 +174,35 @@ class Serving:
         model."""
         return in_blocks(self.rows, lambda rows: (self._means(*self._covariances(rows)),), x)[0]
 
-    def mean_and_std(self, x: Tensor, columns: Sequence[int]) -> tuple[Tensor, Tensor]:
+    def mean_and_std(
+        self, x: Tensor, columns: Sequence[int], paths: Tensor | None = None, begin: int = 0
+    ) -> tuple[Tensor, Tensor]:
         """Return means (m, O), and standard deviations without noise (m, O), at x (m, width). Only the standard
-        deviations of ``columns`` are computed; those of other columns are 0."""
+        deviations of ``columns`` are computed; those of other columns are 0.
 
-        def block(rows: Tensor) -> tuple[Tensor, Tensor]:
+        With ``paths`` (m, W) the means are replaced by the values of a sampled function for each row. Its weights begin
+        at the index ``begin``: those of each process, in the order of ``processes``.
+        """
+
+        def block(rows: Tensor, paths: Tensor | None) -> tuple[Tensor, Tensor]:
             z, smooth = self._covariances(rows)
             mean, squared = self._means(z, smooth), z.square()
-            std = torch.zeros_like(mean)
-            for column in self.processes.keys() & set(columns):
-                std[:, column] = self.processes[column].std(rows, z, squared, smooth)
+            std, end = torch.zeros_like(mean), begin
+            for column, process in self.processes.items():
+                if paths is None and column not in columns:
+                    continue
+                differences = process.variance_by_differences if column in columns else False
+                differences = differences or (paths is not None and process.function_by_differences)
+                k = process.correlations(rows, z, smooth, differences=differences)
+                if paths is not None:
+                    weights = paths[:, end : (end := end + process.pathwise.size)]
+                    own = rows.index_select(1, process.inputs)
+                    mean[:, column] += process.scale * process.pathwise.residual(own, weights, k)
+                if column in columns:
+                    std[:, column] = process.std(z, squared, k)
             return mean, std
 
-        mean, std = in_blocks(self.rows, block, x)
+        mean, std = in_blocks(self.rows, block, x, paths)
         return mean, std
 
     def _covariances(self, x: Tensor) -> tuple[Tensor, Tensor]:
@@ -208,6 +239,7 @@ def _process(output: Output, posterior: Posterior, span: slice, polynomial: Tens
         scale=output.scale,
         mean_by_differences=mean_error > MEAN_TOLERANCE,
         variance_by_differences=variance_error > VARIANCE_TOLERANCE,
+        pathwise=Pathwise(posterior),
     )
 
 
@@ -288,11 +320,22 @@ def _error_bounds(posterior: Posterior) -> tuple[float, float]:
     as shares of s and s^2, with sigma_f^2 + sigma_l^2 as the smallest s^2, or sigma_f^2 for an odd process, whose
     variance is 0 on the mirror, where its value is known. Mirror images double both errors.
     """
-    hyper, (n, d) = posterior.hyper, posterior.x.shape
-    reach = float((posterior.x / hyper.lengthscale).square().sum(1).max())
-    delta = (2 * d + 2) * torch.finfo(posterior.x.dtype).eps * 4.5 * reach
-    s = math.sqrt(hyper.signal_variance + hyper.polynomial.constant)
-    delta *= 1 if hyper.reflection is None else 2
+    hyper, n = posterior.hyper, len(posterior.x)
+    delta, s = _exponent_error(posterior), _least_deviation(hyper)
     mean = hyper.signal_variance * delta * float(posterior.weights.abs().sum()) / s
     noise = math.sqrt(hyper.noise_variance + posterior.jitter)
     return mean, 2 * hyper.signal_variance * delta * math.sqrt(n) / max(noise * s, 1e-300)
+
+
+def _exponent_error(posterior: Posterior) -> float:
+    """Return delta, a bound on the rounding error of an exponent that is computed by products; twice that with mirror
+    images."""
+    hyper = posterior.hyper
+    reach = float((posterior.x / hyper.lengthscale).square().sum(1).max())
+    delta = (2 * posterior.x.shape[1] + 2) * torch.finfo(posterior.x.dtype).eps * 4.5 * reach
+    return delta if hyper.reflection is None else 2 * delta
+
+
+def _least_deviation(hyper: Hyperparameters) -> float:
+    """Return the smallest prior standard deviation, s."""
+    return math.sqrt(hyper.signal_variance + hyper.polynomial.constant)

@@ -48,6 +48,23 @@ def test_each_served_output_equals_the_posterior_of_its_own_process(outputs, at,
         torch.testing.assert_close(std[:, output.column], output.scale * variance.sqrt(), rtol=1e-7, atol=1e-9)
 
 
+@pytest.mark.parametrize("tolerance", [0.0, 1e9], ids=["differences", "products"])
+def test_served_values_of_sampled_functions_equal_those_of_their_own_process(outputs, at, monkeypatch, rng, tolerance):
+    monkeypatch.setattr(serving, "FUNCTION_TOLERANCE", tolerance)
+    compiled = Serving.of(outputs, COLUMNS, WIDTH)
+    samplers = [process.pathwise for process in compiled.processes.values()]
+    noise = [torch.from_numpy(rng.standard_normal((len(at), one.size))) for one in samplers]
+    weights = [one.draw(own) for one, own in zip(samplers, noise, strict=True)]
+    paths = torch.cat([at.new_full((len(at), 2), torch.nan), *weights], 1)  # the first two belong to others
+    value, std = compiled.mean_and_std(at, [1], paths, 2)
+    torch.testing.assert_close(std, compiled.mean_and_std(at, [1])[1], rtol=1e-7, atol=1e-9)
+    for output, one, own in zip(outputs[1:], samplers, weights, strict=True):
+        residual = output.scale * one.residual(at[:, list(output.inputs)], own)
+        torch.testing.assert_close(
+            value[:, output.column] - compiled.mean(at)[:, output.column], residual, rtol=1e-7, atol=1e-7
+        )
+
+
 def test_served_standard_deviations_that_were_not_requested_are_zero(outputs, at):
     compiled = Serving.of(outputs, COLUMNS, WIDTH)
     _, some = compiled.mean_and_std(at, [1])

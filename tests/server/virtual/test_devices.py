@@ -144,6 +144,7 @@ def seen_in_a_step(
 
     run(model, settings)  # what is computed once on the CPU, such as frequencies, is known then
     monkeypatch.setattr(serving, "_error_bounds", lambda _: (float(differences), float(differences)))
+    monkeypatch.setattr(serving._Process, "function_by_differences", differences)
     monkeypatch.setattr(environment, "fetched", results)
     monkeypatch.setattr(several, "fetched", sizes)
     u = np.zeros((LANES, model.definition.action.size))

@@ -21,8 +21,6 @@ class Drawn:
 
     column: int
     span: slice  # columns of this output's weights among the W weights of a sampled function
-    inputs: Tensor  # indices of the features that the output reads
-    scale: float
     pathwise: Pathwise
 
 
@@ -71,17 +69,12 @@ class OutputGroup:
             grown: rates of those outputs that have rates, see ``Grown``.
         """
         device = encoder.definition.device
-        noise, samplers = torch.zeros(columns, dtype=torch.float64, device=device), []
-        for output in outputs:
-            if output.posterior is None:
-                continue
-            noise[output.column] = output.scale * math.sqrt(output.posterior.hyper.noise_variance)
-            pathwise = Pathwise(output.posterior)
-            span = slice(begin, begin := begin + pathwise.size)
-            samplers.append(
-                Drawn(output.column, span, torch.tensor(output.inputs, device=device), output.scale, pathwise)
-            )
         serving = Serving.of(outputs, columns, encoder.width(lead), device)
+        noise, samplers = torch.zeros(columns, dtype=torch.float64, device=device), []
+        for column, process in serving.processes.items():
+            pathwise = process.pathwise
+            noise[column] = process.scale * math.sqrt(pathwise.posterior.hyper.noise_variance)
+            samplers.append(Drawn(column, slice(begin, begin := begin + pathwise.size), pathwise))
         return cls(encoder, serving, noise, tuple(samplers), begin, grown)
 
     def predict(
@@ -98,26 +91,18 @@ class OutputGroup:
             process: standard normal numbers, by which the learned noise moves the values, in all columns, or None.
             paths: (m, W) weights of a sampled function for each row, whose value replaces the mean, or None.
         """
-        if columns:
-            value, spread = self.serving.mean_and_std(x, columns)
+        if columns or paths is not None:
+            first = self.drawn[0].span.start if self.drawn else 0
+            value, spread = self.serving.mean_and_std(x, columns, paths, first)
         else:
             value, spread = self.serving.mean(x), x.new_zeros(len(x), 0)
         if kick is not None:
             value = torch.addcmul(value, spread, kick)
         if process is not None:
             value = torch.addcmul(value, self.noise_std, process)
-        if paths is not None:
-            value = value + self._residuals(x, paths)
         for one in self.grown:
             grown = amplitude(x[:, one.inputs], one.rates)
             value[:, one.column] = one.centre + grown * (value[:, one.column] - one.centre)
             if columns:
                 spread[:, one.column] *= grown
         return value, spread
-
-    def _residuals(self, x: Tensor, paths: Tensor) -> Tensor:
-        residuals = x.new_zeros(len(x), len(self.noise_std))
-        for one in self.drawn:
-            residual = one.pathwise.residual(x[:, one.inputs], paths[:, one.span])
-            residuals[:, one.column] = one.scale * residual
-        return residuals
