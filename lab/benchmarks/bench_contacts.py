@@ -198,7 +198,7 @@ def run(task: str, spec: EnvironmentSpec, seed: int, options: argparse.Namespace
         if not options.searches or words not in options.arms:
             continue
         begun = time.process_time()
-        adjustable(searched[0].simulator).set_parameters(values)
+        searched[0].set_parameters(values)  # of the simulator that all share
         earned = returns(task, [one.stepped() for one in searched], plant, options.searches, seed)
         print(f"{task} {seed}, {words}: {earned}; {time.process_time() - begun:.0f} s")
 

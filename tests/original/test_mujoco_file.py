@@ -198,6 +198,20 @@ def test_a_surrogate_may_step_the_calibrated_file_itself(tmp_path):
     assert returns.tolist() == [2.0 * spec.time_limit] * 3
 
 
+def test_values_that_one_simulator_was_calibrated_to_can_be_given_to_another_one(tmp_path):
+    (other := tmp_path / "other").mkdir()
+    prior = surrogym.Prior(pole(tmp_path), spec_of(), ["mass.pole"])
+    prior.set_parameters({"mass.pole": 0.3})
+    q, u = drawn(5)
+    heavy = original.make(pole(other, mass=0.3), spec=spec_of())
+    moved = prior.stepped().model.transition(torch.from_numpy(q), torch.from_numpy(u))
+    np.testing.assert_allclose(
+        moved.q_next, [heavy.step_from(*row).next_coordinates for row in zip(q, u, strict=True)], atol=1e-12
+    )
+    with pytest.raises(ValueError, match=r"expected values of mass\.pole, got one of mass\.cart"):
+        prior.set_parameters({"mass.pole": 0.2, "mass.cart": 1.0})
+
+
 def test_a_stepped_simulator_needs_a_reward_and_a_declared_termination(tmp_path):
     for fields, words in (
         ({"reward": {"timing": "after"}}, "a declared reward"),

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Self
 
@@ -196,6 +196,17 @@ class SimulatorPrior(ABC):
         self._set(found.values)
         self._seconds = step.seconds
         return True
+
+    def set_parameters(self, values: Mapping[str, float]) -> None:
+        """Give some of the named parameters these values, for example those of a calibration of another simulator of
+        the same plant. Raises ``ValueError`` if one was not named when the prior was made."""
+        names = [parameter.name for parameter in self.parameters]
+        if unknown := [name for name in values if name not in names]:
+            raise ValueError(
+                f"expected values of {', '.join(names) or 'no parameter'}, got one of {unknown[0]}: name it when the "
+                "prior is made"
+            )
+        self._set(values)
 
     def learned(self, progress: Progress = silent) -> tuple[SurrogateFile, float]:
         """Learn a model of the simulator with its current parameters, and return it and its confidence index. If no
