@@ -393,7 +393,7 @@ def chosen_lanes(mask: Bools | None, lanes: LaneState) -> Bools | slice:
         return EVERY
     if len(mask) != len(lanes):
         raise InvalidInput(f"mask: expected {len(lanes)} entries, one for each lane, got {len(mask)}")
-    return np.asarray(mask, dtype=bool)
+    return np.array(mask, dtype=bool)  # a copy, because that of a message is read-only, which compiled code refuses
 
 
 def _scatter(chosen: Chosen, count: int, values: NDArray[Any]) -> NDArray[Any]:

@@ -110,6 +110,7 @@ def test_compiled_steps_with_a_mask_agree_with_torch(model):
     lanes, _ = reset(model.definition, settings, create(model.definition, settings, 0))
     for _ in range(STEPS):
         u, mask = actions(model, rng), rng.random(LANES) < 0.6
+        mask.flags.writeable = False  # as that of a message is
         made = step(model, settings, lanes, u, mask)
         require_agreement(made, step(model, replace(settings, compiled=False), lanes, u, mask))
         lanes = made[0]
