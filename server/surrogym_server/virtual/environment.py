@@ -202,7 +202,7 @@ def step(
     cut = _cut(settings, active, doubtful)
     after = replace(after, phase=after.phase.copy())
     after.phase[moving] = np.where(over | cut, ENDED, RUNNING)
-    terminated, truncated = (_scatter(moving, len(lanes), flags) for flags in (over, cut))
+    terminated, truncated = (scattered(moving, len(lanes), flags) for flags in (over, cut))
     final_lanes = np.zeros(0, dtype=np.int64)
     if settings.autoreset_mode == "same_step":
         beginning = terminated | truncated
@@ -210,8 +210,8 @@ def step(
     final_observation = observation[final_lanes]
     if len(final_lanes):
         after = _begin(definition, settings, after, final_lanes)
-        (observation[final_lanes],) = fetched(_observe(definition, settings, after.take(final_lanes)))
-    reward = _scatter(moving, len(lanes), reward)
+        (observation[final_lanes],) = fetched(_observe(definition, settings, after.bare.take(final_lanes)))
+    reward = scattered(moving, len(lanes), reward)
     return after, LaneTransition(
         observation=observation,
         reward=reward,
@@ -220,10 +220,10 @@ def step(
         final_lanes=final_lanes,
         final_observation=final_observation,
         reset_lanes=np.zeros(len(lanes), dtype=bool) if beginning is None else beginning,
-        reward_mean=reward.copy() if reward_mean is None else _scatter(moving, len(lanes), reward_mean),
-        std=None if std is None else _scatter(moving, len(lanes), std),
-        untrusted=None if doubtful is None else _scatter(moving, len(lanes), doubtful),
-        left=None if early is None else _scatter(moving, len(lanes), early),
+        reward_mean=reward.copy() if reward_mean is None else scattered(moving, len(lanes), reward_mean),
+        std=None if std is None else scattered(moving, len(lanes), std),
+        untrusted=None if doubtful is None else scattered(moving, len(lanes), doubtful),
+        left=None if early is None else scattered(moving, len(lanes), early),
     )
 
 
@@ -349,7 +349,7 @@ def _cut(settings: VirtualSettings, after: LaneState, untrusted: Bools | None) -
 
 def _begin(definition: EnvironmentDefinition, settings: VirtualSettings, lanes: LaneState, chosen: Chosen) -> LaneState:
     """Begin new episodes in the lanes that ``chosen``, a mask or indices, selects."""
-    fresh = lanes.take(chosen)
+    fresh = lanes.bare.take(chosen)
     if not len(fresh):
         return lanes
     begun = np.full_like(fresh.phase, RUNNING)
@@ -396,7 +396,7 @@ def chosen_lanes(mask: Bools | None, lanes: LaneState) -> Bools | slice:
     return np.array(mask, dtype=bool)  # a copy, because that of a message is read-only, which compiled code refuses
 
 
-def _scatter(chosen: Chosen, count: int, values: NDArray[Any]) -> NDArray[Any]:
+def scattered(chosen: Chosen, count: int, values: NDArray[Any]) -> NDArray[Any]:
     """Return an array with ``count`` rows, one for each lane: the rows of ``values``, in order, in the ``chosen``
     lanes, and zeros in all others."""
     if isinstance(chosen, slice):

@@ -7,7 +7,7 @@ Coordinates and weights are tensors on the session's device.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -56,13 +56,16 @@ class LaneState:
 
     def put(self, index: Chosen, other: LaneState) -> LaneState:
         """Return a copy of this state in which the lanes that ``index``, an index array or a mask, selects are replaced
-        by the lanes of ``other``, in order."""
+        by the lanes of ``other``, in order. Particles and weights that ``other`` has none of stay as they are."""
         if isinstance(index, slice):
             return other
         at, there = self._places(index)
         replaced: list[Any] = []
         for f in fields(self):
             values, ours = getattr(other, f.name), getattr(self, f.name)
+            if f.name in ("particles", "path") and not values.shape[1]:
+                replaced.append(ours)
+                continue
             if f.name == "path":
                 width = max(ours.shape[1], values.shape[1])
                 ours, values = _widened(ours, width), _widened(values, width)
@@ -70,6 +73,11 @@ class LaneState:
             changed[there if isinstance(ours, Tensor) else at] = values
             replaced.append(changed)
         return LaneState(*replaced)
+
+    @property
+    def bare(self) -> LaneState:
+        """The same lanes without particles and weights, which are large."""
+        return replace(self, particles=self.particles[:, :0], path=self.path[:, :0])
 
     def _places(self, index: NDArray[Any]) -> tuple[NDArray[Any], Tensor]:
         """Return the indices of lanes as an array and on the device of the coordinates. By a mask there, the device

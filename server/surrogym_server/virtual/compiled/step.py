@@ -19,8 +19,15 @@ from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.models.abilities import ArraySteps, ArrayTransition
 from surrogym_server.models.port import DynamicsModel
 from surrogym_server.virtual.compiled.outcome import conclude, observe
-from surrogym_server.virtual.environment import LaneTransition, VirtualSettings, chosen_lanes, divided, paid_outside
-from surrogym_server.virtual.lanes import EVERY, RUNNING, LaneState
+from surrogym_server.virtual.environment import (
+    LaneTransition,
+    VirtualSettings,
+    chosen_lanes,
+    divided,
+    paid_outside,
+    scattered,
+)
+from surrogym_server.virtual.lanes import RUNNING, LaneState
 from surrogym_server.virtual.noise import Purpose, normal_noise
 from surrogym_server.virtual.paths import with_paths
 from surrogym_server.virtual.sensors import driving, sensed
@@ -77,7 +84,8 @@ def compiled_step(
     ``move`` is the model's compiled step.
     """
     definition, changed = model.definition, _Changed.of(lanes)
-    running, moving, beginning = _divided(settings, lanes, changed.phase, mask)
+    moving, beginning = divided(settings, lanes, chosen_lanes(mask, lanes))
+    running = np.ones(len(lanes), dtype=np.bool_) if isinstance(moving, slice) else moving
     if settings.variant == "pathwise":
         lanes = lanes.put(moving, with_paths(model, lanes.take(moving), settings.functions))
     moved = _moved(model, move, settings, lanes, u, moving, stds)
@@ -100,28 +108,10 @@ def compiled_step(
         final_observation=final_observation,
         reset_lanes=np.zeros(len(changed.phase), dtype=bool) if beginning is None else beginning,
         reward_mean=changed.rewards[1],
-        std=_scattered(running, moved.std) if stds else None,
+        std=scattered(moving, len(lanes), moved.std) if stds else None,
         untrusted=None if settings.trust is None else changed.ends[2],
         left=None if definition.outside_reward is None and definition.limits is None else changed.ends[4],
     )
-
-
-def _divided(
-    settings: VirtualSettings, lanes: LaneState, phase: NDArray[np.int8], mask: Bools | None
-) -> tuple[Bools, Bools | slice, Bools | None]:
-    """Divide the lanes (parallel environments) that ``mask`` (N,) selects into those that this step moves and those
-    that it resets; None selects all. ``phase`` (N,) says of each lane whether it was never reset, is in an episode, or
-    has ended one.
-
-    Returns:
-        A mask (N,) of the lanes to move; the same mask, or the slice of all lanes if all move; and a mask (N,) of the
-        lanes to reset, None if there are none.
-    """
-    running = phase == RUNNING
-    if mask is None and running.all():
-        return running, EVERY, None
-    moving, waiting = divided(settings, lanes, chosen_lanes(mask, lanes))
-    return running if isinstance(moving, slice) else moving, moving, waiting
 
 
 def _moved(
@@ -241,13 +231,3 @@ def _observed(steps: ArraySteps, q: Floats) -> Singles:
 @lru_cache(maxsize=MODELS)
 def _observation_tables(steps: ArraySteps) -> Tables:
     return tables_of(steps.definition.observe)
-
-
-def _scattered(moving: Bools, values: Floats) -> Floats:
-    """Return an array of N rows, one for each lane: the rows of ``values``, in order, in the lanes that the mask
-    ``moving`` (N,) selects, and zeros in all others."""
-    if len(values) == len(moving):
-        return values
-    full: Floats = np.zeros((len(moving), *values.shape[1:]))
-    full[moving] = values
-    return full
