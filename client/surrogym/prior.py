@@ -14,12 +14,13 @@ from surrogym_sampler.original.errors import StepRefused
 from surrogym_sampler.priors.prior import Careful, Progress, SimulatorPrior
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.definition import EnvironmentDefinition
-from surrogym_server.errors import InvalidInput
+from surrogym_server.errors import InvalidInput, PluginFailed
 from surrogym_server.local import LocalSurrogate
 from surrogym_server.models.port import DynamicsModel, Transition
 from surrogym_shared.surrogate_file import SurrogateFile
 
 MOST_THREADS = 4
+DIVERGED = 1e15  # a step to larger numbers counts as diverged; policies can't take them
 
 
 class Prior(SimulatorPrior):
@@ -60,7 +61,8 @@ class Prior(SimulatorPrior):
 
 
 class SteppedModel(DynamicsModel):
-    """A simulator in the place of a model of it. Its steps are certain."""
+    """A simulator in the place of a model of it. Its steps are certain. A step raises ``PluginFailed`` if the simulator
+    raises an error or diverges."""
 
     samples, digest = 1, "stepped"
 
@@ -80,16 +82,28 @@ class SteppedModel(DynamicsModel):
         reward_std: bool = False,
     ) -> Transition:
         del noise, process  # the simulator is certain, and has no noise
-        if self._many is not None:
-            q_next, reward = torch.from_numpy(self._many(q.numpy(), u.numpy())), q.new_zeros(len(q))
-        else:
-            steps = [self._simulator.step_from(*row) for row in zip(q.numpy(), u.numpy(), strict=True)]
-            q_next = q.new_tensor(np.array([step.next_coordinates for step in steps]))
-            reward = q.new_tensor([step.reward for step in steps])
+        try:
+            q_next, reward = self._taken(q, u)
+        except (Exception, SystemExit) as error:  # a user's code may raise anything
+            raise PluginFailed(
+                f"the simulator failed: {type(error).__name__}: {error}; correct the simulator"
+            ) from error
+        if not all((numbers.abs() < DIVERGED).all() for numbers in (q_next, reward)):  # not so for NaN either
+            raise PluginFailed(
+                f"expected numbers below {DIVERGED:g} from the simulator, got larger ones or NaN: give it a smaller "
+                "time step, or narrow the sampling ranges and starts"
+            )
         if (declared := self.definition.declared_reward) is not None:
             reward = declared(q_next if declared.after else q, u)
         certain = q.new_zeros(len(q), len(self.definition.outputs))
         return Transition(q_next, reward, certain[:, :-1] if stds else None, certain[:, -1] if reward_std else None)
+
+    def _taken(self, q: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+        if self._many is not None:
+            return torch.from_numpy(self._many(q.numpy(), u.numpy())), q.new_zeros(len(q))
+        steps = [self._simulator.step_from(*row) for row in zip(q.numpy(), u.numpy(), strict=True)]
+        q_next = q.new_tensor(np.array([step.next_coordinates for step in steps]))
+        return q_next, q.new_tensor([step.reward for step in steps])
 
     def means(self, q: Tensor, u: Tensor) -> Tensor:
         moved = self.transition(q, u)

@@ -14,7 +14,7 @@ from surrogym_sampler import original
 from surrogym_sampler.original.describing import describe
 from surrogym_sampler.original.errors import StepFailed, UnknownEnvironment
 from surrogym_sampler.original.loading import is_known
-from surrogym_server.errors import InvalidInput
+from surrogym_server.errors import InvalidInput, PluginFailed
 from surrogym_shared.spec import (
     BoxAction,
     Coordinate,
@@ -90,6 +90,15 @@ def test_many_steps_at_once_equal_single_ones_and_one_that_diverges_is_no_number
     with pytest.raises(StepFailed, match=r"diverged: use a smaller timestep in the file, or narrower sampling ranges"):
         environment.step_from(q[3], u[3])
     np.testing.assert_allclose(environment.step_from(q[4], u[4]).next_coordinates, single[4], atol=1e-9)
+    environment.close()
+
+
+def test_many_steps_of_one_time_step_each_that_diverge_are_no_numbers_either(tmp_path):
+    environment, (q, u) = original.make(pole(tmp_path), spec=spec_of(sampling_period=0.01)), drawn(20)
+    single = [environment.step_from(*row).next_coordinates for row in zip(q, u, strict=True)]
+    np.testing.assert_allclose(environment.steps_from(q, u), single, atol=1e-9)
+    q[3, 3] = 1e9
+    assert np.isnan(environment.steps_from(q, u)).any(1).nonzero()[0].tolist() == [3]
     environment.close()
 
 
@@ -219,3 +228,47 @@ def test_a_stepped_simulator_needs_a_reward_and_a_declared_termination(tmp_path)
     ):
         with pytest.raises(InvalidInput, match=words):
             surrogym.Prior(pole(tmp_path), spec_of(**fields)).stepped()
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"mass.pole": 0.0}, r"expected mass\.pole above 0, got 0"),
+        ({"mass.pole": -1.0}, r"expected mass\.pole above 0, got -1"),
+        ({"mass.pole": math.nan}, r"expected a finite number for mass\.pole, got nan"),
+        ({"mass.pole": "heavy"}, r"expected a finite number for mass\.pole, got 'heavy'"),
+        ({"mass.pole": 0.3, "damping.hinge": -0.1}, r"expected damping\.hinge of at least 0, got -0\.1"),
+    ],
+)
+def test_values_that_no_machine_can_have_are_refused_and_change_nothing(tmp_path, values, words):
+    prior, (q, u) = surrogym.Prior(pole(tmp_path), spec_of(), ["mass.pole", "damping.hinge"]), drawn(5)
+    before = prior.simulator.steps_from(q, u)  # type: ignore[attr-defined]
+    with pytest.raises(ValueError, match=words):
+        prior.set_parameters(values)
+    prior.set_parameters({"damping.hinge": 0.0})
+    prior.set_parameters({"damping.hinge": 0.02})
+    np.testing.assert_array_equal(prior.simulator.steps_from(q, u), before)  # type: ignore[attr-defined]
+
+
+def test_a_calibration_with_a_range_of_values_that_no_machine_can_have_ends(tmp_path):
+    (other := tmp_path / "other").mkdir()
+    real, (q, u) = original.make(pole(other, mass=0.01), spec=spec_of()), drawn(20)
+    prior = surrogym.Prior(pole(tmp_path), spec_of(), ["mass.pole=-1..1"])
+    prior.calibrate([real.step_from(*row) for row in zip(q, u, strict=True)])
+    assert prior.calibration is not None
+    assert prior.calibration.values == pytest.approx({"mass.pole": 0.01}, rel=1e-3)
+
+
+def test_a_training_in_a_file_that_diverges_ends_with_a_sentence(tmp_path):
+    path = Path(pole(tmp_path, timestep=0.03).partition(":")[2])
+    path.write_text(path.read_text().replace('type="slide"', 'type="slide" stiffness="1e6"'))
+    prior = surrogym.Prior(f"mujoco:{path}", spec_of())
+    with pytest.raises(PluginFailed, match=r"below 1e\+15 from the simulator, got larger ones or NaN"):
+        imagined_returns(prior.stepped(), lambda shown: np.zeros((len(shown), 1)), 3, seed=0)
+
+
+def test_an_opened_file_has_no_reward_either(tmp_path):
+    spec = spec_of(reward={"timing": "after"})
+    opened = surrogym.Prior(pole(tmp_path), spec).simulator
+    with pytest.raises(InvalidInput, match="a declared reward"):
+        surrogym.Prior(opened, spec).stepped()

@@ -304,7 +304,10 @@ class _Errors:
         return len(self._real) * int(self._moves.sum())
 
     def __call__(self, values: Array) -> Array:
-        rows = self._many(values, self._real.coordinates, self._real.action)
+        try:
+            rows = self._many(values, self._real.coordinates, self._real.action)
+        except Exception as error:
+            rows = self._failed(error, self._real.coordinates.shape)
         if not self.failure and not np.isfinite(rows).all():
             self.failure = ", with numbers that are infinite or NaN, as a solver that diverges gives"
         errors = self._difference(rows, self._real.next_coordinates)[:, self._moves] / self._scale
@@ -316,9 +319,13 @@ class _Errors:
     def _one(self, values: Array, coordinates: Array, action: Array) -> Array:
         try:
             return np.asarray(self._step(values, coordinates, action), dtype=np.float64)
-        except Exception as error:  # a user's code may raise anything; then the step counts as very wrong
-            self.failure = f" ({type(error).__name__}: {str(error)[:80]})"
-            return np.full(len(coordinates), np.nan)
+        except Exception as error:
+            return self._failed(error, coordinates.shape)
+
+    def _failed(self, error: Exception, shape: tuple[int, ...]) -> Array:
+        """Results of steps that raised an error, as a user's code may, so that they count as very wrong."""
+        self.failure = f" ({type(error).__name__}: {str(error)[:80]})"
+        return np.full(shape, np.nan)
 
     def _difference(self, one: Array, other: Array) -> Array:
         difference = one - other

@@ -19,7 +19,7 @@ from surrogym_sampler.original.episodes import draw
 from surrogym_sampler.original.errors import StepRefused, UnknownEnvironment
 from surrogym_sampler.original.loading import Respecified, is_own, make, with_choices
 from surrogym_sampler.original.periods import require_period
-from surrogym_sampler.original.protocol import Array, OriginalEnvironment, RealStep
+from surrogym_sampler.original.protocol import Array, OriginalEnvironment, RealStep, is_number
 from surrogym_sampler.priors.calibration import (
     Calibration,
     RealTransitions,
@@ -126,7 +126,8 @@ class SimulatorPrior(ABC):
         self.simulator = _opened(simulator, self.spec)
         self.source = self._words(simulator)
         adapter = adapter_of(simulator) if isinstance(simulator, str) else None
-        self.pays = adapter is None or adapter.pays  # whether the simulator has a reward
+        # whether the simulator has a reward
+        self.pays = (adapter is None or adapter.pays) and getattr(layers(self.simulator)[-1], "pays", True)
         plant = adjustable(self.simulator)
         self.parameters = read_parameters(parameters, plant)
         self._set, present = plant.set_parameters, plant.parameters()
@@ -199,13 +200,17 @@ class SimulatorPrior(ABC):
 
     def set_parameters(self, values: Mapping[str, float]) -> None:
         """Give some of the named parameters these values, for example those of a calibration of another simulator of
-        the same plant. Raises ``ValueError`` if one was not named when the prior was made."""
+        the same plant. Raises ``ValueError``, and changes nothing, if one was not named when the prior was made, is
+        not a finite number, or is refused by the simulator."""
         names = [parameter.name for parameter in self.parameters]
         if unknown := [name for name in values if name not in names]:
             raise ValueError(
                 f"expected values of {', '.join(names) or 'no parameter'}, got one of {unknown[0]}: name it when the "
                 "prior is made"
             )
+        for name, value in values.items():
+            if not is_number(value):
+                raise ValueError(f"expected a finite number for {name}, got {value!r}")
         self._set(values)
 
     def learned(self, progress: Progress = silent) -> tuple[SurrogateFile, float]:

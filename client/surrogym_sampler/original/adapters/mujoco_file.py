@@ -28,6 +28,7 @@ from surrogym_shared.spec import MAX_DIMENSIONS, BoxAction, EnvironmentSpec
 
 PREFIX = "mujoco:"
 PERIOD = 0.02  # seconds for which an action is held, about, until a specification declares a sampling period
+BEGIN = 1.0  # time at which rollouts begin, in seconds
 UNKNOWN_LIMITS = (-1.0, 1.0)  # assumed limits of a control that declares none
 
 
@@ -158,13 +159,15 @@ class MujocoFile(OfParts):
         start = np.empty(self._mujoco.mj_stateSize(self._model, kind))
         self._parts[0].write(self.rest)
         self._mujoco.mj_getState(self._model, self._data, start, kind)
-        # MuJoCo's state begins with the time, which is 0 here, and the variables.
+        # MuJoCo's state begins with the time and the variables. MuJoCo goes on from its initial state at time 0 after a
+        # step that diverged, so a rollout that begins at another time does not end at its due time then. (Interpolated
+        # delays of actuators have times of their own.)
+        start[0] = begin = 0.0 if getattr(self._model, "nhistory", 0) else BEGIN
         start, variables = np.tile(start, (len(coordinates), 1)), np.arange(1, 1 + len(self.variables))
         start[:, variables[columns]] = coordinates
         held = np.repeat(np.asarray(actions, dtype=np.float64)[:, None], self._substeps, axis=1)
         reached = pool.rollout(self._model, datas, start, held)[0][:, -1, : 1 + len(self.variables)]
-        # a rollout ends early where a step diverges
-        reached[np.abs(reached[:, 0] - self.period) > CLOSE * self.period] = np.nan
+        reached[np.abs(reached[:, 0] - begin - self.period) > CLOSE * self.period] = np.nan
         return np.asarray(reached[:, 1:])
 
     @cached_property

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -50,21 +51,30 @@ class OfParts(Simulator):
     def parameters(self) -> dict[str, float]:
         """Return the parameters of a MuJoCo model by name: ``mass.BODY``, ``damping.JOINT``, ``friction.GEOM``
         (sliding) and ``gear.ACTUATOR``. Elements without a name or with a value of 0 are left out."""
-        return {} if self._model is None else {name: float(rows[at]) for name, rows, at in _parameters(self._model)}
+        return {name: float(rows[at]) for name, (rows, at) in self._places.items()}
 
     def set_parameters(self, values: Mapping[str, float]) -> None:
-        """Change parameters of the MuJoCo model, by name. A body's inertia changes in proportion to its mass."""
+        """Change parameters of the MuJoCo model, by name. A body's inertia changes in proportion to its mass. Raises
+        ``ValueError``, and changes nothing, if a mass is not above 0, or damping or friction is below 0."""
         import mujoco
 
-        places = {name: (rows, at) for name, rows, at in _parameters(self._model)}
         for name, value in values.items():
-            rows, at = places[name]
+            if not (value > 0 if name.startswith("mass.") else value >= 0 or name.startswith("gear.")):
+                least = "above 0" if name.startswith("mass.") else "of at least 0"
+                raise ValueError(f"expected {name} {least}, got {value:g}: give a value that a machine can have")
+        for name, value in values.items():
+            rows, at = self._places[name]
             if name.startswith("mass."):
                 self._model.body_inertia[at] *= value / float(rows[at])
             rows[at] = value
         qpos, qvel = self._data.qpos.copy(), self._data.qvel.copy()
         mujoco.mj_setConst(self._model, self._data)
         self._data.qpos[:], self._data.qvel[:] = qpos, qvel
+
+    @cached_property
+    def _places(self) -> dict[str, tuple[Any, Any]]:
+        """Array and index of each parameter. A parameter stays one when its value becomes 0."""
+        return {} if self._model is None else {name: (rows, at) for name, rows, at in _parameters(self._model)}
 
     def perturb(self, rng: np.random.Generator, sigma: float) -> None:
         if self._model is None or self._masses is None:
