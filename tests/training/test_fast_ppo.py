@@ -322,6 +322,10 @@ def test_fastppo_refuses_to_continue_a_stable_baselines3_policy(surrogate, tmp_p
     start = train(surrogate, tmp_path / "first.zip", TrainSettings("ppo", **small)).path
     with pytest.raises(UnusablePolicy, match="which it has not saved: leave --algorithm out"):
         train(surrogate, tmp_path / "further.zip", TrainSettings("fastppo", start_from=start, **small))
+    with pytest.raises(UnusablePolicy, match=r"missing\.zip, which is no file"):
+        train(
+            surrogate, tmp_path / "further.zip", TrainSettings("fastppo", start_from=tmp_path / "missing.zip", **small)
+        )
 
 
 def test_ppo_of_stable_baselines3_is_the_default_where_nothing_can_be_compiled(tmp_path: Path, monkeypatch):

@@ -110,7 +110,8 @@ class FastPpo(PolicySearch):
     def search(self, task: SearchTask) -> Found:
         start = task.settings.start_from
         if start is not None and not Network.is_at(start):
-            raise UnusablePolicy(f"fastppo can't continue {start}, which it has not saved: leave --algorithm out")
+            why = "it has not saved: leave --algorithm out" if Path(start).is_file() else "is no file"
+            raise UnusablePolicy(f"fastppo can't continue {start}, which {why}")
         compiled_update()  # loads the linear algebra library now, so that its threads are limited as well
         with threadpool_limits(limits=task.settings.threads):
             return _Training(self, task).run()
