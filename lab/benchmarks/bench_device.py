@@ -168,7 +168,7 @@ def on_device(model: DynamicsModel, call: Callable[[], Any]) -> Call:
 
 
 def seconds_of(call: Call, seconds: float) -> float:
-    """Median of the calls of so many seconds, at least ``LEAST``."""
+    """Median duration of a call in seconds. It is called for ``seconds``, and at least ``LEAST`` times."""
     for _ in range(WARM_UP):
         call()
     taken, end = [], time.perf_counter() + seconds

@@ -6,7 +6,8 @@ Tensors are placed on a device once; computations run on the device of their inp
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import fields, is_dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any, TypeVar
@@ -55,7 +56,7 @@ def sent(values: NDArray[Any], device: torch.device) -> Tensor:
     tensor = torch.from_numpy(values)
     if device == CPU:
         return tensor
-    # Only from memory that the system can't move does CUDA copy while the program goes on.
+    # CUDA copies from pinned memory while the program goes on; it waits for a copy from other memory.
     return (tensor.pin_memory() if device.type == "cuda" else tensor).to(device, non_blocking=True)
 
 
@@ -98,6 +99,17 @@ def gpu_failure(error: BaseException) -> Unavailable | None:
             "sessions; samples, models and policies are stored"
         )
     return None
+
+
+@contextmanager
+def gpu_calls() -> Iterator[None]:
+    """Raise what ``gpu_failure`` returns in the place of an error that torch raised because a GPU failed."""
+    try:
+        yield
+    except RuntimeError as error:
+        if failure := gpu_failure(error):
+            raise failure from error
+        raise
 
 
 @lru_cache(maxsize=1_024)

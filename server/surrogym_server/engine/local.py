@@ -60,7 +60,7 @@ from surrogym_server.errors import DeadlineExceeded, Overloaded, SessionExpired,
 from surrogym_server.models.draws import function_draws
 from surrogym_server.models.guard import plugin_calls
 from surrogym_server.sampling.uncertainty import visited_confidence
-from surrogym_server.tensors import CPU, gpu_failure
+from surrogym_server.tensors import CPU, gpu_calls, gpu_failure
 from surrogym_server.virtual import expected_bytes
 from surrogym_shared import compiled
 from surrogym_shared.compiled import disk_cache
@@ -148,12 +148,8 @@ class LocalEngine(SessionEngine):
         return info_of(self._live.get(session))
 
     async def coordinates(self, session: str) -> Array:
-        try:
+        with gpu_calls():
             coordinates: Array = self._live.get(session).lanes.q.cpu().numpy()
-        except RuntimeError as error:
-            if failure := gpu_failure(error):
-                raise failure from error
-            raise
         return coordinates
 
     async def submit(self, session: str) -> Visited:
@@ -256,12 +252,8 @@ class LocalEngine(SessionEngine):
         version = latest if request.opening.model == "latest" else request.opening.model
         model = self._models.get(request.surrogate_id, version, self._device)
         self._compiling.wait()
-        try:
+        with gpu_calls():
             return opened(request, definition, model, version, digest, self._place)
-        except RuntimeError as error:
-            if failure := gpu_failure(error):
-                raise failure from error
-            raise
 
     def _visits(self, session: Session, states: Array) -> Visited:
         surrogate = session.surrogate_id
@@ -587,12 +579,8 @@ def _mebibytes(nbytes: int) -> str:
 
 def _timed(work: Work, session: Session) -> tuple[tuple[Session, Outcome], float]:
     start = time.perf_counter()
-    try:
+    with gpu_calls():
         result = work(session)
-    except RuntimeError as error:
-        if failure := gpu_failure(error):
-            raise failure from error
-        raise
     return result, time.perf_counter() - start
 
 

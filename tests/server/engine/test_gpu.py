@@ -1,5 +1,7 @@
-"""A GPU that is too small for a session, or that fails while one is stepped. A server without a GPU stands in for one
-that has it: it is told how much memory is free, and steps of three environments raise what torch raises."""
+"""A GPU that is too small for a session, or that fails while a session is stepped.
+
+The server has no GPU. It is told an amount of free memory, and steps of three environments raise the errors of torch.
+"""
 
 from __future__ import annotations
 

@@ -159,9 +159,9 @@ class MujocoFile(OfParts):
         start = np.empty(self._mujoco.mj_stateSize(self._model, kind))
         self._parts[0].write(self.rest)
         self._mujoco.mj_getState(self._model, self._data, start, kind)
-        # MuJoCo's state begins with the time and the variables. MuJoCo goes on from its initial state at time 0 after a
-        # step that diverged, so a rollout that begins at another time does not end at its due time then. (Interpolated
-        # delays of actuators have times of their own.)
+        # MuJoCo's state begins with the time and the variables. After a step that diverged, MuJoCo continues from its
+        # initial state at time 0. A rollout that began at another time then ends at a wrong time, which shows that.
+        # Rollouts begin at 0 if actuators have interpolated delays, because these depend on the time.
         start[0] = begin = 0.0 if getattr(self._model, "nhistory", 0) else BEGIN
         start, variables = np.tile(start, (len(coordinates), 1)), np.arange(1, 1 + len(self.variables))
         start[:, variables[columns]] = coordinates
