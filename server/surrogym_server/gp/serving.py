@@ -191,8 +191,9 @@ class Serving:
             for column, process in self.processes.items():
                 if paths is None and column not in columns:
                     continue
-                differences = process.variance_by_differences if column in columns else False
-                differences = differences or (paths is not None and process.function_by_differences)
+                differences = (column in columns and process.variance_by_differences) or (
+                    paths is not None and process.function_by_differences
+                )
                 k = process.correlations(rows, z, smooth, differences=differences)
                 if paths is not None:
                     weights = paths[:, end : (end := end + process.pathwise.size)]
