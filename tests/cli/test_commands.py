@@ -153,6 +153,12 @@ def test_exporting_a_surrogate_without_a_model_is_refused(on_server, pendulum):
     assert "has no model yet" in said.err
 
 
+def test_an_export_waits_for_the_first_fit(on_server, pendulum):
+    """It said that a sampler had to answer the first queries, which were answered."""
+    assert on_server("sample", pendulum, "--max-queries", "4", "--quiet").code == 0
+    assert on_server("export", pendulum, "--out", "early.surrogate").code == 0
+
+
 def test_training_without_a_model_recommends_sampling_or_waiting(on_server, pendulum):
     """A person who starts the training a second after the sampler is told nothing: the training waits."""
     missing = f"error: '{pendulum}' has no model yet, its phase is "

@@ -8,8 +8,8 @@ from unittest.mock import Mock
 import pytest
 
 from surrogym_client.surrogates import waiting
-from surrogym_client.surrogates.waiting import DesignUnfinished, wait_for_model, words_of_long_fit
-from surrogym_shared.wire import Ledger
+from surrogym_client.surrogates.waiting import DesignUnfinished, is_fitting, wait_for_model, words_of_long_fit
+from surrogym_shared.wire import Ledger, QueryCounts
 
 
 def view(phase: str, samples: int = 2_000) -> Any:
@@ -31,3 +31,14 @@ def test_waiting_that_times_out_reports_that_the_fit_continues(monkeypatch: pyte
     api: Any = Mock(surrogate=lambda _: view(phase))
     with pytest.raises(DesignUnfinished, match=said):
         wait_for_model(api, "tank", 0.01)
+
+
+def test_a_first_fit_that_waits_for_its_turn_counts_as_running():
+    """train said that there was no model yet, while the fits of other surrogates ran before that of this one."""
+    due: Any = view("collecting")
+    due.paused, due.queries = False, QueryCounts(answered=4)
+    assert is_fitting(due)
+    due.queries = QueryCounts(answered=4, pending=1)
+    assert not is_fitting(due), "a sampler has to answer the other query first"
+    due.queries, due.paused = QueryCounts(answered=4), True
+    assert not is_fitting(due), "a paused design fits no model"

@@ -86,12 +86,12 @@ class Differences:
                 f"expected {option} with the environment as it is, got --perturb, which changes it; give one of the two"
             )
 
-    def learning(self, surrogate: str | None, server: str | None, token: str | None) -> Learning | None:
+    def learning(self, surrogate: str | None, server: str | None, token: str | None, *, quiet: bool) -> Learning | None:
         """Return the surrogate that will learn from the real steps, after a check on the server; None without --learn
         and --learn-all. Raises the errors of ``learning_of``."""
         if not self.learns:
             return None
-        return learning_of("--learn-all" if self.learn_all else "--learn", surrogate, server, token)
+        return learning_of("--learn-all" if self.learn_all else "--learn", surrogate, server, token, quiet=quiet)
 
     def between(
         self,

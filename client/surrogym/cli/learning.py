@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from surrogym.cli.errors import CommandError
-from surrogym.cli.options import connect
+from surrogym.cli.options import connect, first_model
 from surrogym_shared.terminal import say
 from surrogym_shared.words import counted
 
@@ -73,7 +73,7 @@ class Learning:
             )
 
 
-def learning_of(option: str, surrogate: str | None, server: str | None, token: str | None) -> Learning:
+def learning_of(option: str, surrogate: str | None, server: str | None, token: str | None, *, quiet: bool) -> Learning:
     """Check on the server, before any real step, that a surrogate can learn from the steps, and return the surrogate.
 
     Raises:
@@ -83,7 +83,7 @@ def learning_of(option: str, surrogate: str | None, server: str | None, token: s
     if surrogate is None:
         raise CommandError(f"expected --surrogate with {option}, got none; no real step was taken")
     with connect(server, token) as api:
-        view = api.surrogate(surrogate)
+        view = first_model(api, surrogate, quiet=quiet) if option == "--learn" else api.surrogate(surrogate)
     if option == "--learn" and view.fidelity is None:
         raise CommandError(
             f"--learn adds steps that differ from the model, and {surrogate!r} has no model yet: --learn-all adds "

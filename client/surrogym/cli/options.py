@@ -30,6 +30,7 @@ NAMES = (  # forms of an environment's name, for the help of every command that 
     "a Gymnasium id, package:Id-v0, dm_control:DOMAIN-TASK, pcgym:MODEL, pcgym:FILE.json, fmu:PLANT.fmu, "
     "mujoco:FILE.xml, exec:COMMAND or package.module:factory"
 )
+LONGEST_SECONDS = 604_800.0  # a week: longest wait for a design on which a sampler is at work, or for a fit
 QUICK = 1.0  # seconds to wait for a server in the first attempt, because it may not be running
 
 
@@ -217,6 +218,22 @@ def await_model(
     with working("fit", stays, quiet=quiet) as update, connect(server, token) as api:
         began = time.monotonic()
         return wait_for_model(api, surrogate, seconds, lambda view: update(None, words(view, time.monotonic() - began)))
+
+
+def first_model(api: Api, surrogate: str, *, quiet: bool) -> SurrogateView:
+    """Return a surrogate. If its first model is being fitted, or is about to be, wait for it; the terminal says so.
+
+    Raises:
+        DesignUnfinished: the fit failed.
+        SurrogymClientError: the server does not answer, or has no such surrogate.
+    """
+    from surrogym_client.surrogates.waiting import is_fitting, wait_for_model, words_of_design
+
+    view = api.surrogate(surrogate)
+    if view.model_version is not None or not is_fitting(view):
+        return view
+    with working("fit", "interrupted; the server continues to fit the model", quiet=quiet) as update:
+        return wait_for_model(api, surrogate, LONGEST_SECONDS, lambda now: update(None, words_of_design(now)))
 
 
 def given_here(context: typer.Context, name: str) -> bool:

@@ -273,6 +273,12 @@ def _look(api: Api, name: str, deadline: float) -> SurrogateView | None:
         return None
 
 
+def is_fitting(view: SurrogateView) -> bool:
+    """Whether a model is being fitted, or the first one is about to be, because the first queries are answered."""
+    due = view.phase == "collecting" and view.samples > 0 and not view.paused and not _under_way(view)
+    return due or view.phase == "fitting"
+
+
 def _under_way(view: SurrogateView) -> bool:
     """Whether a design has open queries, including those that were added after its end."""
     return view.queries.pending + view.queries.leased > 0

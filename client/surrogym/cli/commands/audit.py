@@ -12,7 +12,7 @@ import typer
 from surrogym.cli.errors import CommandError
 from surrogym.cli.groups import Output, PolicyReading, Service
 from surrogym.cli.opening import opener_for_policy
-from surrogym.cli.options import FallbackProgram, SpecFile, push_or_say, read_spec
+from surrogym.cli.options import FallbackProgram, SpecFile, first_model, push_or_say, read_spec
 from surrogym_shared.environments import is_elsewhere
 from surrogym_shared.terminal import progress, say
 from surrogym_shared.words import counted
@@ -88,12 +88,15 @@ def command(
     if name is None:
         raise CommandError(f"expected --surrogate NAME, because no card beside {policy} names a surrogate")
     predict, asked = reading.load(policy, card), AuditSettings(steps=steps, seed=seed)
+    with service.connect(context) as api:
+        view = first_model(api, name, quiet=output.quiet)
+    if view.fidelity is None:
+        raise CommandError(f"{name!r} has no model yet: wait until a sampler has answered its first queries")
     with (
         service.connect(context) as api,
         HttpSurrogate(api.url, name, service.token_for(context)) as http,
         progress("audit", quiet=output.quiet) as update,
     ):
-        view = api.surrogate(name)
         if card.surrogate not in (None, name):
             card = _of_another(card)
         port = with_integrals(http, card.integral, card.set_points)
@@ -141,8 +144,6 @@ def by_episodes(
     spec = subject.port.spec()
     if isinstance(subject.port, IntegralPort):
         acting, spec = subject.port.acting(subject.predict), subject.port.port.spec()
-    if subject.api.surrogate(subject.name).fidelity is None:
-        raise CommandError(f"{subject.name!r} has no model yet: wait until a sampler has answered its first queries")
     most = settings.episodes * (spec.time_limit or LONGEST_EPISODE)
     count = counted(settings.episodes, "whole episode")
     say(f"the audit takes {count} in {env}: at most {most} real steps", quiet=quiet)

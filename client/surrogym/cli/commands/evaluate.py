@@ -158,7 +158,7 @@ def command(
     beside.check(settings)
     opener = opener_for_policy(env, read_spec(spec), card, fallback, quiet=output.quiet)
     ledger = ledger_of(surrogate, service.server, card, policy, quiet=output.quiet)
-    if learning := differences.learning(ledger, service.server, token):
+    if learning := differences.learning(ledger, service.server, token, quiet=output.quiet):
         opener = learning.checked(opener)
     enter = partial(enter_steps, ledger, service.server, token, quiet=output.quiet)
     controllers = beside.controllers(policy, card, reading, opener)

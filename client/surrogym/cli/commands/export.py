@@ -9,10 +9,12 @@ import typer
 
 from surrogym.cli.errors import CommandError
 from surrogym.cli.groups import Output, Service
-from surrogym.cli.options import Surrogate, connect, working
+from surrogym.cli.options import Surrogate, connect, first_model, working
 
 if TYPE_CHECKING:
     from surrogym_client.transport.api import Api
+
+OF_A_MODEL = (".surrogate", ".safetensors")  # endings of files that hold a model
 
 
 def command(
@@ -41,6 +43,9 @@ def command(
     """
     token = service.token_for(context)
     stays = "interrupted; nothing was written; the same command starts from the beginning"
+    if out.suffix.lower() in OF_A_MODEL:
+        with connect(service.server, token) as api:
+            first_model(api, surrogate, quiet=output.quiet)
     with working("export", stays, quiet=output.quiet) as update, connect(service.server, token) as api:
         update(0.0, f"reading {surrogate}")
         content = _content(api, surrogate, out)

@@ -16,6 +16,7 @@ import typer
 from surrogym.cli.errors import CommandError
 from surrogym.cli.groups import Output, Service
 from surrogym.cli.options import (
+    LONGEST_SECONDS,
     ExitWithParent,
     Surrogate,
     TrainWait,
@@ -43,7 +44,6 @@ if TYPE_CHECKING:
 
     Record = Callable[[TrainProgress], None]
 
-LONGEST_SECONDS = 604_800.0  # a week: longest wait for a design on which a sampler is at work
 NOTHING_YET = "interrupted before there was a policy; nothing was saved; the same command starts from the beginning"
 
 
@@ -248,11 +248,9 @@ class _NobodyWorks(Exception):
 
 def _is_at_work(view: SurrogateView) -> bool:
     """Whether a sampler or a fit is at work for the design."""
-    from surrogym_client.surrogates.waiting import COMPLETED
+    from surrogym_client.surrogates.waiting import ENDED, is_fitting
 
-    return (
-        view.phase not in (*COMPLETED, "failed") and not view.paused and bool(view.samplers or view.phase == "fitting")
-    )
+    return view.phase not in ENDED and not view.paused and (bool(view.samplers) or is_fitting(view))
 
 
 def _words_without_trials(view: SurrogateView, settings: TrainSettings) -> str:
