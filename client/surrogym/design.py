@@ -273,8 +273,7 @@ class Design:
         columns = (steps.coordinates, steps.action, steps.next_coordinates, steps.reward, steps.terminated)
         samples = RealSamples(*columns, truncated)
         tolerances = {output["name"]: output["tolerance"] for output in result.fidelity["outputs"]}
-        predictions = self._state.get("predictions", [])
-        return SurrogateFile(name, self._spec_to_save(), result.model, samples, tolerances, predictions=predictions)
+        return SurrogateFile(name, self._spec_to_save(), result.model, samples, tolerances)
 
     @classmethod
     def load(cls, path: str | Path, **options: Any) -> Self:
@@ -311,8 +310,6 @@ class Design:
         usual = [tolerance for tolerance in known if tolerance is not None]
         if len(usual) == len(known):
             self._state = self._state | {"usual": usual}
-        if len(file.predictions) == len(known):
-            self._state = self._state | {"predictions": file.predictions}
         self._result = judge_stored(self._job(), file.model)
         if self._result.verdict == "continue":
             self._phase = "sampling"

@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from statistics import NormalDist
 from typing import Any
 
 import numpy as np
@@ -25,7 +26,6 @@ from surrogym_server.models.gaussian_process.feature_maps import reflection
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 from surrogym_server.sampling.design import advance, initial_queries
 from surrogym_server.sampling.latin_hypercube import going_on, latin_hypercube, random_points
-from surrogym_server.sampling.prequential import half_width
 from surrogym_server.sampling.state import DesignState, Request
 from surrogym_shared.spec import REWARD, Design, Reward
 
@@ -44,7 +44,7 @@ def scored(off: Tensor, variance: Tensor) -> dict[str, float]:
     """Scores of errors (m,) with predicted variances (m,), both in deviations of the output."""
     variance = variance + FLOOR**2
     density = -0.5 * (off.square() / variance + (2 * math.pi * variance).log())
-    covered = (off.abs() <= half_width(0.9) * variance.sqrt()).double()
+    covered = (off.abs() <= NormalDist().inv_cdf(0.95) * variance.sqrt()).double()
     return {
         "error": float(off.square().mean().sqrt()),
         "density": float(density.mean()),

@@ -88,9 +88,6 @@ class SurrogateFile:
     samples: RealSamples
     tolerances: dict[str, float] = field(default_factory=dict)  # largest error that does not matter, by output
     ledger: dict[str, int] = field(default_factory=dict)  # counts of real steps by purpose, on the exporting server
-    # For each output, and each sample that was new at a fit: [error, standard deviation] of its prediction before this
-    # fit.
-    predictions: list[list[list[float]]] = field(default_factory=list)
     about: dict[str, Any] = field(default_factory=dict)  # what a prior was made from, as JSON of ``PriorAbout``
 
     def to_bytes(self) -> bytes:
@@ -114,7 +111,6 @@ class SurrogateFile:
             "spec": self.spec.model_dump(mode="json"),
             "tolerances": self.tolerances,
             "ledger": self.ledger,
-            "predictions": self.predictions,
             "about": self.about,
         }
         header[METADATA] = header.get(METADATA, {}) | {OWN: json.dumps(own)}
@@ -147,7 +143,6 @@ class SurrogateFile:
             tolerances = {str(output): float(value) for output, value in own.get("tolerances", {}).items()}
             ledger = {str(purpose): int(steps) for purpose, steps in own.get("ledger", {}).items()}
             about = dict(own.get("about", {}))
-            predictions = [[_pair(pair) for pair in output] for output in own.get("predictions", [])]
         except NotASurrogateFile:
             raise
         except ValidationError as error:
@@ -161,7 +156,7 @@ class SurrogateFile:
                 "the surrogate again by surrogym export"
             ) from error
         _require_shapes(spec, samples)
-        return cls(name, spec, model, samples, tolerances, ledger, predictions, about)
+        return cls(name, spec, model, samples, tolerances, ledger, about)
 
     def about_as_json(self) -> str:
         """Return as JSON what a prior made from this file is learned from: the simulator that the attribute ``about``
@@ -228,15 +223,6 @@ def _array(entry: Any, body: bytes) -> NDArray[Any]:
         raise ValueError(f"expected an array of shape {shape} to fill its bytes, got {stop - start} bytes")
     raw = np.frombuffer(body[start:stop], dtype=np.uint8 if dtype == np.bool_ else dtype).reshape(shape)
     return raw.astype(np.bool_ if dtype == np.bool_ else np.float64)
-
-
-def _pair(pair: Any) -> list[float]:
-    """Return [error, standard deviation] of a prediction. If they are invalid, raises one of the exceptions that
-    ``UNREADABLE`` lists."""
-    error, std = (float(one) for one in pair)
-    if not math.isfinite(error) or not 0 <= std < math.inf:
-        raise ValueError(f"expected a finite error and a standard deviation of 0 or more, got {error} and {std}")
-    return [error, std]
 
 
 def _name(name: object) -> str:

@@ -12,11 +12,9 @@ import pytest
 
 from support.dirty import learned
 from support.scripted_server import lost_reply, reply, scripted_server
-from support.teaching import teach
 from support.terminal import on_terminal
 from surrogym.cli.commands import status
 from surrogym_client.transport import Api
-from surrogym_sampler.original.classic import pendulum
 from surrogym_shared import wire
 from surrogym_shared.dirt import Rollout, identify, sensors
 from surrogym_shared.dirt.words import traits
@@ -156,20 +154,6 @@ def test_the_status_command_with_watch_reports_a_lost_server_and_tries_again(sur
 def test_the_status_command_with_watch_of_an_unknown_surrogate_ends_at_once(on_server):
     said = on_server("status", "nobody", "--watch")
     assert (said.code, said.out) == (1, "")
-
-
-def test_the_status_command_shows_how_well_new_samples_were_predicted(on_server, server_process, name):
-    with Api(server_process.url) as api:
-        teach(api, name, pendulum(), queries=8, initial=5)
-    lines = on_server("status", name).out.splitlines()
-    at = next(i for i, line in enumerate(lines) if line.startswith("new samples, predicted before"))
-    assert lines[at + 1].split("  ")[0] == "output"
-    seen = on_server("status", name, "--json").json
-    scored = [output for output in seen["fidelity"]["outputs"] if output["prequential"]]
-    assert [line.split()[:2] for line in lines[at + 2 : at + 2 + len(scored)]] == [
-        [output["name"], str(output["prequential"]["predictions"])] for output in scored
-    ]
-    assert max(output["prequential"]["predictions"] for output in scored) == seen["ledger"]["adaptive"] > 0
 
 
 def test_the_status_command_with_watch_fits_a_narrow_terminal_and_ends_with_ctrl_c(pendulum_server):

@@ -15,7 +15,6 @@ import pytest
 
 from support.server import ServerProcess
 from surrogym_client.transport import Api
-from surrogym_shared.wire import PrequentialScores
 from surrogym_trainer.coverage import Cut, cuts
 from surrogym_trainer.figures import draw_fidelity, svg
 from surrogym_trainer.report.known import Known
@@ -86,19 +85,6 @@ def test_the_report_contains_ledger_fidelity_samples_and_model_sections(known: B
     assert models[0].data_hash[:12] in read.texts
     assert f"{view.ledger.total} taken, {view.budget} allowed" in read.texts
     assert not {"over_budget", "from_log"} & set(re.findall(r"\w+", " ".join(read.texts)))
-
-
-def test_the_report_has_a_table_of_prediction_scores_if_there_are_any(known: Both, text: str) -> None:
-    title = "New samples, predicted before the model learned from them: shares in intervals, or within the tolerance"
-    assert title not in Page(text).texts
-    *before, model = known[0].models
-    first, *others = model.fidelity.outputs
-    scores = PrequentialScores(predictions=17, within_50=0.4, within_80=0.7, within_90=0.8125, interval_score=3.375)
-    outputs = [first.model_copy(update={"prequential": scores}), *others]
-    scored = model.model_copy(update={"fidelity": model.fidelity.model_copy(update={"outputs": outputs})})
-    read = Page(page(replace(known[0], models=[*before, scored]), known[1]))
-    assert title in read.texts
-    assert {"17", "0.8125", "3.375"} <= set(read.texts)
 
 
 def test_the_report_explains_angle_encoding_only_if_there_are_angles(known: Both, text: str) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from contextlib import suppress
 
 import numpy as np
@@ -88,9 +87,6 @@ HOSTILE = {
     "samples of different lengths": lambda h: h["samples.reward"].update(shape=[3], data_offsets=[0, 24]),
     "tolerances that are none": lambda h: with_own(h, tolerances={"theta": "small"}),
     "a ledger that is a list": lambda h: with_own(h, ledger=[1]),
-    "predictions without a deviation": lambda h: with_own(h, predictions=[[[0.1]]]),
-    "predictions of negative deviation": lambda h: with_own(h, predictions=[[[0.1, -1.0]]]),
-    "predictions that are not finite": lambda h: with_own(h, predictions=[[[math.inf, 1.0]]]),
     "a name that leads elsewhere": lambda h: with_own(h, name="../pendulum"),
     "a name of dots": lambda h: with_own(h, name=".."),
     "a name that is none": lambda h: with_own(h, name=None),

@@ -14,11 +14,11 @@ from surrogym_server.convert import definition_from_spec
 from surrogym_server.models.abilities import FunctionDraws
 from surrogym_server.models.port import DynamicsModel
 from surrogym_server.sampling.latin_hypercube import random_points
-from surrogym_server.sampling.prequential import LEVELS
 from surrogym_shared.spec import EnvironmentSpec
 
 Array = np.ndarray
 HORIZON = 10
+LEVELS = (0.5, 0.8, 0.9)  # probabilities of the central intervals that are scored
 
 
 @dataclass(frozen=True)

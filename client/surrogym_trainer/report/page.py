@@ -18,7 +18,7 @@ from surrogym_client.errors import SurrogymClientError
 from surrogym_client.runtime.versions import versions
 from surrogym_client.surrogates.waiting import IN_WORDS
 from surrogym_shared.spec import EnvironmentSpec
-from surrogym_shared.wire import ModelView, OutputFidelity, Phase, SampleView, SurrogateView
+from surrogym_shared.wire import ModelView, Phase, SampleView, SurrogateView
 from surrogym_trainer.coverage import Cut, coverage_of
 from surrogym_trainer.figures import draw_coverage, draw_fidelity, draw_maps, draw_samples, svg
 from surrogym_trainer.policies.controller_check import StoredCheck
@@ -77,14 +77,6 @@ FIDELITY = {
     "within 1 std": "leave_one_out_within_one",
     "within 2": "leave_one_out_within_two",
     "noise": "noise",
-}
-PREQUENTIAL = {
-    "output": "name",
-    "new samples": "predictions",
-    "in 50 %": "within_50",
-    "in 80 %": "within_80",
-    "in 90 %": "within_90",
-    "interval score": "interval_score",
 }
 LEDGER = ("initial", "adaptive", "manual", "total", "audit", "logged", "evaluation", "unresolved", "resets", "wear")
 
@@ -170,15 +162,7 @@ def _fidelity(view: SurrogateView, models: Sequence[ModelView]) -> str:
         tuple(FIDELITY), [[getattr(o, field) for field in FIDELITY.values()] for o in outputs], "The latest model"
     )
     alt = "Confidence index and leave-one-out error of every output against the number of real samples"
-    return section("Fidelity", picture(svg(draw_fidelity(models, view.target)), alt) + judged + _predicted(outputs))
-
-
-def _predicted(outputs: Sequence[OutputFidelity]) -> str:
-    """Return the table of samples that were predicted before the model learned from them, as HTML; empty if there are
-    none."""
-    scored = [{"name": o.name, **o.prequential.model_dump()} for o in outputs if o.prequential is not None]
-    said = "New samples, predicted before the model learned from them: shares in intervals, or within the tolerance"
-    return table(tuple(PREQUENTIAL), [[one[f] for f in PREQUENTIAL.values()] for one in scored], said) if scored else ""
+    return section("Fidelity", picture(svg(draw_fidelity(models, view.target)), alt) + judged)
 
 
 def _maps(view: SurrogateView, cuts: Sequence[Cut]) -> str:

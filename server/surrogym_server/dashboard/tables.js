@@ -64,12 +64,12 @@ function model(record) {
   const { fidelity } = record;
   const head = h("summary", {}, h("strong", {}, `version ${record.version}`), h("span", { class: "note" },
     ` ${plural(record.samples, "sample")}, confidence ${percent(fidelity.confidence_index)}, fitted in ${seconds(record.fit_seconds)}, ${moment(record.created_at)}`));
-  const rows = fidelity.outputs.map((output) => [output.name, output.structure, percent(output.confidence_index), percent(output.coverage), number(output.leave_one_out_error), output.prequential ? percent(output.prequential.within_90) : "", number(output.tolerance)]);
+  const rows = fidelity.outputs.map((output) => [output.name, output.structure, percent(output.confidence_index), percent(output.coverage), number(output.leave_one_out_error), number(output.tolerance)]);
   const parts = (record.description.outputs ?? []).map((output) => h("div", {}, h("h4", {}, output.name), h("dl", { class: "hyper" },
     HYPER.filter((name) => output[name] !== undefined).flatMap((name) => [h("dt", {}, name.replaceAll("_", " ")),
       h("dd", {}, hyper(output[name]))]))));
   return h("details", { class: "model" }, head,
-    table(`Outputs of version ${record.version}`, [["output", ""], ["structure", ""], ["confidence", "num"], ["coverage", "num"], ["leave-one-out", "num"], ["new samples in 90 %", "num"], ["tolerance", "num"]], rows, ""), h("div", { class: "outputs" }, parts));
+    table(`Outputs of version ${record.version}`, [["output", ""], ["structure", ""], ["confidence", "num"], ["coverage", "num"], ["leave-one-out", "num"], ["tolerance", "num"]], rows, ""), h("div", { class: "outputs" }, parts));
 }
 
 export function modelTable() {

@@ -29,8 +29,8 @@ from surrogym_server.sampling.confidence import OutputConfidence, confidences_of
 from surrogym_server.sampling.design import Decision, advance
 from surrogym_server.sampling.judging import judge_model, monte_carlo
 from surrogym_server.sampling.limits import Limit, reached_limits
-from surrogym_server.sampling.prequential import LATEST, Predictions, latest, predicted
 from surrogym_server.sampling.state import DesignState, Request
+from surrogym_server.sampling.surprises import Surprises, surprises_of
 from surrogym_server.sampling.tolerances import default_tolerances
 from surrogym_shared.nouns import Query, RealSteps
 from surrogym_shared.states import Phase, SamplePurpose, Verdict
@@ -39,6 +39,7 @@ Array = NDArray[np.float64]
 
 # Purposes of samples whose states and actions were not chosen by means of a model.
 UNCHOSEN: tuple[SamplePurpose, ...] = ("initial", "logged")
+LATEST = 20  # greatest number of new samples whose errors by the previous model are computed
 
 
 @dataclass(frozen=True)
@@ -144,15 +145,13 @@ def judge_stored(job: DesignJob, data: bytes) -> DesignResult:
 
 def _decide(job: DesignJob) -> tuple[Decision, Samples]:
     samples, state = _samples(job), DesignState.from_json(job.state)
-    new = _new_predictions(job, samples)
-    if new:
-        state = replace(state, predictions=latest(state.predictions, new))
-    return advance(job.definition, samples, state, replace(_request(job), surprises=new)), samples
+    request = replace(_request(job), surprises=errors_of_new(job, samples))
+    return advance(job.definition, samples, state, request), samples
 
 
-def _new_predictions(job: DesignJob, samples: Samples) -> Predictions:
-    """Predict the latest samples that came after the previous round, by that round's model, which has not learned from
-    them. Samples that no model chose, those of the initial design and of logs, are left out.
+def errors_of_new(job: DesignJob, samples: Samples) -> Surprises:
+    """Return the errors of the latest samples that came after the previous round, by that round's model, which has not
+    learned from them. Samples that no model chose, those of the initial design and of logs, are left out.
 
     The result is empty without a previous model, or if it learned from other samples, as an imported model did.
     """
@@ -165,7 +164,7 @@ def _new_predictions(job: DesignJob, samples: Samples) -> Predictions:
             new = (
                 is_chosen[_is_known(job)].index_fill(0, torch.arange(model.samples), value=False).nonzero()[-LATEST:, 0]
             )
-            return predicted(model, samples.at(new))
+            return surprises_of(model, samples.at(new))
     return ()
 
 

@@ -16,7 +16,6 @@ from surrogym_server.environment.points import Points
 from surrogym_server.models.abilities import LeaveOneOut, LeaveOneOutErrors, offers
 from surrogym_server.models.guard import require_shapes
 from surrogym_server.models.port import DynamicsModel
-from surrogym_server.sampling.prequential import PrequentialScores
 from surrogym_server.sampling.regions import Region, regions_of
 
 SUREST = 1e9  # the ratio of tolerance to standard deviation is at most this, so that log U_m is finite
@@ -40,7 +39,6 @@ class OutputConfidence:
     # Share of the model's squared errors that earlier steps of the episode explain, as with a dead time.
     past: float = 0.0
     region: Region | None = None  # part of the sampling range in which most of the model uncertainty lies
-    prequential: PrequentialScores | None = None  # scores of predictions of samples before the model learned from them
 
 
 def stds(model: DynamicsModel, q: Tensor, u: Tensor) -> Tensor:

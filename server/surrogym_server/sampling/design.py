@@ -159,9 +159,7 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
         verdict = _verdict_with(queries, round)
 
     # The state that the next round needs. A design with extra queries has not ended, unless it is ready. A design that
-    # has ended continues if its conditions change. ``predictions`` is only scored and
-    # reported. ``engine.design_job`` adds predictions of new samples by the previous round's model before each round,
-    # and passes their errors as ``request.surprises``, which the verdict above reads.
+    # has ended continues if its conditions change.
     ended = verdict == "ready" or (verdict != "continue" and not queries)
     following = DesignState(
         round=state.round + 1,
@@ -169,7 +167,6 @@ def advance(definition: EnvironmentDefinition, samples: Samples, state: DesignSt
         warm=fit.warm,
         ended_under=conditions if ended else None,
         ended_as=verdict if ended else "",
-        predictions=state.predictions,
         tested_at=tested_at,
     )
     return Decision(fit.model, judgement.confidences, judgement.widened_tolerances, following, verdict, queries)

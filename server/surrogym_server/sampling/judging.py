@@ -20,7 +20,6 @@ from surrogym_server.sampling.endings import ending
 from surrogym_server.sampling.latin_hypercube import going_on, random_points
 from surrogym_server.sampling.noise import SLACK, established_noise, widened_by
 from surrogym_server.sampling.past import owed_to_past
-from surrogym_server.sampling.prequential import scores_of
 from surrogym_server.sampling.reward_peaks import highest
 from surrogym_server.sampling.seeds import generator_for
 from surrogym_server.sampling.sensor_noise import noise_of_sensors, sensor_noise
@@ -59,7 +58,7 @@ def judge_model(
         samples: the samples that the model has learned from.
         tolerances: tolerance of each output (O,), in its unit.
         request: budget and target of the design.
-        state: result of the previous round. Its ``predictions`` are only scored, and don't influence the verdict.
+        state: result of the previous round.
 
     Raises:
         PluginFailed: code of the model's family failed.
@@ -86,7 +85,6 @@ def judge_model(
             noise=float(w),
             sensor_noise=0.0 if one is None else one.std,
             past=past[i],
-            prequential=scores_of(state.predictions[i], widened[i]) if state.predictions else None,
         )
         for i, (c, w, one) in enumerate(zip(without_noise, noise, sensors, strict=True))
     )
@@ -220,7 +218,7 @@ def _contradicted(judgement: Judgement, request: Request) -> bool:
         latest = surprises[i] if surprises else ()
         error = confidence.leave_one_out_error or 0.0
         if latest:
-            error = math.sqrt(sum(one.error**2 for one in latest) / len(latest))
+            error = math.sqrt(sum(one**2 for one in latest) / len(latest))
         if error > SLACK * tolerance:
             return True
     return False

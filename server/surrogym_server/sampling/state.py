@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from surrogym_server.models.port import DynamicsModel
-from surrogym_server.sampling.prequential import Predictions, from_pairs, pairs_of
+from surrogym_server.sampling.surprises import Surprises
 from surrogym_server.sampling.tolerances import DefaultTolerances
 from surrogym_shared.nouns import Query, Vector
 
@@ -45,8 +45,6 @@ class DesignState:
     warm: dict[str, NDArray[np.float64]] = field(default_factory=dict)  # values at which the next fit of a model starts
     ended_under: Conditions | None = None  # conditions when the design ended; None while it continues
     ended_as: str = ""  # the verdict with which the design ended; "" while it continues
-    # Predictions of the latest samples by models that had not learned from them. They are only scored and reported.
-    predictions: Predictions = ()
     # Number of real steps that counted towards the budget when the last excursion was planned: an action sequence that
     # tests a model which satisfies the stopping rule; 0 if none was planned since a model last failed the rule.
     tested_at: float = 0
@@ -56,8 +54,7 @@ class DesignState:
         usual, ranges = list(self.defaults.values), list(self.defaults.ranges)
         conditions = [] if self.ended_under is None else self.ended_under.to_list()
         fields = {"round": self.round, "usual": usual, "ranges": ranges, "warm": warm, "ended_with": conditions}
-        fields["ended_as"] = self.ended_as
-        return fields | {"predictions": pairs_of(self.predictions), "tested_at": self.tested_at}
+        return fields | {"ended_as": self.ended_as, "tested_at": self.tested_at}
 
     @classmethod
     def from_json(cls, state: dict[str, Any]) -> DesignState:
@@ -70,7 +67,6 @@ class DesignState:
             warm=warm,
             ended_under=Conditions.from_list(conditions) if conditions else None,
             ended_as=state.get("ended_as", ""),
-            predictions=from_pairs(state.get("predictions", [])),
             tested_at=state.get("tested_at", 0),
         )
 
@@ -98,7 +94,7 @@ class Request:
     unlearned: int = 0  # number of real steps that are not among the samples, because lags (past values) were not known
     open: int = 0  # number of real steps of the pending queries that may still be answered, without those set aside
     prior: DynamicsModel | None = None  # model of what is known beforehand, such as a model of a simulator
-    surprises: Predictions = ()  # predictions of this round's new samples by the previous model
+    surprises: Surprises = ()  # errors of this round's new samples, by the previous model
 
     def cost(self, samples: int) -> int:
         """Return the number of real steps that count towards the budget of a design with this number of ``samples``.

@@ -57,7 +57,7 @@ _NAMES = {
     ),
     "surrogates": (
         "CheckedSurrogate CreatedSurrogate CreateSurrogate DoubtfulRegion Fidelity ImprovedSurrogate Ledger "
-        "OutputFidelity PatchSurrogate PrequentialScores QueryCounts ReachedLimit SurrogateList SurrogateSummary "
+        "OutputFidelity PatchSurrogate QueryCounts ReachedLimit SurrogateList SurrogateSummary "
         "SurrogateView"
     ),
 }

@@ -58,34 +58,10 @@ class DoubtfulRegion(Reply):
     )
 
 
-class PrequentialScores(Reply):
-    """Scores of how well the last samples of an output, 20 at most, were predicted before the model learned from them.
-
-    Each sample that the design, an audit or a person chose after the first fit is predicted by the latest model that
-    has not learned from it. The standard deviation of a prediction is computed with the most probable hyperparameters,
-    and includes the learned noise. An error within the tolerance counts as inside every interval. The design chooses
-    samples where the model is uncertain, so their errors are not representative. No verdict on the design depends on
-    these scores.
-    """
-
-    predictions: int = Field(description="number of samples that were predicted")
-    within_50: float = Field(
-        description="share of the predictions whose error is in the central 50 % interval or within the tolerance"
-    )
-    within_80: float = Field(
-        description="share of the predictions whose error is in the central 80 % interval or within the tolerance"
-    )
-    within_90: float = Field(
-        description="share of the predictions whose error is in the central 90 % interval or within the tolerance"
-    )
-    interval_score: float = Field(
-        description="mean interval score (Gneiting and Raftery 2007, eq. 43) of the 90 % intervals, which are at least "
-        "as wide as the tolerance, divided by the tolerance; lower is better, and 2 is the least"
-    )
-
-
 class OutputFidelity(Reply):
     """How well the model predicts one output."""
+
+    model_config = ConfigDict(extra="ignore")  # databases of earlier versions have scores that were removed
 
     name: str = Field(description="name of the output")
     structure: str = Field(description="inputs and kernel that the fit has chosen, in words")
@@ -137,10 +113,6 @@ class OutputFidelity(Reply):
     region: DoubtfulRegion | None = Field(
         default=None,
         description="where the model is most uncertain about the output; null if no range of a single input stands out",
-    )
-    prequential: PrequentialScores | None = Field(
-        default=None,
-        description="scores of samples that were predicted before they were learned from; null if there are none",
     )
 
 

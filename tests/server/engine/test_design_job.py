@@ -11,7 +11,7 @@ import torch
 from support.real_steps import answer, arrays, columns, join
 from surrogym_sampler.original.classic import pendulum
 from surrogym_server.convert import definition_from_spec
-from surrogym_server.engine.design_job import DesignJob, DesignResult, run_design_job
+from surrogym_server.engine.design_job import DesignJob, DesignResult, errors_of_new, run_design_job
 from surrogym_server.environment.samples import Samples
 from surrogym_server.models.files import from_bytes
 from surrogym_server.sampling.design import initial_queries
@@ -78,46 +78,36 @@ def answered(job: DesignJob, result: DesignResult) -> DesignJob:
     return replace(job, samples=samples, state=json.loads(json.dumps(result.state)), previous=result.model)
 
 
-def scored(result: DesignResult) -> list[int]:
-    """How many samples each output's scores are of."""
-    outputs = Fidelity.model_validate(result.fidelity).outputs
-    return [0 if output.prequential is None else output.prequential.predictions for output in outputs]
+def surprised(job: DesignJob) -> list[int]:
+    """How many errors of new samples a round has for each output."""
+    return [len(errors) for errors in errors_of_new(job, Samples.of(job.samples))]
 
 
-def test_new_samples_are_scored_by_the_model_of_the_previous_round(job):
-    """Over two rounds, as the scores are cumulative. No answer of this design ends at a limit."""
+def test_errors_of_new_samples_are_those_of_the_model_of_the_previous_round(job):
+    """No answer of this design ends at a limit."""
+    assert errors_of_new(job, Samples.of(job.samples)) == ()
     first = run_design_job(replace(job, extra_queries=3))
-    assert scored(first) == [0, 0, 0]
     following = answered(job, first)
-    second = run_design_job(replace(following, extra_queries=2))
-    new = len(first.queries)
-    assert scored(second) == [new] * 3
-    third = run_design_job(answered(following, second))
-    assert scored(third) == [new + len(second.queries)] * 3
-    error, deviation = second.state["predictions"][0][0]
-    model = from_bytes(job.definition, first.model)
     answers = Samples.of(following.samples).at(torch.arange(len(job.samples), len(following.samples)))
-    truth = float(answers.q_next[0, 0] - answers.q[0, 0])
-    assert error == pytest.approx(truth - float(model.means(answers.q[:1], answers.u[:1])[0, 0]), abs=1e-9)
-    assert deviation > 0
+    model = from_bytes(job.definition, first.model)
+    expected = answers.q_next - answers.q - model.means(answers.q, answers.u)[:, :2]
+    errors = errors_of_new(following, Samples.of(following.samples))
+    np.testing.assert_allclose(np.array(errors)[:2].T, expected.numpy(), atol=1e-9)
 
 
-def test_prediction_scores_change_neither_model_nor_queries(job):
+def test_a_previous_model_changes_neither_model_nor_queries_of_a_design_that_was_not_ready(job):
     following = answered(job, run_design_job(replace(job, extra_queries=3)))
-    scores, none = (run_design_job(replace(following, extra_queries=2, previous=p)) for p in (following.previous, None))
-    assert scored(none) == [0, 0, 0]
-    assert scores.model == none.model
-    assert scores.verdict == none.verdict
-    assert scores.queries == none.queries
+    one, other = (run_design_job(replace(following, extra_queries=2, previous=p)) for p in (following.previous, None))
+    assert (one.model, one.verdict, one.queries) == (other.model, other.verdict, other.queries)
 
 
-def test_logged_samples_and_unusable_previous_models_give_no_prediction_scores(job):
+def test_logged_samples_and_unusable_previous_models_give_no_errors_of_new_samples(job):
     following = answered(job, run_design_job(replace(job, extra_queries=3)))
     purpose = (*following.samples.purpose[:-1], "logged")
     new = len(following.samples) - len(job.samples)
     one_logged = replace(following, samples=replace(following.samples, purpose=purpose))
-    assert scored(run_design_job(one_logged)) == [new - 1] * 3
+    assert surprised(one_logged) == [new - 1] * 3
     moved = replace(job.samples, coordinates=job.samples.coordinates + 0.01)
     other = run_design_job(replace(job, samples=moved)).model
-    assert scored(run_design_job(replace(following, previous=other))) == [0, 0, 0]
-    assert scored(run_design_job(replace(following, previous=b"damaged"))) == [0, 0, 0]
+    assert surprised(replace(following, previous=other)) == []
+    assert surprised(replace(following, previous=b"damaged")) == []

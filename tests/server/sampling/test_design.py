@@ -21,7 +21,6 @@ from surrogym_server.sampling.batch import NEAR, nearest
 from surrogym_server.sampling.confidence import OutputConfidence
 from surrogym_server.sampling.design import Decision, advance, initial_queries
 from surrogym_server.sampling.judging import judge, monte_carlo
-from surrogym_server.sampling.prequential import Prediction
 from surrogym_server.sampling.state import DesignState, Request
 from surrogym_server.sampling.tolerances import DefaultTolerances, default_tolerances, sizes_of
 from surrogym_shared.spec import Design, EnvironmentSpec
@@ -366,7 +365,7 @@ def after_audit(before: Decision, errors: float, budget: int = 100) -> Decision:
     state = DesignState.from_json(json.loads(json.dumps(before.state.to_json())))
     assert state.ended_under is not None
     state = replace(state, ended_under=replace(state.ended_under, target=BEYOND))
-    surprises = ((Prediction(errors * GENEROUS, 0.1),) * AUDITED,) * 3
+    surprises = ((errors * GENEROUS,) * AUDITED,) * 3
     asked = replace(request(budget, surprises=surprises, audited=AUDITED), target=BEYOND)
     after = advance(before.model.definition, random_steps(pendulum(), LEARNED + AUDITED, seed=0), state, asked)
     assert min(c.confidence_index for c in after.confidences) < BEYOND

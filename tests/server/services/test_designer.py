@@ -137,17 +137,11 @@ def test_a_fit_job_contains_samples_budget_and_visited_states(answered: Storage,
     assert (job.previous, job.samples.purpose) == (None, ("initial",) * pendulum.INITIAL)
 
 
-def test_new_samples_are_scored_by_the_previous_model_and_scores_are_stored(
-    answered: Storage, designer, runner: Runner
-):
+def test_a_fit_job_contains_the_previous_model(answered: Storage, designer, runner: Runner):
     fit_all(designer)
-    assert {output["prequential"] for output in answered.models.get(NAME).fidelity["outputs"]} == {None}
-    taken = pendulum.answer_open(answered, NAME)
+    assert pendulum.answer_open(answered, NAME) > 0
     fit_all(designer)
     assert runner.jobs[-1].previous == answered.models.blob(NAME, 1)
-    stored = answered.models.get(NAME, 2).fidelity["outputs"]
-    assert max(output["prequential"]["predictions"] for output in stored) == taken > 0
-    assert len(answered.surrogates.get(NAME).state["predictions"]) == len(stored)
 
 
 def test_a_budget_lowered_after_an_improve_request_limits_its_extra_queries(

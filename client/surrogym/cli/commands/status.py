@@ -26,7 +26,6 @@ FIDELITY = (
     *("output", "confidence", "as in the paper", "tolerance", "coverage"),
     *("leave-one-out error", "within 1 std", "within 2", "noise"),
 )
-PREQUENTIAL = ("output", "new samples", "in 50 %", "in 80 %", "in 90 %", "interval score")
 
 
 def command(
@@ -172,7 +171,6 @@ def _detail(view: SurrogateView, models: Sequence[ModelView]) -> str:
             f"model {view.model_version}: confidence index {view.fidelity.confidence_index:.4f}, "
             f"target {view.target:g}; as the paper counts it {view.fidelity.confidence_index_paper:.4f}",
             columns([FIDELITY, *(_judged(output) for output in view.fidelity.outputs)]),
-            *_predicted(view.fidelity.outputs),
             f"verdict: {verdict(view)}",
         ]
     if noise := noise_in_words(view):
@@ -230,14 +228,3 @@ def _judged(output: OutputFidelity) -> tuple[str | float | None, ...]:
         *(output.name, output.confidence_index, output.confidence_index_paper, output.tolerance, output.coverage),
         *(output.leave_one_out_error, output.leave_one_out_within_one, output.leave_one_out_within_two, output.noise),
     )
-
-
-def _predicted(outputs: Sequence[OutputFidelity]) -> list[str]:
-    """Return a table about the samples that were predicted before the model learned from them; empty without any."""
-    rows = [
-        (output.name, scores.predictions, scores.within_50, scores.within_80, scores.within_90, scores.interval_score)
-        for output in outputs
-        if (scores := output.prequential) is not None
-    ]
-    said = "new samples, predicted before the model learned from them (shares in intervals, or within the tolerance):"
-    return [said, columns([PREQUENTIAL, *rows])] if rows else []
