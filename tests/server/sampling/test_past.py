@@ -16,7 +16,7 @@ from surrogym_server.sampling.design import advance
 from surrogym_server.sampling.judging import Judgement, judge_model
 from surrogym_server.sampling.noise import repeats
 from surrogym_server.sampling.past import EXPLAINED, pairs_lacking
-from surrogym_server.sampling.rules.past import LENGTH as LONGER
+from surrogym_server.sampling.rules import LENGTH as LONGER
 from surrogym_server.sampling.state import DesignState, Request
 from surrogym_server.sampling.tolerances import default_tolerances
 from surrogym_shared.spec import BoxAction, Coordinate, EnvironmentSpec, ObservationEntry, Term, Uniform

@@ -20,8 +20,7 @@ from surrogym_server.convert import definition_from_spec
 from surrogym_server.planning.planner import allows_planning
 from surrogym_server.sampling.judging import judge_model
 from surrogym_server.sampling.round import Round
-from surrogym_server.sampling.rules.left import leave_to_trials
-from surrogym_server.sampling.rules.trials import try_planner
+from surrogym_server.sampling.rules import leave_to_trials, try_planner
 from surrogym_server.sampling.state import DesignState, Request
 from surrogym_shared.limits import past
 from surrogym_shared.spec import EnvironmentSpec, with_history
