@@ -220,6 +220,7 @@ def test_an_audit_by_resets_takes_as_many_rollouts_of_the_policy_as_reach_its_st
         audit = hand_over(replace(place.subject(), predict=stay), AUDIT).audit
         queries = [query for query in place.api.queries(place.name) if query.purpose == "audit"]
     assert audit is not None
+    assert audit.rollouts == len(queries)
     assert len(queries) in (2, 4)
     assert all(query.policy for query in queries)
     assert {len(query.actions) for query in queries} == {42 // len(queries)}
@@ -375,10 +376,10 @@ def test_a_policy_is_not_trusted_if_the_environment_failed_at_an_audit_query(ser
 
 
 class Interlocked(rail.Rail):
-    """The rail, which once it is changed stops every episode at its third step, or fails at its first."""
+    """The rail, which once it is changed ends every episode at its third step, or fails at the step ``fails``."""
 
     changed = False
-    fails = False
+    fails = 0
     steps = 0
 
     def reset(self, *, seed: int | None = None) -> tuple[np.ndarray, dict[str, Any]]:
@@ -386,28 +387,30 @@ class Interlocked(rail.Rail):
         return super().reset(seed=seed)
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        if self.changed and self.fails:
+        if self.changed and self.fails == self.steps + 1:
             raise RuntimeError("the interlock is open")
         observation, reward, over, truncated, said = super().step(action)
         self.steps += 1
-        return observation, reward, over or (self.changed and self.steps == 3), truncated, said
+        return observation, reward, over or (self.changed and not self.fails and self.steps == 3), truncated, said
 
 
-@pytest.mark.parametrize("fails", [False, True], ids=["ends", "fails"])
+@pytest.mark.parametrize("fails", [0, 1, 4], ids=["ends", "fails", "stops"])
 def test_a_policy_whose_audit_rollout_fails_or_ends_early_is_not_trusted(
-    server_process: ServerProcess, fails: bool
+    server_process: ServerProcess, fails: int
 ) -> None:
+    """A rollout that failed at its fourth step was taken for one of three steps."""
     with placed(server_process.url, rail.SPEC, Interlocked()) as place:
         place.environment.fails, place.environment.changed = fails, True
         handover = hand_over(place.subject(), AUDIT)
         assert handover.audit is not None
-        assert handover.audit.steps == (0 if fails else 3)
+        assert handover.audit.steps == (0 if fails == 1 else 3)
         assert not handover.trusted
         failed = (
             "failed at 1 of 1 queries, so nothing is known there; the last error was: RuntimeError: the interlock is "
         )
-        end = f"{failed}open" if fails else "where the model predicted no end"
-        assert handover.reason.endswith(end)
+        stopped = "1 of 1 rollout stopped after the first steps, because the original environment failed or"
+        said = {0: "where the model predicted no end", 1: f"{failed}open", 4: stopped}[fails]
+        assert said in handover.reason
 
 
 class Misplaced(rail.Rail):

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from surrogym_shared.spec import EnvironmentSpec
+from surrogym_shared.words import counted
 from surrogym_trainer.evaluation.systematic import Inputs, Systematic, columns, systematic
 from surrogym_trainer.policies.evidence import Audit, Promise
 
@@ -64,6 +65,8 @@ class Compared:
         misplaced: number of steps whose termination was predicted wrongly.
         cut_short: whether the steps are rollouts, one of which ended earlier than the model predicted.
         unanswered: number of chosen states at which the original environment failed to take the step.
+        rollouts: number of rollouts that were requested; 0 if the steps are single ones.
+        broken_off: number of rollouts that stopped after their first steps although their episode had not ended.
         elsewhere: number of steps in states that the policy does not visit; they come last.
         claimed_alone: error (O,) of the model on left-out samples. A tolerance does not enlarge it.
         states: states (n, C) at which the steps began.
@@ -77,6 +80,8 @@ class Compared:
     misplaced: int = 0
     cut_short: bool = False
     unanswered: int = 0
+    rollouts: int = 0
+    broken_off: int = 0
     elsewhere: int = 0
     claimed_alone: Array = field(default_factory=lambda: np.zeros(0))
     states: Array = field(default_factory=lambda: np.zeros((0, 0)))
@@ -196,7 +201,7 @@ def judge(
       is not a fault.
 
     A rollout has at most one end, so a single end that was not predicted is a fault. A step that the original
-    environment fails to take is a fault, because the policy would need it.
+    environment fails to take is a fault, because the policy would need it; so is a rollout that stops.
 
     Args:
         compared: the real steps with their predictions.
@@ -217,7 +222,13 @@ def judge(
     if consequence is not None and (shared := consequence.fault(compared)) is not None:
         faults.append(shared)
     if compared.unanswered:
-        faults.insert(0, unanswered(compared.unanswered, n + compared.unanswered))
+        faults.insert(0, unanswered(compared.unanswered, compared.rollouts or n + compared.unanswered))
+    if compared.broken_off:
+        faults.insert(
+            0,
+            f"{compared.broken_off} of {counted(compared.rollouts, 'rollout')} stopped after the first steps, because "
+            "the original environment failed or the sampler ended, so nothing is known of the rest",
+        )
     if compared.cut_short:
         faults.append("a rollout ended at a step where the model predicted no end")
     elif compared.misplaced >= MISPLACED_ENDS:
@@ -230,6 +241,7 @@ def judge(
         )
     return Audit(
         steps=n,
+        rollouts=compared.rollouts,
         elsewhere=compared.elsewhere,
         passed=not faults,
         faults=tuple(faults),

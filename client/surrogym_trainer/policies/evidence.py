@@ -90,6 +90,7 @@ class Audit(BaseModel):
         elsewhere: number of these steps that were taken in gaps of the samples, in states that the policy does not
             visit.
         episodes: number of whole episodes that the steps form; 0 if they are single steps or a part of an episode.
+        rollouts: number of rollouts from resets that were requested for the steps; 0 if they are single steps.
         untested: share of the policy's states that are far from every step of the audit, if states can't be set.
         unanswered: number of further queries, at which the original environment failed.
         untestable: the coordinate that most often prevents the original environment from being set to the policy's
@@ -109,6 +110,7 @@ class Audit(BaseModel):
     steps: int
     elsewhere: int = 0
     episodes: int = 0
+    rollouts: int = 0
     untested: float = 0.0
     unanswered: int = 0
     untestable: tuple[str, float] | None = None

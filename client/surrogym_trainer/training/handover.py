@@ -24,6 +24,7 @@ from surrogym_shared.starts import not_declared
 from surrogym_shared.states import LEAST_AUDITED
 from surrogym_shared.wire import QueryView, SampleView, SurrogateView
 from surrogym_shared.wire.queries import MAX_POLICY
+from surrogym_shared.words import counted
 from surrogym_shared.wrapping import Step, undeclared_turns
 from surrogym_trainer.evaluation.audit import (
     AUDIT_STEPS,
@@ -204,7 +205,7 @@ def take(
     matters = UNNOTICED * earned(before, subject.floor) * WAY_LANES / len(q)
     wanted, elsewhere = _asked(subject, settings, q, u, claims=view.phase == "ready")
     while True:
-        answers, failed = _answers(subject, settings, wanted, progress)
+        answers, failed, broken_off = _answers(subject, settings, wanted, progress)
         samples = [sample for sample in answers if spec.known(sample.coordinates)]
         if not samples:
             error = f"; the last error was: {failed[-1].error}" if failed else ""
@@ -222,7 +223,9 @@ def take(
         wanted |= added
     wait_for_design(api, name, settings.patience_seconds, progress, after_round=view.round)
     far = untested(spec, q, beside.states) if spec.query == "rollout" else 0.0
-    beside = replace(beside, unanswered=sum(query.id not in elsewhere for query in failed))
+    rollouts = len(wanted) if spec.query == "rollout" else 0
+    missing = sum(query.id not in elsewhere for query in failed)
+    beside = replace(beside, unanswered=missing, rollouts=rollouts, broken_off=broken_off)
     about: dict[str, Any] = {"unanswered": len(failed), "untestable": untestable(spec, q)}
     about |= {"range_left": range_left(spec, q), "untested": far}
     firsts = {sample.query_id: sample.coordinates for sample in sorted(answers, key=lambda sample: -sample.id)}
@@ -309,16 +312,23 @@ def _answers(
     settings: AuditSettings,
     wanted: set[int],
     progress: Callable[[SurrogateView], None] | None,
-) -> tuple[list[SampleView], list[QueryView]]:
-    """Wait for the answers to the queries ``wanted``. Returns their samples, and the queries that have none."""
+) -> tuple[list[SampleView], list[QueryView], int]:
+    """Wait for the answers to the queries ``wanted``. Returns their samples, the queries that have none, and the number
+    of rollouts that stopped after their first steps although their episode had not ended."""
     api, name = subject.api, subject.name
     try:
         wait_for_answers(api, name, wanted, settings.patience_seconds, progress)
     except BaseException:
         api.withdraw_audit(name, sorted(wanted))
         raise
-    failed = [query for query in api.queries(name) if query.id in wanted and query.status in ("set_aside", "refused")]
-    return [sample for sample in api.samples(name) if sample.query_id in wanted], failed
+    queries = {query.id: query for query in api.queries(name) if query.id in wanted}
+    samples = [sample for sample in api.samples(name) if sample.query_id in wanted]
+    last = {sample.query_id: sample for sample in sorted(samples, key=lambda sample: sample.step)}
+    broken_off = sum(
+        id in last and last[id].step + 1 < len(query.actions) and not (last[id].terminated or last[id].truncated)
+        for id, query in queries.items()
+    )
+    return samples, [query for query in queries.values() if query.status in ("set_aside", "refused")], broken_off
 
 
 def _consequence(
@@ -501,9 +511,10 @@ def _verdict(audit: Audit, floor: float | None) -> tuple[bool, str]:
             f"{100 * share:.0f} % of the policy's states have a {name!r} beyond what the original environment can be "
             "set to, so no audit tests them: register under a new name with a wider range or bounds"
         )
+    rollouts = f" in {counted(audit.rollouts, 'rollout')}" if audit.rollouts else ""
     if audit.untested > MOST_UNTESTED:
         return False, (
-            f"the audit's {audit.steps} real steps from a reset reached {100 * (1 - audit.untested):.0f} % of the "
+            f"the audit's {audit.steps} real steps{rollouts} reached {100 * (1 - audit.untested):.0f} % of the "
             "policy's states, and the others are untested: surrogym audit POLICY --env ENVIRONMENT takes whole episodes"
         )
     if audit.episodes:
@@ -511,7 +522,7 @@ def _verdict(audit: Audit, floor: float | None) -> tuple[bool, str]:
             True,
             f"the return and the {audit.steps} real steps of {audit.episodes} whole episodes agree with the model",
         )
-    where = f"{audit.steps - audit.elsewhere} real steps on the policy's way"
+    where = f"{audit.steps - audit.elsewhere} real steps{rollouts} on the policy's way"
     if audit.elsewhere:
         where += f" and {audit.elsewhere} in the widest gaps of the samples"
     missing = f"; {audit.unanswered} in the gaps could not be taken" if audit.unanswered else ""
