@@ -122,7 +122,7 @@ class Settings(BaseModel):
     ] = 1_024
     max_lanes: Annotated[
         int, Field(ge=1, le=MAX_LANES, description="largest number of lanes (parallel environments) of one session")
-    ] = MAX_LANES
+    ] = 65_536
     policies_mib: Annotated[
         int, Field(ge=1, description="largest size of all files of a surrogate's policies together, in MiB")
     ] = 1_024

@@ -206,8 +206,6 @@ def info_of(session: Session) -> SessionInfo:
 
 SESSION_ID_BYTES = 16
 MAX_PARTICLES = 4_000_000  # a session of variant probabilistic may have at most this many particles in all its lanes
-# A session of variant pathwise may have at most this many lanes, because each lane stores a sampled function.
-MAX_PATHWISE_LANES = 4_096
 
 
 class Models(Protocol):
@@ -229,11 +227,6 @@ def check_size(settings: VirtualSettings, max_lanes: int) -> None:
         raise TooLarge(
             f"expected at most {MAX_PARTICLES} particles in all lanes of a session, got {particles}: open fewer lanes "
             "or choose fewer particles"
-        )
-    if settings.variant == "pathwise" and settings.num_envs > MAX_PATHWISE_LANES:
-        raise TooLarge(
-            f"expected at most {MAX_PATHWISE_LANES} lanes in a session of variant pathwise, got {settings.num_envs}: "
-            "open fewer lanes"
         )
 
 

@@ -5,10 +5,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+import torch
+
 from surrogym_server.models.draws import function_draws
 from surrogym_server.models.port import DynamicsModel
 from surrogym_server.virtual.lanes import LaneState
 from surrogym_server.virtual.noise import Purpose, normal_noise
+
+BLOCK = 4_096  # lanes whose functions are sampled at once: their random numbers take five times the memory of functions
 
 
 def with_paths(model: DynamicsModel, lanes: LaneState, functions: int | None = None) -> LaneState:
@@ -23,6 +28,7 @@ def with_paths(model: DynamicsModel, lanes: LaneState, functions: int | None = N
         return lanes
     drawing, draws = lanes.take(fresh), function_draws(model, functions)
     keyed = drawing if functions is None else replace(drawing, lane=drawing.lane % functions)
-    noise = normal_noise(keyed, Purpose.PATH, 1, draws.path_size)[:, 0]
-    started = replace(drawing, path=draws.draw(noise))
+    blocks = np.array_split(np.arange(len(keyed)), range(BLOCK, len(keyed), BLOCK))
+    drawn = [draws.draw(normal_noise(keyed.take(b), Purpose.PATH, 1, draws.path_size)[:, 0]) for b in blocks]
+    started = replace(drawing, path=drawn[0] if len(drawn) == 1 else torch.cat(drawn))
     return started if len(started) == len(lanes) else lanes.put(fresh, started)

@@ -20,7 +20,7 @@ from surrogym_shared.states import QueryStatus as QueryStatus
 from surrogym_shared.states import SamplePurpose as SamplePurpose
 
 PROTOCOL = 1
-MAX_LANES = 65_536
+MAX_LANES = 1_048_576
 MAX_PARTICLES = 1_000_000
 MAX_CLAIM = 256
 MAX_BATCH = 65_536

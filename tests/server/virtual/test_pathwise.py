@@ -13,7 +13,7 @@ from surrogym_sampler.original.classic import pendulum
 from surrogym_server.convert import definition_from_spec
 from surrogym_server.environment.samples import Samples
 from surrogym_server.models.gaussian_process.model import GaussianProcessModel
-from surrogym_server.virtual import LaneState, step
+from surrogym_server.virtual import LaneState, paths, step
 
 ARRAYS = ("observation", "reward", "terminated", "truncated")
 
@@ -52,6 +52,13 @@ def test_in_pathwise_mode_a_state_has_the_same_step_throughout_an_episode(model,
     np.testing.assert_array_equal(first, again)
     assert len(np.unique(first[:, 1])) == 3, "each lane has a function of its own"
     assert not np.allclose(elsewhere, first)
+
+
+def test_functions_sampled_in_several_blocks_are_those_of_one_block(model, started, monkeypatch):
+    _, whole = moved(model, *started(model, 5, variant="pathwise"), 2.0, -6.0)
+    monkeypatch.setattr(paths, "BLOCK", 2)
+    _, split = moved(model, *started(model, 5, variant="pathwise"), 2.0, -6.0)
+    np.testing.assert_allclose(split, whole, rtol=1e-12)
 
 
 def test_with_functions_2_pathwise_environments_share_two_drawn_functions(model, started):
