@@ -65,3 +65,17 @@ def test_steps_that_an_audits_rollout_did_not_take_are_left_for_other_audits(
     with pytest.raises(BeyondBudget, match=f"at most {LEAST_AUDITED - 2} more"):
         storage.queries.enqueue(name, [Query.rollout([[0.0]] * (LEAST_AUDITED - 1))], purpose="audit")
     storage.queries.enqueue(name, [Query.rollout([[0.0]] * (LEAST_AUDITED - 2))], purpose="audit")
+
+
+def test_resuming_a_surrogate_does_not_repeat_the_failed_queries_of_an_audit(
+    storage: Storage, make: Callable[..., str]
+) -> None:
+    """Real steps were taken for an audit that had ended."""
+    name = make(queries=1)
+    [own] = storage.queries.claim(name, "a", 1, 60.0)
+    storage.queries.enqueue(name, FOUR[:1], purpose="audit")
+    [audited] = storage.queries.claim(name, "a", 1, 60.0)
+    for leased in (own, audited):
+        storage.queries.fail(name, leased.id, leased.token, "not there", begun=True, refused=True)
+    storage.surrogates.change(name, paused=False)
+    assert [storage.queries.get(name, query.id).status for query in (own, audited)] == ["pending", "refused"]

@@ -153,13 +153,13 @@ def _detail(view: SurrogateView, models: Sequence[ModelView]) -> str:
         f"{view.name}: {view.environment or 'own environment'}{_period(view)}, "
         f"{'paused, ' if view.paused else ''}{view.phase}",
         f"real steps: {_steps(view)}",
-        f"in the budget: {ledger.initial} initial, {ledger.adaptive} adaptive, {ledger.manual} manual, "
-        f"{ledger.unresolved} unresolved ({ledger.failed} failed)",
+        f"in the budget: {ledger.initial} initial, {ledger.adaptive} adaptive, {ledger.manual} manual",
+        f"without an answer, also in audits: {ledger.unresolved} unresolved ({ledger.failed} failed)",
         *_given(view),
         f"queries: {view.queries.pending} pending, {view.queries.leased} leased, {view.queries.set_aside} set aside",
     ]
     if view.queries.set_aside:
-        lines[-1] += f" because they failed; surrogym change {view.name} --resume queues them again"
+        lines[-1] += f" because they failed; surrogym change {view.name} --resume queues those of the design again"
     if view.queries.refused:
         lines[-1] += f"; {view.queries.refused} refused by the environment, which took no real step of the budget"
     if hint := _hint(view):

@@ -553,10 +553,13 @@ def is_unbegun(surrogate_id: int) -> sa.ColumnElement[bool]:
 
 
 def requeue_set_aside(connection: Connection, surrogate: Row[Any]) -> int:
-    """Make a surrogate's queries that were set aside or refused pending again, with all attempts. Return their
-    number."""
-    set_aside = (queries.c.surrogate_id == surrogate.id) & queries.c.status.in_(("set_aside", "refused"))
-    return connection.execute(sa.update(queries).where(set_aside).values(status="pending")).rowcount
+    """Make a surrogate's queries that were set aside or refused pending again, with all attempts. Return their number.
+
+    Those of audits are left, because an audit does not wait for queries that failed.
+    """
+    again = queries.c.status.in_(("set_aside", "refused")) & (queries.c.purpose != "audit")
+    own = queries.c.surrogate_id == surrogate.id
+    return connection.execute(sa.update(queries).where(own, again).values(status="pending")).rowcount
 
 
 NAMED_QUERIES: sa.Select[Any] = (
