@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import signal
 import sys
 import threading
@@ -107,14 +106,12 @@ def progress(title: str, *, quiet: bool = False) -> Iterator[Update]:
         with _bar(title) as update:
             yield update
     else:
-        lines = _Lines(title)
-        first = threading.Timer(FIRST_SECONDS, lines.begin)
-        first.daemon = True
-        first.start()
+        lines, ended = _Lines(title), threading.Event()
+        threading.Thread(target=lines.show_until, args=(ended,), daemon=True).start()
         try:
             yield lines
         finally:
-            first.cancel()
+            ended.set()
 
 
 @contextmanager
@@ -149,25 +146,31 @@ def _bar(title: str) -> Iterator[Update]:
 
 
 class _Lines:
-    """Progress as lines of text, at most one in ``PLAIN_SECONDS`` seconds, and none before ``begin`` is called. The end
-    of the work (share 1) is always shown."""
+    """Progress as lines of text, at most one in ``PLAIN_SECONDS`` seconds. The end of the work (share 1) is always
+    shown, and so are words that nothing follows for that long."""
 
     def __init__(self, title: str) -> None:
         self._title = title
-        self._next = math.inf
+        self._next = time.monotonic() + FIRST_SECONDS
+        self._lock = threading.Lock()
         self._words = self._last = ""
 
     def __call__(self, share: float | None, words: str) -> None:
         self._words = words
         if time.monotonic() >= self._next or (share or 0.0) >= 1.0:
-            self.begin()
+            self._show()
 
-    def begin(self) -> None:
-        """Print the present state, if it has changed. The first call comes from another thread."""
-        if self._words != self._last:
-            self._last = self._words
-            say(f"{self._title}: {self._words}")
-        self._next = time.monotonic() + PLAIN_SECONDS
+    def show_until(self, ended: threading.Event) -> None:
+        """Show the words that came too soon after a line, until the work has ended. This runs in another thread."""
+        while not ended.wait(max(0.0, self._next - time.monotonic())):
+            self._show()
+
+    def _show(self) -> None:
+        with self._lock:
+            if self._words != self._last:
+                self._last = self._words
+                say(f"{self._title}: {self._words}")
+            self._next = time.monotonic() + PLAIN_SECONDS
 
 
 def _silent(share: float | None, words: str) -> None:

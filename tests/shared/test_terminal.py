@@ -6,6 +6,7 @@ import os
 import pty
 import re
 import sys
+import time
 
 import pytest
 
@@ -19,6 +20,24 @@ def test_control_characters_in_printed_text_are_escaped_on_the_terminal(capsys: 
     out, err = capsys.readouterr()
     assert err == "\\x1b]0;title\\x07\\x1b[2J\\x0dok: forged\\x9b1m\n"
     assert out == "a\\x1b[31m\tb\nc\n"
+
+
+def test_words_that_come_too_soon_after_a_line_are_shown_later(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A planner's audit said for two minutes that it waited for the sampler."""
+    monkeypatch.setattr("surrogym_shared.terminal.FIRST_SECONDS", 0.0)
+    monkeypatch.setattr("surrogym_shared.terminal.PLAIN_SECONDS", 0.5)
+    shown = ""
+    with progress("train") as update:
+        update(None, "takes steps")
+        update(None, "compares")
+        for _ in range(100):
+            shown += capsys.readouterr().err
+            if "compares" in shown:
+                break
+            time.sleep(0.1)
+    assert shown.endswith("train: compares\n")
 
 
 @pytest.mark.parametrize(("columns", "bar"), [(40, 10), (80, 20), (160, 24)])

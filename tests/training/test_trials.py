@@ -234,8 +234,9 @@ def test_a_machine_with_a_dead_time_gets_a_planner_that_acts_in_its_audit(
     assert result.algorithm == "PLANNER"
     named = [words for words in said if "%" not in words]
     assert named == [PROMISING, COMPARING, PROMISING], "a planner's virtual episodes may take minutes"
-    shares = [words.removeprefix(f"{PROMISING}: ") for words in said if "%" in words]
+    shares = [words.removeprefix(f"{PROMISING}: ") for words in said if words.startswith(f"{PROMISING}: ")]
     assert len(shares) == 2 * min(EPISODE, 100), "of the steps of both promises' episodes"
+    assert f"{COMPARING}: 100 %" in said
     assert shares[-1] == "100 %"
     assert view.phase == "over_budget", "nothing of the budget is left to trials"
     assert handover.audit is not None

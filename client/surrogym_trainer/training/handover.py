@@ -118,20 +118,20 @@ class Subject:
 
     def promise(self) -> Promise:
         """Compute the policy's promise in the latest model."""
-        self.saying(PROMISING)
-        return promise_of(self.port, self._counting(), self.seed, self.session, self.floor)
+        return promise_of(self.port, self.counting(PROMISING), self.seed, self.session, self.floor)
 
-    def _counting(self) -> Predict:
-        """Return the policy, which says for each per cent of an episode that it has come so far. A network acts at the
-        server, where nothing is counted, and takes seconds; a planner takes minutes."""
+    def counting(self, words: str, episodes: int = 1) -> Predict:
+        """Say ``words``, and return the policy, which repeats them with each per cent of so many successive episodes. A
+        network acts at the server, where nothing is counted, and takes seconds; a planner takes minutes."""
+        self.saying(words)
         if isinstance(self.predict, Network):
             return self.predict
-        limit, calls = self.port.spec().time_limit or LONGEST_EPISODE, itertools.count(1)
+        limit, calls = episodes * (self.port.spec().time_limit or LONGEST_EPISODE), itertools.count(1)
 
         def act(observations: NDArray[np.floating[Any]]) -> NDArray[Any]:
             now = next(calls)
             if 100 * now // limit > 100 * (now - 1) // limit:
-                self.saying(f"{PROMISING}: {min(100 * now // limit, 100)} %")
+                self.saying(f"{words}: {min(100 * now // limit, 100)} %")
             return self.predict(observations)
 
         return act
@@ -348,12 +348,10 @@ def _consequence(
     """
     if len(beside.errors) == beside.elsewhere or view.model_version is None:
         return None
-    subject.saying(COMPARING)
     shifted = beside.together(subject.port.spec(), inputs)
     weights = shifted.draws(DRAWS, np.random.default_rng(subject.seed), beside.surprising)
-    changes = changes_of(
-        subject.port, subject.predict, subject.seed, subject.session, view.model_version, shifted, weights
-    )
+    predict = subject.counting(COMPARING, 2)  # with the errors and without them
+    changes = changes_of(subject.port, predict, subject.seed, subject.session, view.model_version, shifted, weights)
     return Consequence(shifted, changes, before, SLACK * earned(before, subject.floor))
 
 

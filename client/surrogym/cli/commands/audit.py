@@ -90,8 +90,6 @@ def command(
     predict, asked = reading.load(policy, card), AuditSettings(steps=steps, seed=seed)
     with service.connect(context) as api:
         view = first_model(api, name, quiet=output.quiet)
-    if view.fidelity is None:
-        raise CommandError(f"{name!r} has no model yet: wait until a sampler has answered its first queries")
     with (
         service.connect(context) as api,
         HttpSurrogate(api.url, name, service.token_for(context)) as http,
@@ -144,6 +142,8 @@ def by_episodes(
     spec = subject.port.spec()
     if isinstance(subject.port, IntegralPort):
         acting, spec = subject.port.acting(subject.predict), subject.port.port.spec()
+    if subject.api.surrogate(subject.name).fidelity is None:
+        raise CommandError(f"{subject.name!r} has no model yet: wait until a sampler has answered its first queries")
     most = settings.episodes * (spec.time_limit or LONGEST_EPISODE)
     count = counted(settings.episodes, "whole episode")
     say(f"the audit takes {count} in {env}: at most {most} real steps", quiet=quiet)
