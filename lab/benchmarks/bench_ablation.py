@@ -63,7 +63,7 @@ from surrogym_server.environment.definition import EnvironmentDefinition, wrap
 from surrogym_server.environment.distributions import scaling
 from surrogym_server.environment.features import FeatureMap
 from surrogym_server.environment.samples import Samples
-from surrogym_server.models.gaussian_process.learning import dropping, learn, many, region, reward
+from surrogym_server.models.gaussian_process.learning import dropping, learn, output_learner, region, reward
 from surrogym_server.models.gaussian_process.learning import thresholds as thresholds_
 from surrogym_server.models.gaussian_process.learning.output_learner import OutputLearner
 from surrogym_server.models.gaussian_process.model import GaussianProcessModel
@@ -258,7 +258,7 @@ def _same_theta(_x: Any, _y: Any, _options: Any, theta: Any, *_: Any) -> Any:
     return theta
 
 
-def _only_theta(x: Any, y: Any, options: Any, theta: Any, mirror: Any, refine: Any = many.refine) -> Any:
+def _only_theta(x: Any, y: Any, options: Any, theta: Any, mirror: Any, refine: Any = output_learner.refine) -> Any:
     return refine(x, y, options, theta, mirror)[:1]
 
 
@@ -295,13 +295,14 @@ MECHANISMS: dict[str, Mechanism] = {
     "thresholds": Mechanism(_forms("Thresholds"), patches=[(region, "thresholds", lambda *_: [])]),
     "rival thresholds": Mechanism(_forms("Thresholds"), patches=[(thresholds_, "RIVALS", 1)]),
     "classifier of regions": Mechanism(_forms("Classifier"), patches=[(region, "_classifier", _unlikely)]),
-    "many: several starts": Mechanism(_many, patches=[(many, "refine", _only_theta)]),
+    "many: several starts": Mechanism(_many, patches=[(output_learner, "refine", _only_theta)]),
     "many: hyperparameters of more than 150": Mechanism(
-        _many, patches=[(many, "fit_some", _same_theta), (many, "fit_through_few", _no_fit_through_few)]
+        _many,
+        patches=[(output_learner, "fit_some", _same_theta), (output_learner, "fit_through_few", _no_fit_through_few)],
     ),
-    "many: through few points": Mechanism(_many, patches=[(many, "fit_through_few", _no_fit_through_few)]),
+    "many: through few points": Mechanism(_many, patches=[(output_learner, "fit_through_few", _no_fit_through_few)]),
     "many: where errors are large": Mechanism(
-        _many, patches=[(many, "refine_where_hard", lambda posterior, *_: posterior.hyper)]
+        _many, patches=[(output_learner, "refine_where_hard", lambda posterior, *_: posterior.hyper)]
     ),
     "many: fewer inputs": Mechanism(_many, patches=[(dropping, "_of_many", _posterior)]),
 }

@@ -2,9 +2,7 @@
 
 Each sampler is a process with an environment that sleeps 50 ms in each step. Queries made by hand keep the queue full,
 so that no fit is due. The rate is counted in the ledger, over a window that begins after each sampler has answered.
-The processor time of server and samplers in this window is divided by the samples, and shows the first bottleneck. With
-``--synchronous normal`` the commits of SQLite do not wait for the disk. If the rate stays the same, the disk is not the
-bottleneck.
+The processor time of server and samplers in this window is divided by the samples, and shows the first bottleneck.
 """
 
 from __future__ import annotations
@@ -149,13 +147,12 @@ def main() -> None:
     made.add_argument("--database", choices=("SQLite", "PostgreSQL"), help="only this one")
     made.add_argument("--samplers", type=int, nargs="+", help="numbers of them; shares are of the first one's rate")
     made.add_argument("--claims", type=int, nargs="+", default=BATCHES, help="queries of one claim")
-    made.add_argument("--synchronous", choices=("full", "normal"), default="full", help="of SQLite")
     options = started(made)
     counts, window = (QUICK_COUNTS, QUICK_WINDOW) if options.quick else (COUNTS, WINDOW)
     counts = options.samplers or counts
     report = {}
     if options.database != "PostgreSQL":
-        report["SQLite"] = measured(("--synchronous", options.synchronous), None, counts, options.claims, window)
+        report["SQLite"] = measured((), None, counts, options.claims, window)
     if options.database != "SQLite":
         with running_postgresql() as postgresql:
             storage = ("--database", postgresql.new_database())

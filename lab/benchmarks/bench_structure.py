@@ -62,7 +62,7 @@ from surrogym_server.gp.posterior import Posterior
 from surrogym_server.gp.search import minimum
 from surrogym_server.gp.selection import select_inputs
 from surrogym_server.models.gaussian_process.learning.dropping import FEWEST, LESS, ODDS, WIN
-from surrogym_server.models.gaussian_process.learning.many import EXPLAINED
+from surrogym_server.models.gaussian_process.learning.output_learner import EXPLAINED
 
 SIZES = (10, 20, 40, 100)
 SUMS = ("additive", "state + action")

@@ -138,7 +138,7 @@ def create_app(settings: Settings, design: DesignPort = DesignPort(), fits: Fits
     if cluster is not None:
         cluster.check(settings)
     keep_private(settings)
-    storage = open_storage(settings.database_url, settings.synchronous)
+    storage = open_storage(settings.database_url)
     engine = None if cluster is None else _connected(cluster, settings, storage)
     app = FastAPI(
         title="Surrogym",

@@ -13,7 +13,6 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, FilePath, Val
 
 from surrogym_server.errors import InvalidInput
 from surrogym_server.logs import LogFormat
-from surrogym_server.storage.records import Synchronous
 from surrogym_shared.faults import first_fault
 from surrogym_shared.patterns import IN_WORDS, TOKEN
 from surrogym_shared.secret_files import parse_token, tokens_in
@@ -55,10 +54,6 @@ class Settings(BaseModel):
         Path | None,
         Field(description="folder for the files of policies. None: beside a SQLite file, or in PostgreSQL"),
     ] = None
-    synchronous: Annotated[
-        Synchronous,
-        Field(description="SQLite only: with full, data survive a loss of power, with normal a crash alone"),
-    ] = "full"
     public_url: Annotated[
         str | None,
         AfterValidator(_without_path),

@@ -35,6 +35,7 @@ REMOVED: Mapping[str, Mapping[str, str]] = {
         "--propagation": PROPAGATION,
         "--weighting": WEIGHTING,
     },
+    "option of serve": {"--synchronous": "leave it out, each commit waits for the disk"},
     "option of register": {"--teleport": "use --access any", "--no-teleport": "use --access reset"},
     "model": {
         "bayesian_last_layer": "use 'gaussian_process' for few real steps, 'ensemble' for contacts and many steps",

@@ -18,13 +18,6 @@ def test_the_default_server_listens_on_loopback_only():
     assert settings.database_url == "sqlite:///surrogym.db"
 
 
-def test_sqlite_commits_sync_to_disk_unless_set_otherwise():
-    assert read_settings({}).synchronous == "full"
-    assert read_settings({"SURROGYM_SYNCHRONOUS": "normal"}).synchronous == "normal"
-    with pytest.raises(InvalidInput, match="synchronous"):
-        read_settings({}, synchronous="off")
-
-
 @pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.168.1.5", "robot.example"])
 def test_listening_on_a_non_loopback_address_requires_a_token(host: str):
     with pytest.raises(InvalidInput, match=rf"^host {host} can be reached from other machines: expected a token"):

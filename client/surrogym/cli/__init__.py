@@ -42,9 +42,7 @@ ADVANCED: Mapping[str, frozenset[str]] = {  # for each command, the options for 
         {"--worker", "--once", "--time-limit", "--most-snapshots", "--most-bytes", "--on-ray", "--ray-address"}
         | {"--ray-resources", "--runtime-env"}
     ),
-    "serve": frozenset(
-        {"--synchronous", "--engine", "--ray-address", "--ray-hosts", "--ready-file", "--exit-with-parent"}
-    ),
+    "serve": frozenset({"--engine", "--ray-address", "--ray-hosts", "--ready-file", "--exit-with-parent"}),
     "train": frozenset(
         {"--variant", "--particles", "--spread", "--process-noise", "--start-box"}
         | {"--start-visited", "--horizon", "--penalty", "--trust", "--num-envs", "--audit-steps"}

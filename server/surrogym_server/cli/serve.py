@@ -24,13 +24,6 @@ Port = Annotated[int | None, typer.Option(help="Port to listen on; 0 takes any f
 Database = Annotated[
     str | None, typer.Option(help="Database: a SQLite file or a SQLAlchemy URL. [default: surrogym.db]")
 ]
-Synchronous = Annotated[
-    str | None,
-    typer.Option(
-        help="When to flush a SQLite file to disk: full at each commit; normal less often, so that a power "
-        "failure can lose the latest commits. [default: full]"
-    ),
-]
 TokenFile = Annotated[
     Path | None, typer.Option(help="File with one token per line: role:token, or an admin's token alone.")
 ]
@@ -103,7 +96,6 @@ def serve(
     host: Host = None,
     port: Port = None,
     database: Database = None,
-    synchronous: Synchronous = None,
     token_file: TokenFile = None,
     insecure: Insecure = None,
     public_url: PublicUrl = None,

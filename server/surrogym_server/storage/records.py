@@ -10,7 +10,7 @@ import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,6 @@ from surrogym_shared.states import EventKind, Phase, Purpose, QueryStatus, Sampl
 Array = NDArray[np.float64]
 JSON = dict[str, Any]
 FREE = ("audit", "logged")  # purposes of samples that don't count towards the budget
-Synchronous = Literal["full", "normal"]  # SQLite's setting; full: each commit waits until the disk has stored it
 
 OPEN_STATUSES: tuple[QueryStatus, ...] = ("pending", "leased")
 

@@ -26,8 +26,7 @@ class Settings:
         repeated_parts: whether outputs that are the same function of different inputs may share samples; see
             ``gp.pooling``. Needs ``drop_inputs``.
         inducing: greatest number of inducing points of a process. With more than 150 samples, hyperparameters maximise
-            the variational bound of all samples. 0 selects ``learning.many.BySubsets`` instead, which fits
-            hyperparameters to subsets of the samples.
+            the variational bound of all samples. 0 fits hyperparameters to subsets of the samples.
     """
 
     kernel: str = "composite"

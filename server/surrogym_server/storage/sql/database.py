@@ -14,7 +14,6 @@ import sqlite3
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +25,6 @@ from sqlalchemy.sql.compiler import SQLCompiler
 from sqlalchemy.sql.functions import FunctionElement
 
 from surrogym_server.errors import Damaged, InvalidInput, Unavailable
-from surrogym_server.storage.records import Synchronous
 from surrogym_server.storage.sql.filelock import FileLock, marks
 
 SQLITE_CODES = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
@@ -257,13 +255,11 @@ def conflict_insert(connection: Connection, table: sa.Table) -> sqlite.Insert | 
     return sqlite.insert(table) if connection.dialect.name == "sqlite" else postgresql.insert(table)
 
 
-def connect(url: str, synchronous: Synchronous = "full") -> Database:
+def connect(url: str) -> Database:
     """Open a SQLite file or a PostgreSQL database.
 
     Args:
         url: address such as ``sqlite:///path/to/file`` or ``postgresql://user@host/name``.
-        synchronous: setting of SQLite: ``full`` waits for the disk at each commit, ``normal`` may lose the last
-            commits if the power fails, but not if the process dies.
 
     Raises:
         InvalidInput: the address is of another kind.
@@ -275,7 +271,7 @@ def connect(url: str, synchronous: Synchronous = "full") -> Database:
         raise InvalidInput(f"expected a database address such as sqlite:///surrogym.db, got {url!r}") from None
     match location.get_backend_name():
         case "sqlite" if location.database and location.database != ":memory:":
-            return _sqlite(Path(location.database), synchronous)
+            return _sqlite(Path(location.database))
         case "postgresql":
             return _postgresql(location)
         case _:
@@ -285,7 +281,7 @@ def connect(url: str, synchronous: Synchronous = "full") -> Database:
             )
 
 
-def _sqlite(path: Path, synchronous: Synchronous) -> Database:
+def _sqlite(path: Path) -> Database:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -299,16 +295,17 @@ def _sqlite(path: Path, synchronous: Synchronous) -> Database:
     lock = FileLock(path)
     engine = sa.create_engine(URL.create("sqlite", database=str(path)), connect_args={"timeout": BUSY_SECONDS}, **POOL)
     sa.event.listen(engine, "do_connect", lambda *_: lock.require_in_place())  # else SQLite would create a missing file
-    sa.event.listen(engine, "connect", partial(_prepare_sqlite, synchronous))
+    sa.event.listen(engine, "connect", _prepare_sqlite)
     sa.event.listen(engine, "begin", _begin_sqlite)
     sa.event.listen(engine, "before_cursor_execute", _require_storable)
     recover = f"sqlite3 {shlex.quote(str(path))} .recover | sqlite3 recovered.db"
     return Database(engine, lock, way_out=f"restore a copy of the file, or save what can be read: {recover}")
 
 
-def _prepare_sqlite(synchronous: Synchronous, connection: Any, _: object) -> None:
+def _prepare_sqlite(connection: Any, _: object) -> None:
     connection.isolation_level = None  # the driver begins no transaction itself; ``_begin_sqlite`` does
-    for pragma in ("journal_mode=WAL", f"synchronous={synchronous}", "foreign_keys=ON"):
+    # synchronous=FULL: each commit waits until the disk has stored it
+    for pragma in ("journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON"):
         connection.execute(f"PRAGMA {pragma}").close()
 
 

@@ -28,7 +28,6 @@ import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
 from surrogym_server.errors import Damaged, Unavailable
-from surrogym_server.storage.records import Synchronous
 from surrogym_server.storage.sql.database import Database, connect, damaged, never_connected
 from surrogym_server.storage.sql.designs import Designs, Occupancy, Priors
 from surrogym_server.storage.sql.events import Announcements, Events, NotifiedAnnouncements
@@ -80,14 +79,12 @@ class Storage:
         self._database.close()
 
 
-def open_storage(url: str, synchronous: Synchronous = "full") -> Storage:
+def open_storage(url: str) -> Storage:
     """Open a database, check it, and migrate its schema to the newest version.
 
     Args:
         url: ``sqlite:///path/to/file`` (created if it does not exist, for one server at a time) or
             ``postgresql://user:password@host/name`` (for several servers).
-        synchronous: setting of SQLite: ``full`` waits for the disk at each commit, ``normal`` may lose the last
-            commits if the power fails.
 
     Raises:
         InvalidInput: the address is of another kind.
@@ -95,7 +92,7 @@ def open_storage(url: str, synchronous: Synchronous = "full") -> Storage:
             newer program.
         Damaged: pages, tables or columns are broken or missing; the message says how to recover.
     """
-    database = connect(url, synchronous)
+    database = connect(url)
     try:
         _bring_up(database)
     except BaseException as error:

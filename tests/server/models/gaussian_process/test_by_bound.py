@@ -20,8 +20,10 @@ from surrogym_server.environment.samples import Samples, increments
 from surrogym_server.errors import InvalidSpec
 from surrogym_server.models.files import from_bytes, to_bytes
 from surrogym_server.models.gaussian_process import GaussianProcesses
-from surrogym_server.models.gaussian_process.learning.many import ByBound
+from surrogym_server.models.gaussian_process.learning.limits import with_samples
+from surrogym_server.models.gaussian_process.learning.output_learner import OutputLearner
 from surrogym_server.models.gaussian_process.model import GaussianProcessModel
+from surrogym_server.models.gaussian_process.settings import Settings
 from surrogym_server.models.registry import learner_of
 from surrogym_server.plugins import Choice
 from surrogym_shared import compiled
@@ -144,11 +146,14 @@ def test_a_warm_started_sparse_model_is_as_accurate_as_a_fresh_one():
 
 
 def test_reconditioning_a_sparse_process_keeps_the_number_of_inducing_points():
-    """As one does that met limits of its output."""
-    posterior, rng = model().transitions[3].posterior, np.random.default_rng(0)
-    assert posterior is not None
-    x = torch.from_numpy(rng.uniform(-1.7, 1.7, (300, posterior.x.shape[1])))
-    again = ByBound(30).conditioned(posterior.hyper, x, posterior.mean(x))
+    """As for an output that has met its limits."""
+    output, rng = model().transitions[3], np.random.default_rng(0)
+    assert output.posterior is not None
+    x = torch.from_numpy(rng.uniform(-1.7, 1.7, (300, output.posterior.x.shape[1])))
+    learner = OutputLearner(model().definition, Settings(inducing=30), {}, {})
+    everything = torch.ones(300, dtype=torch.bool)
+    again = with_samples(learner, output, output.mean(x), {output.feature_map: x}, everything).posterior
+    assert again is not None
     assert again.sparse is not None
     assert (again.sparse.points, len(again.y)) == (300, 30)
 

@@ -10,7 +10,17 @@ from torch import Tensor
 
 from surrogym_server.environment.features import FeatureMap, features
 from surrogym_server.errors import NumericalFailure
-from surrogym_server.gp import Posterior, Selection, condition, is_noisy, loses_nothing, select_inputs, spread, subsets
+from surrogym_server.gp import (
+    Posterior,
+    Selection,
+    condition,
+    fewer_inputs,
+    is_noisy,
+    loses_nothing,
+    select_inputs,
+    spread,
+    subsets,
+)
 from surrogym_server.models.gaussian_process.learning.output_learner import OutputLearner, is_unexplained
 from surrogym_server.models.gaussian_process.learning.rates import inputs_of
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
@@ -66,8 +76,12 @@ def _of_many(
     learner: OutputLearner, output: OutputModel, posterior: Posterior, may: Tensor, x: Tensor, y: Tensor
 ) -> OutputModel:
     """Leave out inputs of an output whose process has inducing points and was fitted to points x (n, d), y (n,).
-    ``may`` (d,) is true for the inputs that may be left out."""
-    selection = learner.many.fewer_inputs(x, y, learner.options(output.name), posterior, may, ODDS)
+    ``may`` (d,) is true for the inputs that may be left out. Without the setting ``inducing``, none are left out if the
+    inducing points lose accuracy."""
+    inducing = learner.settings.inducing
+    if not inducing and not loses_nothing(posterior):
+        return output
+    selection = fewer_inputs(x, y, posterior, learner.options(output.name), inducing or subsets.SOME, may, ODDS)
     if selection is None:
         return output
     return replace(output, feature_map=map_without(output.feature_map, selection.mask), posterior=selection.posterior)

@@ -17,7 +17,6 @@ from surrogym_server.models.gaussian_process.feature_maps import candidates
 from surrogym_server.models.gaussian_process.learning.angle_prediction import learn_drift
 from surrogym_server.models.gaussian_process.learning.dropping import without_inputs
 from surrogym_server.models.gaussian_process.learning.limits import past_limits, within_limits
-from surrogym_server.models.gaussian_process.learning.many import ByBound, BySubsets
 from surrogym_server.models.gaussian_process.learning.output_learner import OutputLearner
 from surrogym_server.models.gaussian_process.learning.prior import Known, better_of
 from surrogym_server.models.gaussian_process.learning.rates import output_with_rates
@@ -50,8 +49,7 @@ def learn(
         raise InvalidInput(
             f"a model needs at least {MIN_POINTS} samples, got {len(samples)}; add samples before you learn"
         )
-    many = ByBound(settings.inducing) if settings.inducing else BySubsets()
-    learner = OutputLearner(definition, settings, warm, {}, many)
+    learner = OutputLearner(definition, settings, warm, {})
     known = None if prior is None else Known.of(prior, samples)
     transitions = _transitions(learner, samples, None if known is None else known.change)
     paying, terminal_reward, jumps = learn_reward(learner, samples, known)

@@ -24,7 +24,7 @@ import torch
 from torch import Tensor
 
 from surrogym_server.environment.features import FeatureMap
-from surrogym_server.gp import Joint, Posterior
+from surrogym_server.gp import Joint, Posterior, condition_sparse
 from surrogym_server.models.gaussian_process.learning.output_learner import OutputLearner
 from surrogym_server.models.gaussian_process.learning.rates import inputs_of, output_with_rates
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
@@ -118,7 +118,7 @@ def within_limits(
         if output.posterior.sparse is None:
             again = output_with_rates(learner, name + HELD, target, plain, more, more, side)
         else:
-            again = _with_samples(learner, output, target, inputs, more)
+            again = with_samples(learner, output, target, inputs, more)
         candidate = replace(again, name=name, past_limits=past, at_limit=_sides(again, side[more]))
         if _misfit(candidate, target, inputs, more, side) > WORSE * _misfit(output, target, inputs, keep, side):
             break
@@ -154,7 +154,7 @@ def _misfit(
     return float(short.square().sum() + off[side[rows] == 0].square().sum())
 
 
-def _with_samples(
+def with_samples(
     learner: OutputLearner, output: OutputModel, target: Tensor, inputs: Mapping[FeatureMap, Tensor], keep: Tensor
 ) -> OutputModel:
     """Condition the output on the samples ``keep`` (n,) with unchanged hyperparameters.
@@ -163,7 +163,8 @@ def _with_samples(
     """
     assert output.posterior is not None
     x = inputs_of(output, inputs)[keep]
-    posterior = learner.many.conditioned(output.posterior.hyper, x, output.standardised(target[keep], x))
+    y = output.standardised(target[keep], x)
+    posterior = condition_sparse(output.posterior.hyper, x, y, learner.settings.inducing or None)
     return replace(output, posterior=posterior)
 
 

@@ -11,9 +11,24 @@ from torch import Tensor
 
 from surrogym_server.environment.definition import EnvironmentDefinition
 from surrogym_server.environment.features import FeatureMap
-from surrogym_server.gp import Censored, FitOptions, Fitted, Posterior, Selection, fit, loses_nothing, spread, subsets
+from surrogym_server.gp import (
+    Censored,
+    FitOptions,
+    Fitted,
+    Posterior,
+    Selection,
+    condition_many,
+    fit,
+    fit_bound,
+    fit_some,
+    fit_through_few,
+    loses_nothing,
+    refine,
+    refine_where_hard,
+    spread,
+    subsets,
+)
 from surrogym_server.models.gaussian_process.feature_maps import reflection
-from surrogym_server.models.gaussian_process.learning.many import EXPLAINED, BySubsets, ManySamples
 from surrogym_server.models.gaussian_process.prediction.output_model import OutputModel
 from surrogym_server.models.gaussian_process.prediction.warp import PEAK_NOISE
 from surrogym_server.models.gaussian_process.settings import Settings
@@ -29,6 +44,9 @@ LEAD_ODDS, ALONE_ODDS, PARITY_ODDS, PLACE_ODDS = 3.0, -6.0, -3.0, 3.0
 CONSTANT = 1e-9  # an output whose standard deviation is at most this share of its absolute mean counts as constant
 SMALLEST = 1e-100  # an output with a smaller standard deviation counts as constant, because its square would underflow
 PEAK = "reward peak"  # name of the reward's output while the logarithm of the reward is learned
+# If the leave-one-out error is at most this, in standard deviations of the targets, the process predicts well enough,
+# so that no other inputs or hyperparameters are searched for.
+EXPLAINED = 0.01
 
 
 @dataclass
@@ -40,7 +58,6 @@ class OutputLearner:
     settings: Settings
     warm: Warm  # logarithms of hyperparameters from the previous model's fits, by "output|feature map"
     thetas: dict[str, NDArray[np.float64]]  # logarithms of hyperparameters from this model's fits, by the same keys
-    many: ManySamples = field(default_factory=BySubsets)  # strategy for fits to more than ``subsets.FEW`` samples
     # For each output, by name, of which it was tested which inputs can be left out: the best subset of inputs, and its
     # fit.
     selections: dict[str, Selection] = field(default_factory=dict)
@@ -121,11 +138,34 @@ class OutputLearner:
         theta: NDArray[np.float64],
         at_limit: Censored | None = None,
     ) -> Posterior:
-        """Fit the process of an output to all points x (n, d), y (n,), starting at ``theta``, logarithms of
-        hyperparameters that were fitted to a subset. ``at_limit`` are points at which only a bound is known, or
-        None."""
-        mirror = reflection(self.definition, feature_map)
-        return self.many.fitted(x, y, self.options(name), theta, mirror, at_limit)
+        """Fit the process of an output to more than ``subsets.FEW`` points x (n, d), y (n,), both standardised.
+
+        With the setting ``inducing``, hyperparameters maximise the variational bound of the evidence of all samples.
+        Without it, they are fitted to subsets of the samples. With more than ``gp.sparse.MAX_EXACT`` (2,000) points the
+        process then has inducing points, and if its leave-one-out errors are large, hyperparameters fitted to the
+        points with the largest errors are tried too. With fewer points the process is exact, unless inducing points
+        lose no accuracy, see ``gp.variational_bound.loses_nothing``.
+
+        Args:
+            name: name of the output.
+            feature_map: its encoding of state and action.
+            theta: logarithms of hyperparameters that were fitted to a subset of the points.
+            at_limit: points at which only a bound of the function is known, or None; without ``inducing`` they may help
+                to choose hyperparameters.
+
+        Raises:
+            NumericalFailure: no jitter makes the covariance of the points positive definite.
+        """
+        mirror, options = reflection(self.definition, feature_map), self.options(name)
+        if self.settings.inducing:
+            return fit_bound(x, y, options, theta, self.settings.inducing, mirror)
+        theta = fit_some(x, y, options, theta, mirror)
+        if (through_few := fit_through_few(x, y, options, theta, mirror)) is not None:
+            return through_few
+        posterior = condition_many(refine(x, y, options, theta, mirror), x, y, at_limit)
+        if posterior.sparse is None or posterior.left_out.error <= EXPLAINED:
+            return posterior
+        return condition_many([refine_where_hard(posterior, x, y, options)], x, y, at_limit, earlier=posterior)
 
     def options(self, name: str) -> FitOptions:
         """Return the options of an output's fit. By default the kernel of every output has a linear part, and that of
