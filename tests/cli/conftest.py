@@ -13,6 +13,7 @@ from surrogym.cli import main
 @pytest.fixture
 def surrogym(capsys, monkeypatch, tmp_path):
     """``surrogym("status", "--json")`` gives exit code, output and errors."""
+    monkeypatch.setattr("surrogym_client.surrogates.waiting.STARTING_SECONDS", 0.1)
     return speaker(main, capsys, monkeypatch, tmp_path)
 
 

@@ -132,7 +132,7 @@ def connect(server: str | None, token: str | None, wait: float = 0.0, *, quiet: 
         try:
             api.wait_until_ready(QUICK)
         except ServerUnreachable:
-            with _waiting(f"for a server at {api.url}", quiet=quiet):
+            with waiting(f"for a server at {api.url}", quiet=quiet):
                 api.wait_until_ready(wait)
     return api
 
@@ -177,7 +177,7 @@ def awaited_surrogate(api: Api, name: str, wait: float, *, quiet: bool) -> Surro
     except UnknownSurrogate:
         if wait == 0:
             raise
-    with _waiting(f"for {name!r} to be registered", quiet=quiet):
+    with waiting(f"for {name!r} to be registered", quiet=quiet):
         return wait_for_surrogate(api, name, wait)
 
 
@@ -190,7 +190,7 @@ def working(what: str, stays: str, *, quiet: bool) -> Iterator[Update]:
 
 
 @contextmanager
-def _waiting(words: str, *, quiet: bool) -> Iterator[None]:
+def waiting(words: str, *, quiet: bool) -> Iterator[None]:
     with working("wait", "interrupted; the same command waits again", quiet=quiet) as update:
         update(None, words)
         yield

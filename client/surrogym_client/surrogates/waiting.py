@@ -77,6 +77,7 @@ MANY = 1_500  # number of samples from which the expected time of a fit is shown
 # Seconds of a free core for each output in a fit of ``MANY`` to 20,000 samples by the default model: least, if they
 # are so noisy that few inducing points stand for all of them; most, with little noise or none.
 LEAST_SECONDS, MOST_SECONDS = 1, 30
+STARTING_SECONDS = 10.0  # time for a sampler that was started just now to call the server
 FIRST_LEASE_SECONDS = 5.0  # time for a sampler to begin a query, which a running sampler does within a second
 
 
@@ -192,6 +193,17 @@ def wait_for_design(
         f"the design of {name!r} has not ended after {seconds:g} s, its phase is {_phase(view)}: see surrogym "
         f"status {name}"
     )
+
+
+def wait_for_start(api: Api, name: str) -> SurrogateView:
+    """Wait a few seconds for a sampler that was started just now, if a design has not begun. Return the surrogate.
+
+    Raises ``UnknownSurrogate`` if there is no surrogate of this name.
+    """
+    for view in _looks(api, name, STARTING_SECONDS, None):
+        if view is not None and (view.samplers or view.samples or view.phase != "collecting" or view.paused):
+            break
+    return api.surrogate(name)
 
 
 def wait_for_answers(

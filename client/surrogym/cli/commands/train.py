@@ -26,6 +26,7 @@ from surrogym.cli.options import (
     push_or_say,
     require_known,
     typed,
+    waiting,
     working,
 )
 from surrogym.cli.train_options import LogOptions, LoopOptions, SearchOptions, SessionOptions, StartOptions
@@ -193,6 +194,7 @@ def _trainable(
         COMPLETED,
         share_of_design,
         wait_for_design,
+        wait_for_start,
         words_of_design,
         words_of_uncertainty,
     )
@@ -210,6 +212,9 @@ def _trainable(
                 limit_of(view.spec, str(limit))
         except ValueError as error:
             raise CommandError(str(error)) from error
+        if wait is None and view.budget and view.model_version is None:
+            with waiting("for a sampler", quiet=quiet):
+                view = wait_for_start(api, surrogate)
         if wait or (wait is None and _is_at_work(view)):
             SEARCHES.get(name_of(settings))
             stays = "interrupted; the design continues on the server; the same command waits again"
