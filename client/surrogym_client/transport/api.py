@@ -6,9 +6,7 @@ import hashlib
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import groupby
-from typing import Any, Literal, Self, TypeVar
-
-from pydantic import BaseModel
+from typing import Literal, Self, TypeVar
 
 from surrogym_client.errors import NoModel, ProtocolMismatch, ServerUnreachable
 from surrogym_client.transport import routes
@@ -17,8 +15,6 @@ from surrogym_client.transport.routes import check_protocol, new_key, parse
 from surrogym_shared import wire
 from surrogym_shared.codes import STATUS, Code, Problem
 from surrogym_shared.spec import EnvironmentSpec
-
-R = TypeVar("R", bound=wire.Reply)
 
 
 class JobCalls:
@@ -32,13 +28,11 @@ class JobCalls:
 
     def list(self, surrogate: str) -> wire.JobList:
         """List the jobs of a surrogate, newest first, and the workers that are connected."""
-        route = f"{routes.surrogate(surrogate)}/jobs"
-        return parse(wire.JobList, self._connection.send("GET", route), route)
+        return self._connection.get(wire.JobList, f"{routes.surrogate(surrogate)}/jobs")
 
     def get(self, surrogate: str, id: int) -> wire.JobDetail:
         """Return one job, with the curve of its training so far."""
-        route = routes.job(surrogate, id)
-        return parse(wire.JobDetail, self._connection.send("GET", route), route)
+        return self._connection.get(wire.JobDetail, routes.job(surrogate, id))
 
     def add(self, surrogate: str, task: wire.Task, *, idempotency_key: str | None = None) -> wire.JobView:
         """Queue a training or an evaluation.
@@ -49,12 +43,13 @@ class JobCalls:
             Overloaded: too many jobs are queued or running.
         """
         body = wire.AddJob(task=task, idempotency_key=idempotency_key)
-        return self._post(wire.JobView, f"{routes.surrogate(surrogate)}/jobs", body, repeatable=bool(idempotency_key))
+        return self._connection.post(
+            wire.JobView, f"{routes.surrogate(surrogate)}/jobs", body, repeatable=bool(idempotency_key)
+        )
 
     def cancel(self, surrogate: str, id: int) -> wire.JobView:
         """Cancel a queued job, or ask the worker of a running job to stop."""
-        route = f"{routes.job(surrogate, id)}:cancel"
-        return parse(wire.JobView, self._connection.send("POST", route), route)
+        return self._connection.post(wire.JobView, f"{routes.job(surrogate, id)}:cancel")
 
     def claim(
         self,
@@ -87,7 +82,7 @@ class JobCalls:
         )
         timeout = self._connection.timeouts.request + wait_seconds
         route = f"{routes.surrogate(surrogate)}/jobs:claim"
-        return self._post(wire.ClaimedJob, route, body, timeout=timeout, repeatable=False).job
+        return self._connection.post(wire.ClaimedJob, route, body, timeout=timeout, repeatable=False).job
 
     def report(
         self,
@@ -106,7 +101,9 @@ class JobCalls:
             LeaseExpired: the job has ended, or another worker has it.
         """
         body = wire.ReportJob(lease_token=lease_token, lease_seconds=lease_seconds, state=state)
-        return self._post(wire.ReportedJob, f"{routes.job(surrogate, id)}:report", body, retries=retries).cancel
+        return self._connection.post(
+            wire.ReportedJob, f"{routes.job(surrogate, id)}:report", body, retries=retries
+        ).cancel
 
     def finish(
         self,
@@ -123,21 +120,7 @@ class JobCalls:
         body = wire.FinishJob(
             lease_token=lease_token, status=status, error=error, version=version, evaluation=evaluation
         )
-        return self._post(wire.JobView, f"{routes.job(surrogate, id)}:finish", body)
-
-    def _post(
-        self,
-        reply: type[R],
-        route: str,
-        body: BaseModel,
-        *,
-        timeout: float | None = None,
-        repeatable: bool = True,
-        retries: Retries | None = None,
-    ) -> R:
-        content = body.model_dump_json().encode()
-        options = {"timeout": timeout, "repeatable": repeatable, "retries": retries}
-        return parse(reply, self._connection.send("POST", route, content, **options), route)  # type: ignore[arg-type]
+        return self._connection.post(wire.JobView, f"{routes.job(surrogate, id)}:finish", body)
 
 
 _FILE = "application/octet-stream"
@@ -155,13 +138,11 @@ class PolicyCalls:
 
     def list(self, surrogate: str) -> list[wire.PolicyView]:
         """List all policies of a surrogate, newest first."""
-        route = f"{routes.surrogate(surrogate)}/policies"
-        return parse(wire.PolicyList, self._connection.send("GET", route), route).policies
+        return self._connection.get(wire.PolicyList, f"{routes.surrogate(surrogate)}/policies").policies
 
     def get(self, surrogate: str, which: str | int = "latest") -> wire.PolicyDetail:
         """Return one policy, with the settings and the curve of its training."""
-        route = routes.policy(surrogate, which)
-        return parse(wire.PolicyDetail, self._connection.send("GET", route), route)
+        return self._connection.get(wire.PolicyDetail, routes.policy(surrogate, which))
 
     def push(
         self,
@@ -179,8 +160,7 @@ class PolicyCalls:
         """
         notice = wire.FileNotice(form=form, bytes=len(file), digest=_digest(file))
         body = wire.AddPolicy(card=card, curve=[*curve], file=notice)
-        route = f"{routes.surrogate(surrogate)}/policies"
-        pushed = parse(wire.PushedPolicy, self._connection.send("POST", route, body.model_dump_json().encode()), route)
+        pushed = self._connection.post(wire.PushedPolicy, f"{routes.surrogate(surrogate)}/policies", body)
         if not all(one.stored for one in pushed.files if one.form == form):
             stored = self.put_file(surrogate, pushed.version, form, file)
             return wire.PushedPolicy(**stored.model_dump(), created=pushed.created)
@@ -202,19 +182,16 @@ class PolicyCalls:
         """Store the results of real episodes of a policy, once for each idempotency key. This does not change the
         surrogate's counts of real steps, see ``Api.report_steps``."""
         route = f"{routes.policy(surrogate, version)}/evaluations"
-        reply = self._connection.send("POST", route, evaluation.model_dump_json().encode())
-        return parse(wire.EvaluationView, reply, route)
+        return self._connection.post(wire.EvaluationView, route, evaluation)
 
     def evaluation(self, surrogate: str, which: str | int, id: int) -> wire.EvaluationDetail:
         """Return the results of a stored evaluation: the return of each real episode, and the traces of some."""
-        route = f"{routes.policy(surrogate, which)}/evaluations/{id}"
-        return parse(wire.EvaluationDetail, self._connection.send("GET", route), route)
+        return self._connection.get(wire.EvaluationDetail, f"{routes.policy(surrogate, which)}/evaluations/{id}")
 
     def put_alias(self, surrogate: str, alias: str, version: int) -> wire.PolicyView:
         """Point an alias to a version of the policies. This needs a token of role admin."""
         route = f"{routes.policy(surrogate, 'aliases')}/{routes.alias(alias)}"
-        reply = self._connection.send("PUT", route, wire.PutAlias(version=version).model_dump_json().encode())
-        return parse(wire.PolicyView, reply, route)
+        return self._connection.post(wire.PolicyView, route, wire.PutAlias(version=version), method="PUT")
 
     def drop_alias(self, surrogate: str, alias: str) -> None:
         """Remove an alias. This needs a token of role admin."""
@@ -291,7 +268,7 @@ class Api:
         Raises:
             ProtocolMismatch: the server has another protocol version.
         """
-        health = self._get(wire.Health, "/healthz")
+        health = self.connection.get(wire.Health, "/healthz")
         check_protocol(health.protocol, self.url)
         return health
 
@@ -301,7 +278,7 @@ class Api:
         Raises:
             Unavailable: the database does not answer.
         """
-        return self._get(wire.Ready, "/readyz")
+        return self.connection.get(wire.Ready, "/readyz")
 
     def access(self) -> wire.Access:
         """Return what this token may do.
@@ -309,7 +286,7 @@ class Api:
         Raises:
             Unauthenticated: the server requires a token, and the client has none or an unknown one.
         """
-        return self._get(wire.Access, "/v1/access")
+        return self.connection.get(wire.Access, "/v1/access")
 
     def wait_until_ready(self, seconds: float = 60.0) -> wire.Health:
         """Wait until the server is ready, for at most ``seconds``.
@@ -328,14 +305,14 @@ class Api:
 
         Repeating it with the same specification is harmless; the reply's ``created`` is then False.
         """
-        return self._post(wire.CreatedSurrogate, "/v1/surrogates", wire.CreateSurrogate(name=name, spec=spec))
+        return self.connection.post(wire.CreatedSurrogate, "/v1/surrogates", wire.CreateSurrogate(name=name, spec=spec))
 
     def surrogates(self) -> list[wire.SurrogateSummary]:
         """List all surrogates, oldest first, with phase, real steps taken, and confidence index."""
         found: list[wire.SurrogateSummary] = []
         after: int | None = 0
         while after is not None:
-            page = self._get(wire.SurrogateList, "/v1/surrogates", after=after)
+            page = self.connection.get(wire.SurrogateList, "/v1/surrogates", after=after)
             found, after = found + page.surrogates, page.next_after
         return found
 
@@ -345,7 +322,7 @@ class Api:
         Raises:
             UnknownSurrogate: there is no surrogate of this name.
         """
-        return self._get(wire.SurrogateView, routes.surrogate(name))
+        return self.connection.get(wire.SurrogateView, routes.surrogate(name))
 
     def patch_surrogate(
         self,
@@ -362,7 +339,7 @@ class Api:
         """
         given = None if tolerances is None else dict(tolerances)
         body = wire.PatchSurrogate(paused=paused, budget=budget, target=target, tolerances=given)
-        return self._post(wire.SurrogateView, routes.surrogate(name), body, method="PATCH")
+        return self.connection.post(wire.SurrogateView, routes.surrogate(name), body, method="PATCH")
 
     def delete_surrogate(self, name: str) -> None:
         """Delete a surrogate with its samples, models and sessions. This can't be undone.
@@ -395,7 +372,7 @@ class Api:
         body = wire.ClaimQueries(
             sampler=sampler, max_queries=max_queries, wait_seconds=wait_seconds, lease_seconds=lease_seconds
         )
-        claimed = self._post(
+        claimed = self.connection.post(
             wire.ClaimedQueries,
             f"{routes.surrogate(name)}/queries:claim",
             body,
@@ -425,7 +402,8 @@ class Api:
             LeaseExpired: the lease has expired; the sample may still be sent.
         """
         body = wire.RenewLease(lease_token=lease_token, lease_seconds=lease_seconds)
-        self._send(f"{routes.surrogate(name)}/queries/{query_id}:renew", body, retries=retries)
+        route = f"{routes.surrogate(name)}/queries/{query_id}:renew"
+        self.connection.send("POST", route, body.model_dump_json().encode(), retries=retries)
 
     def fail(
         self, name: str, query_id: int, lease_token: str, error: str, *, begun: bool = True, refused: bool = False
@@ -433,7 +411,8 @@ class Api:
         """Hand a query back to the server without an answer, with the error it caused. ``begun``: whether a real step
         may have been taken. ``refused``: whether the original environment refused the query before a real step."""
         body = wire.FailQuery(lease_token=lease_token, error=error, begun=begun, refused=refused)
-        self._send(f"{routes.surrogate(name)}/queries/{query_id}:fail", body)
+        route = f"{routes.surrogate(name)}/queries/{query_id}:fail"
+        self.connection.send("POST", route, body.model_dump_json().encode())
 
     def add_queries(
         self,
@@ -462,27 +441,29 @@ class Api:
             replan=replan,
             idempotency_key=idempotency_key or new_key(),
         )
-        return self._post(wire.QueryList, f"{routes.surrogate(name)}/{'audit' if audit else 'queries'}", body).queries
+        return self.connection.post(
+            wire.QueryList, f"{routes.surrogate(name)}/{'audit' if audit else 'queries'}", body
+        ).queries
 
     def withdraw_audit(self, name: str, query_ids: Sequence[int]) -> int:
         """Withdraw queries of an audit, or trials, that no sampler has begun, and return how many were withdrawn."""
         body = wire.WithdrawQueries(query_ids=list(query_ids))
-        return self._post(wire.WithdrawnQueries, f"{routes.surrogate(name)}/audit:withdraw", body).withdrawn
+        return self.connection.post(wire.WithdrawnQueries, f"{routes.surrogate(name)}/audit:withdraw", body).withdrawn
 
     def queries(self, name: str) -> list[wire.QueryView]:
         """List all queries so far, each with its state, attempts and last error."""
-        return self._get(wire.QueryList, f"{routes.surrogate(name)}/queries").queries
+        return self.connection.get(wire.QueryList, f"{routes.surrogate(name)}/queries").queries
 
     # Routes of snapshots, samples, and counts of real steps
 
     def snapshots(self, name: str) -> list[wire.SnapshotView]:
         """Return the snapshots that samplers hold, oldest first."""
-        return self._get(wire.SnapshotList, f"{routes.surrogate(name)}/snapshots").snapshots
+        return self.connection.get(wire.SnapshotList, f"{routes.surrogate(name)}/snapshots").snapshots
 
     def drop_snapshots(self, name: str, snapshots: Sequence[str]) -> int:
         """Report snapshots that no sampler holds any more, and return how many of them the server knew."""
         body = wire.DropSnapshots(snapshots=list(snapshots))
-        return self._post(wire.DroppedSnapshots, f"{routes.surrogate(name)}/snapshots:drop", body).dropped
+        return self.connection.post(wire.DroppedSnapshots, f"{routes.surrogate(name)}/snapshots:drop", body).dropped
 
     def add_samples(
         self,
@@ -526,7 +507,7 @@ class Api:
                 after=place,
                 idempotency_key=keys[len(added)],
             )
-            reply = self._post(wire.AddedSamples, f"{routes.surrogate(name)}/add_sample", body)
+            reply = self.connection.post(wire.AddedSamples, f"{routes.surrogate(name)}/add_sample", body)
             if reply.restart is not None and not begins:
                 return reply
             added, place = ([*added, reply], reply.digest) if reply.restart is None else ([], reply.restart)
@@ -537,7 +518,7 @@ class Api:
         """Iterate over all samples in order of arrival, page by page."""
         after: int | None = 0
         while after is not None:
-            page = self._get(wire.SamplePage, f"{routes.surrogate(name)}/samples", after=after)
+            page = self.connection.get(wire.SamplePage, f"{routes.surrogate(name)}/samples", after=after)
             yield from page.samples
             after = page.next_after
 
@@ -547,11 +528,11 @@ class Api:
 
     def dirt(self, name: str) -> list[wire.DirtFinding]:
         """Return the dirt that was found in the first real steps of a machine that can only be reset."""
-        return self._get(wire.DirtList, f"{routes.surrogate(name)}/dirt").findings
+        return self.connection.get(wire.DirtList, f"{routes.surrogate(name)}/dirt").findings
 
     def limits(self, name: str) -> list[str]:
         """Describe in sentences how well all real steps kept the limits of the specification; empty without limits."""
-        return self._get(wire.LimitsKept, f"{routes.surrogate(name)}/limits").said
+        return self.connection.get(wire.LimitsKept, f"{routes.surrogate(name)}/limits").said
 
     def report_steps(
         self,
@@ -567,7 +548,7 @@ class Api:
         surrogate's counts of real steps."""
         key = idempotency_key or new_key()
         body = wire.ReportSteps(steps=steps, episodes=episodes, note=note, limits=limits, idempotency_key=key)
-        return self._post(wire.Ledger, f"{routes.surrogate(name)}/ledger", body)
+        return self.connection.post(wire.Ledger, f"{routes.surrogate(name)}/ledger", body)
 
     def improve(
         self,
@@ -586,13 +567,13 @@ class Api:
         """
         key = idempotency_key or new_key()
         body = wire.Improve(queries=queries, checkpoint=checkpoint, trial=trial, idempotency_key=key)
-        return self._post(wire.ImprovedSurrogate, f"{routes.surrogate(name)}/improve", body)
+        return self.connection.post(wire.ImprovedSurrogate, f"{routes.surrogate(name)}/improve", body)
 
     # Routes of models, and of the states of sessions
 
     def session_coordinates(self, session: str) -> list[list[float]]:
         """Return the coordinates (N, C) of the N lanes of a session."""
-        return self._get(wire.SessionCoordinates, f"{routes.session(session)}/coordinates").coordinates
+        return self.connection.get(wire.SessionCoordinates, f"{routes.session(session)}/coordinates").coordinates
 
     def query_uncertainty(
         self,
@@ -621,7 +602,7 @@ class Api:
 
     def models(self, name: str) -> list[wire.ModelView]:
         """List all models with structure, hyperparameters and fidelity, oldest first."""
-        return self._get(wire.ModelList, f"{routes.surrogate(name)}/models").models
+        return self.connection.get(wire.ModelList, f"{routes.surrogate(name)}/models").models
 
     def model(self, name: str) -> wire.ModelView:
         """Return the structure and fidelity of the latest model.
@@ -633,7 +614,7 @@ class Api:
         if view.model_version is None:
             detail = f"{name!r} has no model yet: let a sampler answer its first queries, or import a log"
             raise NoModel(Problem(title="No model", status=STATUS[Code.NO_MODEL], code=Code.NO_MODEL, detail=detail))
-        return self._get(wire.ModelView, f"{routes.surrogate(name)}/models/{view.model_version}")
+        return self.connection.get(wire.ModelView, f"{routes.surrogate(name)}/models/{view.model_version}")
 
     def export_model(self, name: str, version: int) -> bytes:
         """Return a complete model as the content of a safetensors file."""
@@ -723,22 +704,13 @@ class Api:
                 action=[list(row) for row in action[rows]],
                 model=parts[0].model_version if parts else model,
             )
-            parts.append(self._post(reply, path, body))
+            parts.append(self.connection.post(reply, path, body))
         by_point = {
             field: [row for part in parts for row in getattr(part, field)]
             for field in reply.model_fields
             if field not in _OF_ALL_POINTS
         }
         return parts[0].model_copy(update=by_point)
-
-    def _get(self, reply: type[R], path: str, **params: str | int) -> R:
-        return parse(reply, self.connection.send("GET", path, params=params or None), path)
-
-    def _post(self, reply: type[R], path: str, body: BaseModel, *, method: str = "POST", **options: Any) -> R:
-        return parse(reply, self._send(path, body, method=method, **options), path)
-
-    def _send(self, path: str, body: BaseModel, *, method: str = "POST", **options: Any) -> bytes:
-        return self.connection.send(method, path, body.model_dump_json().encode(), **options)
 
 
 def _joined(added: Sequence[wire.AddedSamples]) -> wire.AddedSamples:

@@ -16,7 +16,7 @@ from typing import Any, Self, TypeVar
 from urllib.request import getproxies, proxy_bypass
 
 import httpx
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from surrogym_client.errors import (
     ProtocolMismatch,
@@ -28,11 +28,14 @@ from surrogym_client.errors import (
     UnusableToken,
     error_from_problem,
 )
+from surrogym_client.transport.routes import parse
 from surrogym_client.transport.stream import Stream, StreamUnavailable
 from surrogym_shared.codes import Problem
 from surrogym_shared.patterns import IN_WORDS, TOKEN
+from surrogym_shared.wire import Reply
 
 T = TypeVar("T")
+R = TypeVar("R", bound=Reply)
 
 JSON = "application/json"
 DEFAULT_URL = "http://127.0.0.1:8000"
@@ -133,6 +136,28 @@ class Connection:
     def close(self) -> None:
         """Close the sockets. Sessions and leases on the server remain, and a later request connects again."""
         self._client.close()
+
+    def get(self, reply: type[R], path: str, **params: str | int) -> R:
+        """Send a GET request, and return the answer as its wire model. Raises the errors of ``send``."""
+        return parse(reply, self.send("GET", path, params=params or None), path)
+
+    def post(
+        self,
+        reply: type[R],
+        path: str,
+        body: BaseModel | None = None,
+        *,
+        method: str = "POST",
+        timeout: float | None = None,
+        repeatable: bool = True,
+        retries: Retries | None = None,
+    ) -> R:
+        """Send a request with a wire model as its body, and return the answer as its wire model. The other arguments
+        and the errors are those of ``send``."""
+        content = None if body is None else body.model_dump_json().encode()
+        return parse(
+            reply, self.send(method, path, content, timeout=timeout, repeatable=repeatable, retries=retries), path
+        )
 
     def send(
         self,

@@ -26,7 +26,7 @@ from surrogym_client.errors import (
 )
 from surrogym_client.transport import routes
 from surrogym_client.transport.connection import Connection, Retries, Timeouts
-from surrogym_client.transport.routes import check_protocol, new_key, parse
+from surrogym_client.transport.routes import check_protocol, new_key
 from surrogym_client.transport.step_codecs import UNREADABLE, BinaryForm, Form, JsonForm
 from surrogym_client.transport.stream import Stream, StreamLost, StreamUnavailable
 from surrogym_shared import wire
@@ -168,11 +168,11 @@ class HttpSurrogate:
 
     def spec(self) -> EnvironmentSpec:
         if self._spec is None:
-            self._spec = parse(wire.SurrogateView, self.connection.send("GET", self._route), self._route).spec
+            self._spec = self.connection.get(wire.SurrogateView, self._route).spec
         return self._spec
 
     def model_file(self) -> bytes:
-        view = parse(wire.SurrogateView, self.connection.send("GET", self._route), self._route)
+        view = self.connection.get(wire.SurrogateView, self._route)
         if view.model_version is None:
             detail = f"{self.surrogate!r} has no model yet: let a sampler answer its first queries, or import a log"
             raise NoModel(Problem(title="No model", status=STATUS[Code.NO_MODEL], code=Code.NO_MODEL, detail=detail))
@@ -182,10 +182,8 @@ class HttpSurrogate:
     def open(self, request: wire.OpenSession) -> wire.SessionView:
         if request.idempotency_key is None:
             request = request.model_copy(update={"idempotency_key": new_key()})
-        route = f"{self._route}/sessions"
-        body = request.model_dump_json().encode()
-        content = self.connection.send("POST", route, body, timeout=self.connection.timeouts.open)
-        view = parse(wire.SessionView, content, route)
+        timeout = self.connection.timeouts.open
+        view = self.connection.post(wire.SessionView, f"{self._route}/sessions", request, timeout=timeout)
         check_protocol(view.protocol, self.connection.url)
         self._know(view)
         return view
@@ -244,8 +242,7 @@ class HttpSurrogate:
 
     def submit_occupancy(self, session: str, checkpoint: str) -> wire.SubmittedOccupancy:
         route = f"{routes.session(session)}/occupancy"
-        body = wire.SubmitOccupancy(checkpoint=checkpoint).model_dump_json().encode()
-        return parse(wire.SubmittedOccupancy, self.connection.send("POST", route, body), route)
+        return self.connection.post(wire.SubmittedOccupancy, route, wire.SubmitOccupancy(checkpoint=checkpoint))
 
     def close(self, session: str) -> None:
         """Close the session. Closing the last session also closes the sockets."""
@@ -390,8 +387,7 @@ class HttpSurrogate:
 
     def _look_up(self, session: str) -> _Live:
         """Ask the server for a session that another client opened, and start to track it."""
-        route = routes.session(session)
-        return self._know(parse(wire.SessionView, self.connection.send("GET", route), route))
+        return self._know(self.connection.get(wire.SessionView, routes.session(session)))
 
     def _know(self, view: wire.SessionView) -> _Live:
         route = routes.session(view.id)

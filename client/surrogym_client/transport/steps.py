@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 from surrogym_client.transport import routes
 from surrogym_client.transport.connection import Connection
-from surrogym_client.transport.routes import parse
 from surrogym_shared.wire.watching import AddedSteps, AddSteps, MachineStep, StepPage, StreamedStep
 
 
@@ -44,15 +43,12 @@ class StepCalls:
             IdempotencyConflict: another step is stored under the same number.
         """
         body = AddSteps(machine=machine, stream=stream, first=first, period=period, steps=[*steps])
-        route = self._route(surrogate)
-        return parse(AddedSteps, self._connection.send("POST", route, body.model_dump_json().encode()), route)
+        return self._connection.post(AddedSteps, self._route(surrogate), body)
 
     def after(self, surrogate: str, id: int = 0, since: float = 0.0) -> list[StreamedStep]:
         """Return the steps after the one with this id that the server stored later than ``since`` (s since 1970), at
         most 1,000; empty if there is none yet."""
-        route = self._route(surrogate)
-        params: dict[str, str | int] = {"after": id, "since": str(since)}
-        return parse(StepPage, self._connection.send("GET", route, params=params), route).steps
+        return self._connection.get(StepPage, self._route(surrogate), after=id, since=str(since)).steps
 
     @staticmethod
     def _route(surrogate: str) -> str:

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from surrogym_client.transport import routes
 from surrogym_client.transport.api import Api
-from surrogym_client.transport.routes import parse
 from surrogym_shared.logs.rows import impossible
 from surrogym_shared.spec import BoxAction, EnvironmentSpec, limits
 from surrogym_shared.wire import PolicyView, SurrogateView
@@ -197,7 +196,7 @@ class Watcher:
             idempotency_key=hashlib.sha256(content).hexdigest(),
         )
         route = f"{routes.policy(self._view.name, version)}/drifts"
-        return parse(PolicyView, self._api.connection.send("POST", route, body.model_dump_json().encode()), route)
+        return self._api.connection.post(PolicyView, route, body)
 
     def _tolerances(self, names: Sequence[str]) -> Array:
         assert self._view.fidelity is not None
