@@ -276,6 +276,31 @@ def test_ctrl_c_before_the_first_rollout_leaves_an_untrained_policy(surrogate, t
     assert load_policy(tmp_path / "policy.zip")(np.zeros((1, 3), np.float32)).shape == (1, 1)
 
 
+@pytest.mark.parametrize(
+    "settings",
+    [
+        small(),
+        TrainSettings("FASTPPO", 10_000),
+        TrainSettings("CMAES", 40_000, hyperparameters={"population": 4, "starts": 2}),
+    ],
+    ids=["PPO", "FASTPPO", "CMAES"],
+)
+def test_an_error_in_a_training_leaves_the_policy_so_far(surrogate, tmp_path: Path, settings: TrainSettings):
+    """A simulator that failed after hours lost all of them."""
+    left = iter([None, RuntimeError("the solver did not converge")])
+
+    def fail(_: TrainProgress) -> None:
+        if error := next(left):
+            raise error
+
+    out = tmp_path / "policy.zip"
+    with pytest.raises(RuntimeError, match="did not converge") as raised:
+        train(surrogate, out, settings, fail)
+    assert f"the policy so far is in {out}" in raised.value.__notes__[0]
+    assert load_policy(out, settings.algorithm)(np.zeros((1, 3), dtype=np.float32)).shape[0] == 1
+    assert json.loads(out.with_suffix(".json").read_text())["virtual_steps"] > 0
+
+
 def test_a_training_without_given_steps_may_be_extended_except_with_preset_paper():
     default, paper = pendulum(), make("Pendulum-v1", preset="paper").spec()
     assert prolongs(TrainSettings(), default)

@@ -168,7 +168,7 @@ def run(built: Callable[[], typer.Typer], name: str, arguments: Sequence[str] | 
         message = sentence(error)
         if message is None:
             raise
-        say(f"error: {message}")
+        say(f"error: {'; '.join([message, *getattr(error, '__notes__', ())])}")
         sys.exit(1)
 
 

@@ -7,7 +7,6 @@ function. All candidates of a generation are stepped together, each from the sam
 
 from __future__ import annotations
 
-from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -49,10 +48,13 @@ class CmaEs(PolicySearch):
 
     def search(self, task: SearchTask) -> Found:
         run = _Run(task, self)
-        with suppress(KeyboardInterrupt):
+        stopped = None
+        try:
             for number in range(1, run.generations + 1):
                 run.generation(number)
-        return run.found()
+        except (KeyboardInterrupt, Exception) as error:
+            stopped = error
+        return run.found(stopped)
 
 
 class _Run:
@@ -79,14 +81,15 @@ class _Run:
         steps, total = number * self._cost, self.generations * self._cost
         self._task.progress(TrainProgress(steps, total, self._latest, seen.penalty_share, self._penalty))
 
-    def found(self) -> Found:
-        """Return the best mean of the generations so far."""
+    def found(self, stopped: BaseException | None) -> Found:
+        """Return the best mean of the generations so far. ``stopped`` is Ctrl-C or an error that ended them."""
         return Found(
             self._kept or self._distribution.policy,
             self._done * self._cost,
             None if self._latest is None else self._best,
             {**asdict(self._choices), "total_steps": self.generations * self._cost},
             whole=self._done == self.generations,
+            stopped=stopped,
             episode_penalty=self._penalty,
         )
 

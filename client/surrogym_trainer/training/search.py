@@ -7,7 +7,7 @@ The laws of a search, which ``surrogym_trainer.testing`` checks:
    at least one unit. Steps that only compare policies are not counted.
 3. It reports progress with steps that never decrease and never exceed their total.
 4. On Ctrl-C it returns the best policy so far, with ``whole=False``. It raises ``KeyboardInterrupt`` only if there is
-   no policy yet.
+   no policy yet. After an error of the surrogate it may do the same, with the error in ``stopped``.
 5. It closes every session that it opens, also after errors. It writes no file; the policy's ``save`` does.
 6. ``load_policy`` reads the saved policy without trust, and the policy gives actions of the surrogate's action space.
 7. Impossible settings raise ``ValueError`` with what was expected and what came, before the first virtual step.
@@ -71,7 +71,8 @@ class Found:
     imagined_return: float | None  # imagined return of the policy; None if it was not measured
     settings: Mapping[str, Any] = field(default_factory=dict)  # settings of the search, including defaults
     algorithm: str | None = None  # class of Stable-Baselines3 that can read the file; None if the file needs none
-    whole: bool = True  # whether the search finished; False after Ctrl-C
+    whole: bool = True  # whether the search finished; False after Ctrl-C or an error
+    stopped: BaseException | None = None  # what ended the search: Ctrl-C or an error; ``train`` raises an error again
     episode_penalty: float | None = None
     lost_episodes: int = 0
     networks: int = 1

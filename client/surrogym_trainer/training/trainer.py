@@ -44,6 +44,8 @@ def train(
         SurrogymClientError: the surrogate can't be reached, or has no model yet.
         UnusablePolicy: the file to start from is not a policy of the algorithm, or the card would replace another kind
             of file.
+        Exception: a step failed, for example one of a user's simulator; the policy so far is saved, and a note of the
+            exception says where.
         TrainingInterrupted: Ctrl-C was pressed; the policy with the best imagined return so far is saved.
     """
     require_place(out)
@@ -57,12 +59,21 @@ def train(
     task = SearchTask(port, settings, planned_steps(settings), out, prolong, progress or (lambda _: None))
     started = time.perf_counter()
     found = search.search(task)
+    failure = found.stopped if isinstance(found.stopped, Exception) else None
+    if failure is not None and not found.virtual_steps:
+        raise failure
     out.parent.mkdir(parents=True, exist_ok=True)
     # The card (description) of an earlier policy must not remain beside this policy.
     card_path(out).unlink(missing_ok=True)
     found.policy.save(out)
     result = _result(found, settings, out, time.perf_counter() - started)
     card_path(out).write_text(json.dumps(asdict(result), indent=2, default=str) + "\n")
+    if failure is not None:
+        failure.add_note(
+            f"the training stopped after {found.virtual_steps:,} virtual steps; the policy so far is in {out}, and "
+            "start_from (--start-from) continues it"
+        )
+        raise failure
     if not found.whole:
         raise TrainingInterrupted(result)
     return result

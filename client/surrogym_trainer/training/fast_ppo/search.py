@@ -159,8 +159,8 @@ class _Training:
         self._cycles: list[dict[str, Any]] = []
 
     def run(self) -> Found:
-        """Run the stages until they end, or Ctrl-C is pressed."""
-        whole = True
+        """Run the stages until they end, Ctrl-C is pressed, or a step fails."""
+        stopped = None
         try:
             for learner, hold in self._candidates():
                 self._learn(learner, hold)
@@ -169,9 +169,9 @@ class _Training:
                 self._networks += 1
             if self._task.prolong and not self._checks.saturated:
                 self._refine()
-        except KeyboardInterrupt:
-            whole = False
-        return self._found(whole=whole)
+        except (KeyboardInterrupt, Exception) as error:
+            stopped = error
+        return self._found(stopped)
 
     @property
     def _patience(self) -> int:
@@ -312,7 +312,7 @@ class _Training:
     def _imagined(self, learner: Learner) -> Returns:
         return checked(self._task.port, learner.policy(), self._task.settings)
 
-    def _found(self, *, whole: bool) -> Found:
+    def _found(self, stopped: BaseException | None) -> Found:
         stage = self._learning
         chosen: dict[str, Any] = {"n_steps": self._steps, "gamma": self._gamma_of(stage), "batch_size": self._batch}
         chosen |= {"net_arch": units_of(self._spec), "start_box": stage.settings.learning["start_box"]}
@@ -324,7 +324,8 @@ class _Training:
             self._taken * self._rollout,
             self._checks.best,
             {**ran_with, "total_steps": self._planned * self._rollout},
-            whole=whole,
+            whole=stopped is None,
+            stopped=stopped,
             episode_penalty=self._penalty,
             lost_episodes=self._lost,
             networks=self._networks,

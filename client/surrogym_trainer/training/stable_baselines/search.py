@@ -112,15 +112,15 @@ class _Training:
             self._checking.check(saved)  # the saved policy stays the best if the training does not exceed it
 
     def run(self) -> Found:
-        """Train until the steps are taken, or Ctrl-C is pressed."""
-        checking, whole = self._checking, True
+        """Train until the steps are taken, Ctrl-C is pressed, or a step fails."""
+        checking, stopped = self._checking, None
         if self._learner.tensorboard_log is None:  # without a logger, Stable-Baselines3 would make a temporary folder
             self._learner.set_logger(Logger(folder=None, output_formats=[]))
         with tracking(self._task.settings, self._task.out) as callbacks:
             try:
                 self._learner.learn(self._total, callback=[checking, *callbacks])
-            except KeyboardInterrupt:
-                whole = False
+            except (KeyboardInterrupt, Exception) as error:
+                stopped = error
         best = checking.best_of(self._learner)
         ran_with = {"num_envs": self._env.num_envs, "total_steps": self._total, **effective(best)}
         return Found(
@@ -129,7 +129,8 @@ class _Training:
             checking.checks.best,
             ran_with,
             type(best).__name__,
-            whole,
+            stopped is None,
+            stopped,
             checking.episode_penalty,
             checking.lost,
             untrained=checking.checks.untrained,
