@@ -1,9 +1,12 @@
 """What can't be done is told in one sentence, with a non-zero exit, never as a traceback."""
 
+from unittest.mock import Mock
+
 import pytest
 
 from support.scripted_server import problem, reply, scripted_server
 from surrogym.cli.commands.evaluate import enter_steps
+from surrogym_client.errors import ServerUnreachable
 from surrogym_client.transport import Api
 from surrogym_shared.archives import stored
 from surrogym_shared.codes import Code
@@ -40,7 +43,15 @@ def refused(said, code=1):
 def test_the_error_for_an_unreachable_server_recommends_serve(surrogym, quickly, arguments):
     said = refused(surrogym(*arguments, *NOBODY))
     assert "no Surrogym server answers at http://127.0.0.1:9" in said
-    assert "start one with surrogym serve" in said
+    assert said.count("start one with surrogym serve") == 1
+
+
+def test_the_error_of_a_training_says_what_was_saved(surrogym, monkeypatch):
+    """Notes of exceptions show in tracebacks alone."""
+    error = ServerUnreachable("the server is gone")
+    error.add_note("the policy so far is in policy.zip")
+    monkeypatch.setattr("surrogym.cli.commands.train._trainable", Mock(side_effect=error))
+    assert refused(surrogym("train", "pendulum")).endswith("; the policy so far is in policy.zip\n")
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ from typing import Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from surrogym.cli.errors import sentence
+from surrogym.cli.errors import notes_of, sentence
 from surrogym.cli.groups import add
 from surrogym_shared.removed import remark
 from surrogym_shared.terminal import say
@@ -168,7 +168,7 @@ def run(built: Callable[[], typer.Typer], name: str, arguments: Sequence[str] | 
         message = sentence(error)
         if message is None:
             raise
-        say(f"error: {'; '.join([message, *getattr(error, '__notes__', ())])}")
+        say(f"error: {'; '.join([message, *notes_of(error)])}")
         sys.exit(1)
 
 

@@ -45,6 +45,11 @@ def sentence(error: Exception) -> str | None:
             return None
 
 
+def notes_of(error: Exception) -> list[str]:
+    """Return the notes of an error, such as what was saved, without the way out, which ``sentence`` has."""
+    return [note for note in getattr(error, "__notes__", ()) if not note.startswith("What to do: ")]
+
+
 def invalid(error: Exception) -> str:
     """Describe the first fault of pydantic's validation error, with the path of the wrong entry."""
     from pydantic import ValidationError
