@@ -217,6 +217,17 @@ def test_the_error_for_a_broken_environment_class_names_the_fault(own_module, tm
         original.make(f"broken:{name}")
 
 
+def test_the_error_for_an_incomplete_class_names_it_also_if_its_specification_is_replaced(
+    own_module, tmp_path, monkeypatch
+):
+    (tmp_path / "broken.py").write_text(BROKEN)
+    for module in ("broken", own_module):
+        monkeypatch.delitem(sys.modules, module, raising=False)
+    other = original.make(f"{own_module}:Cart").spec().model_copy(update={"time_limit": 7})
+    with pytest.raises(UnknownEnvironment, match=r"got a Open without close$"):
+        original.make("broken:Open", spec=other)
+
+
 def test_a_specification_from_a_server_can_only_open_built_in_environments():
     assert is_known("Pendulum-v1")
     assert is_known("Hopper-v5")

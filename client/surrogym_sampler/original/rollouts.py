@@ -163,12 +163,12 @@ def answering(environment: object) -> Environment:
     if not isinstance(environment, (OriginalEnvironment, RolloutEnvironment)):
         raise UnknownEnvironment(
             "expected an object with spec, step_from and close, or with spec, reset, step, coordinates and close, "
-            f"got a {type(environment).__name__} without {_missing(environment)}"
+            f"got a {_class_of(environment)} without {_missing(environment)}"
         )
     if rates(environment.spec()) and not getattr(environment, "keeps_rates", False):
         raise UnknownEnvironment(
             "the action has a rate, which Surrogym keeps only in an environment with reset, step and coordinates: "
-            f"expected these methods, got a {type(environment).__name__} without: write them, or remove the rate"
+            f"expected these methods, got a {_class_of(environment)} without: write them, or remove the rate"
         )
     query = environment.spec().query
     needed, methods = (
@@ -205,6 +205,11 @@ def keeping_limits(environment: Environment, fallback: str | None = None) -> Env
     except UnknownEnvironment:
         environment.close()
         raise
+
+
+def _class_of(environment: object) -> str:
+    """Return the name of the user's class, also if its specification is replaced."""
+    return type(getattr(environment, "wrapped", environment)).__name__
 
 
 def _missing(environment: object) -> str:

@@ -151,6 +151,13 @@ def layers(simulator: Any) -> list[Any]:
     return layers
 
 
+def own_name(simulator: Any) -> str:
+    """Return the name of an opened simulator: that of the user's class, or the name by which it was opened."""
+    every = layers(simulator)
+    own = [one for one in every if hasattr(one, "spec")][-1]
+    return type(own).__name__ if own is every[-1] else own.spec().environment or type(own).__name__
+
+
 FEWEST = 2  # smallest number of real steps for a calibration
 STARTS = 5  # largest number of starting points of the fit; the first one is the simulator's own values
 EXPECTED = 1e-3  # if the error is below this share of the coordinates' changes, no further starting point is tried

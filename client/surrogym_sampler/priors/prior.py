@@ -28,6 +28,7 @@ from surrogym_sampler.priors.calibration import (
     adjustable,
     calibrate,
     layers,
+    own_name,
     read_parameters,
 )
 from surrogym_shared.spec import DeclaredReward, EnvironmentSpec, RewardTerm
@@ -236,7 +237,7 @@ class SimulatorPrior(ABC):
 
     def _words(self, simulator: str | OriginalEnvironment) -> str:
         """Return the name of the simulator, and which coordinates it matched to variables by their places."""
-        name = simulator if isinstance(simulator, str) else type(simulator).__name__
+        name = simulator if isinstance(simulator, str) else own_name(simulator)
         matched = ", ".join(getattr(layers(self.simulator)[-1], "matched", ()))
         return (name + (f" ({matched})" if matched else ""))[:LONGEST_SOURCE]
 

@@ -42,4 +42,5 @@ def test_a_certain_model_of_a_simulator_is_learned_from_the_usual_number_of_step
     made = surrogym.Prior(Textbook(), hinge_spec(), ["mass"])
     assert made.update(steps_of(Real(), 6))
     assert made.steps == 80
+    assert surrogym.Prior(made.simulator, hinge_spec()).source == made.source == "Textbook"
     assert Careful(made.simulator).spec().coordinates == made.spec.coordinates
