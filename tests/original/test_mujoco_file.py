@@ -93,8 +93,13 @@ def test_many_steps_at_once_equal_single_ones_and_one_that_diverges_is_no_number
     environment.close()
 
 
-def test_many_steps_of_one_time_step_each_that_diverge_are_no_numbers_either(tmp_path):
-    environment, (q, u) = original.make(pole(tmp_path), spec=spec_of(sampling_period=0.01)), drawn(20)
+@pytest.mark.parametrize("delay", ["", 'delay="0.005" nsample="4" interp="linear"'], ids=["prompt", "delayed"])
+def test_many_steps_of_one_time_step_each_that_diverge_are_no_numbers_either(tmp_path, delay):
+    """Earlier controls of an actuator with a delay have times of their own."""
+    if delay and not hasattr(mujoco.MjModel, "nhistory"):
+        pytest.skip("this version of MuJoCo has no delays")
+    actuator = ACTUATOR.replace("/></actuator>", f" {delay}/></actuator>")
+    environment, (q, u) = original.make(pole(tmp_path, actuator), spec=spec_of(sampling_period=0.01)), drawn(20)
     single = [environment.step_from(*row).next_coordinates for row in zip(q, u, strict=True)]
     np.testing.assert_allclose(environment.steps_from(q, u), single, atol=1e-9)
     q[3, 3] = 1e9

@@ -160,14 +160,18 @@ class MujocoFile(OfParts):
         self._parts[0].write(self.rest)
         self._mujoco.mj_getState(self._model, self._data, start, kind)
         # MuJoCo's state begins with the time and the variables. After a step that diverged, MuJoCo continues from its
-        # initial state at time 0. A rollout that began at another time then ends at a wrong time, which shows that.
-        # Rollouts begin at 0 if actuators have interpolated delays, because these depend on the time.
-        start[0] = begin = 0.0 if getattr(self._model, "nhistory", 0) else BEGIN
+        # initial state at time 0. A rollout that began at another time then ends at a wrong time, which shows that. The
+        # earlier controls of an actuator with a delay have times too: of each, the history has two numbers, then these.
+        start[0] += BEGIN
+        if getattr(self._model, "nhistory", 0):
+            at = self._mujoco.mj_stateSize(self._model, kind & (self._mujoco.mjtState.mjSTATE_HISTORY - 1))
+            for begin, (count, _) in zip(self._model.actuator_historyadr, self._model.actuator_history, strict=True):
+                start[at + begin + 2 : at + begin + 2 + count] += BEGIN
         start, variables = np.tile(start, (len(coordinates), 1)), np.arange(1, 1 + len(self.variables))
         start[:, variables[columns]] = coordinates
         held = np.repeat(np.asarray(actions, dtype=np.float64)[:, None], self._substeps, axis=1)
         reached = pool.rollout(self._model, datas, start, held)[0][:, -1, : 1 + len(self.variables)]
-        reached[np.abs(reached[:, 0] - begin - self.period) > CLOSE * self.period] = np.nan
+        reached[np.abs(reached[:, 0] - start[:, 0] - self.period) > CLOSE * self.period] = np.nan
         return np.asarray(reached[:, 1:])
 
     @cached_property
