@@ -4,6 +4,8 @@ import gzip
 import pickle
 import socket
 import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
 from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 
@@ -197,6 +199,23 @@ def test_a_connection_that_opens_again_does_not_read_the_certificates_again(monk
         monkeypatch.setattr("httpx.create_ssl_context", None)
         connection.close()
         assert connection.send("GET", "/x") == b"done"
+
+
+def test_a_connection_closed_by_another_thread_leaves_no_socket_open():
+    """A sampler that is stopped still waits for queries in its other thread."""
+    with scripted_server(reply("first"), reply("late", delay=0.3), reply("later")) as server:
+        connection = Connection(server.url, retries=NEVER)
+        connection.send("GET", "/x")
+        with ThreadPoolExecutor(1) as pool:
+            under_way = pool.submit(connection.send, "GET", "/x")
+            while len(server.received) < 2:
+                time.sleep(0.005)
+            connection.close()
+            assert under_way.result() == b"late"
+        assert connection._client.is_closed
+        assert connection.send("GET", "/x") == b"later"
+        connection.close()
+        assert connection._client.is_closed
 
 
 def test_retry_delays_grow_to_their_limit_and_end_after_the_time_budget():

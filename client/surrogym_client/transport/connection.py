@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from ipaddress import ip_address
 from pathlib import Path
 from ssl import SSLContext
+from threading import Lock
 from typing import Any, Self, TypeVar
 from urllib.request import getproxies, proxy_bypass
 
@@ -117,7 +118,7 @@ class Connection:
         self._connect()
 
     def __getstate__(self) -> dict[str, Any]:
-        return {key: value for key, value in self.__dict__.items() if key not in ("_client", "_trusted")}
+        return {key: value for key, value in self.__dict__.items() if key not in ("_client", "_trusted", "_lock")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
@@ -126,6 +127,7 @@ class Connection:
     def _connect(self) -> None:
         self._trusted = _trusted_certificates()  # kept for later clients, because it takes 20 ms to read
         self._client = _new_client(self.url, self._token, self._trusted)
+        self._lock, self._under_way, self._closing = Lock(), 0, False
 
     def __enter__(self) -> Self:
         return self
@@ -134,8 +136,13 @@ class Connection:
         self.close()
 
     def close(self) -> None:
-        """Close the sockets. Sessions and leases on the server remain, and a later request connects again."""
-        self._client.close()
+        """Close the sockets; those of requests that other threads have under way are closed when the last of them ends.
+
+        Sessions and leases on the server remain. A later request connects again; then close the sockets again.
+        """
+        with self._lock:
+            self._closing = True
+            self._close_unused()
 
     def get(self, reply: type[R], path: str, **params: str | int) -> R:
         """Send a GET request, and return the answer as its wire model. Raises the errors of ``send``."""
@@ -206,20 +213,20 @@ class Connection:
         """Return a function that sends a request once, for ``persist``. The arguments are those of ``send``."""
 
         def send_once() -> bytes:
-            client = self._open_client()
-            request = client.build_request(
-                method,
-                self.url + path,
-                content=body,
-                params=params,
-                headers={"Content-Type": media_type, "Accept": media_type},
-                timeout=self._timeout(timeout),
-            )
-            response = client.send(request, stream=True)
-            try:
-                return _body(response, _content(response))
-            finally:
-                response.close()
+            with self._open_client() as client:
+                request = client.build_request(
+                    method,
+                    self.url + path,
+                    content=body,
+                    params=params,
+                    headers={"Content-Type": media_type, "Accept": media_type},
+                    timeout=self._timeout(timeout),
+                )
+                response = client.send(request, stream=True)
+                try:
+                    return _body(response, _content(response))
+                finally:
+                    response.close()
 
         return send_once
 
@@ -266,20 +273,37 @@ class Connection:
             ServerUnreachable: the connection failed or broke.
             ProblemError: the server refused.
         """
-        timeout = self._timeout(idle_seconds)
+        url, timeout = self.url + path, self._timeout(idle_seconds)
         try:
-            url, client = self.url + path, self._open_client()
-            with client.stream("GET", url, headers=dict(headers), timeout=timeout) as response:
+            with (
+                self._open_client() as client,
+                client.stream("GET", url, headers=dict(headers), timeout=timeout) as response,
+            ):
                 if response.is_error:
                     _body(response, _content(response))
                 yield response.iter_lines()
         except httpx.TransportError as failure:
             raise _given_up(failure, self.url) from None
 
-    def _open_client(self) -> httpx.Client:
-        if self._client.is_closed:
-            self._client = _new_client(self.url, self._token, self._trusted)
-        return self._client
+    @contextmanager
+    def _open_client(self) -> Iterator[httpx.Client]:
+        """Open client for one request. It is not closed before the request has ended: httpx would lose the socket of a
+        request that is just connecting."""
+        with self._lock:
+            if self._client.is_closed:
+                self._client, self._closing = _new_client(self.url, self._token, self._trusted), False
+            self._under_way += 1
+            client = self._client
+        try:
+            yield client
+        finally:
+            with self._lock:
+                self._under_way -= 1
+                self._close_unused()
+
+    def _close_unused(self) -> None:
+        if self._closing and not self._under_way:
+            self._client.close()
 
     def _timeout(self, seconds: float | None) -> httpx.Timeout:
         return httpx.Timeout(seconds or self.timeouts.request, connect=self.timeouts.connect)

@@ -245,6 +245,8 @@ class Sampler:
         while not self._stopped():
             if wait([waiting], LOOK_SECONDS).done:
                 return waiting.result()
+        # The claim may begin after the sampler's owner has closed the connection, and connects again then.
+        waiting.add_done_callback(lambda _: self._api.close())
         return None
 
     def _claim(self, limit: int, wait_seconds: float, retries: Retries | None = None) -> ClaimedQueries:
