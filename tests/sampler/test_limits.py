@@ -13,6 +13,7 @@ from support.moody import SPEC, Line
 from support.rail import SPEC as RAIL
 from surrogym_client.errors import ProtocolMismatch
 from surrogym_client.transport import Api
+from surrogym_client.transport.connection import Connection
 from surrogym_sampler.original.errors import QueryRefused, UnknownEnvironment
 from surrogym_sampler.queries import Sampler, SamplerSettings
 from surrogym_sampler.queries.query_limits import check_environment, check_query
@@ -36,17 +37,23 @@ class Machine(Line):
         return super().step_from(coordinates, action)
 
 
+class Greedy(Connection):
+    """Asks for six queries in each claim."""
+
+    def post(self, reply, path, body=None, **options):
+        if path.endswith("queries:claim"):
+            body = body.model_copy(update={"max_queries": 6})
+        return super().post(reply, path, body, **options)
+
+
 class Forged(Api):
     """Its server changes what a claim asks for (``forge``), or gives as many queries as there are (``greedy``)."""
 
     def __init__(self, url, forge=None, *, greedy=False):
         super().__init__(url)
-        self.forge, self.greedy = forge or (lambda query: query), greedy
-
-    def _post(self, kind, route, body, **options):
-        if self.greedy and route.endswith("queries:claim"):
-            body = body.model_copy(update={"max_queries": 6})
-        return super()._post(kind, route, body, **options)
+        self.forge = forge or (lambda query: query)
+        if greedy:
+            self.connection = Greedy(url)
 
     def claim(self, name, sampler, **options):
         claimed = super().claim(name, sampler, **options)
