@@ -136,7 +136,7 @@ class Connection:
         self.close()
 
     def close(self) -> None:
-        """Close the sockets; those of requests that other threads have under way are closed when the last of them ends.
+        """Close the sockets, also of streams; but while other threads have requests under way, the last of them does.
 
         Sessions and leases on the server remain. A later request connects again; then close the sockets again.
         """
@@ -273,22 +273,25 @@ class Connection:
             ServerUnreachable: the connection failed or broke.
             ProblemError: the server refused.
         """
-        url, timeout = self.url + path, self._timeout(idle_seconds)
         try:
-            with (
-                self._open_client() as client,
-                client.stream("GET", url, headers=dict(headers), timeout=timeout) as response,
-            ):
+            with self._open_client() as client:
+                request = client.build_request(
+                    "GET", self.url + path, headers=dict(headers), timeout=self._timeout(idle_seconds)
+                )
+                response = client.send(request, stream=True)
+            try:
                 if response.is_error:
                     _body(response, _content(response))
                 yield response.iter_lines()
+            finally:
+                response.close()
         except httpx.TransportError as failure:
             raise _given_up(failure, self.url) from None
 
     @contextmanager
     def _open_client(self) -> Iterator[httpx.Client]:
-        """Open client for one request. It is not closed before the request has ended: httpx would lose the socket of a
-        request that is just connecting."""
+        """Open client for one request, or for the opening of a stream. It is not closed before that has ended, because
+        httpx would lose the socket of a request that is just connecting."""
         with self._lock:
             if self._client.is_closed:
                 self._client, self._closing = _new_client(self.url, self._token, self._trusted), False
