@@ -53,7 +53,7 @@ class LocalSurrogate:
         model: model of the original environment; its version is 1.
 
     Examples:
-        >>> surrogate = LocalSurrogate.load("spec.json", "model.safetensors")
+        >>> surrogate = LocalSurrogate.from_file("pendulum.surrogate")
         >>> env = SurrogateVecEnv.from_port(surrogate, num_envs=16)
     """
 
@@ -62,18 +62,6 @@ class LocalSurrogate:
         self._model = model
         self._models = _OneModel(model)
         self._sessions: dict[str, Session] = {}
-
-    @classmethod
-    def load(cls, spec: str | Path, model: str | Path) -> Self:
-        """Read a specification (JSON) and a model (safetensors) that the server exported.
-
-        Raises:
-            OSError: a file can't be read.
-            ValueError: the specification contradicts itself.
-            InvalidInput: the model does not fit the specification.
-        """
-        read = EnvironmentSpec.model_validate_json(Path(spec).read_bytes())
-        return cls.from_bytes(read, Path(model).read_bytes())
 
     @classmethod
     def from_bytes(cls, spec: EnvironmentSpec, model: bytes) -> Self:

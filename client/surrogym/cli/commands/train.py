@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from surrogym_shared.spec import EnvironmentSpec
     from surrogym_shared.terminal import Update
     from surrogym_shared.wire import CurvePoint, SurrogateView
+    from surrogym_trainer.policies.card import PolicyCard
     from surrogym_trainer.training import TrainProgress, TrainResult, TrainSettings
     from surrogym_trainer.training.handover import Handover
 
@@ -76,6 +77,7 @@ def command(
     from surrogym_sampler.original.fitting import check_shape
     from surrogym_sampler.original.loading import env_option, sample_command
     from surrogym_trainer.policies.card import require_place
+    from surrogym_trainer.training.cards import card_of
     from surrogym_trainer.training.search import with_algorithm
     from surrogym_trainer.training.words import words_of_no_sampler, words_of_result
 
@@ -93,7 +95,8 @@ def command(
             say(words_of_rounds(api, surrogate, loop.improve, loop.rounds), quiet=output.quiet)
     _import(settings, quiet=output.quiet)
     curve: list[CurvePoint] = []
-    card = partial(_write_card, surrogate=surrogate, spec=spec, url=url, seed=search.seed, curve=curve)
+    made = partial(card_of, surrogate=surrogate, spec=spec, url=url, seed=search.seed, curve=curve)
+    card = partial(_write_card, made)
     with _keeping(card, typed(context, without=("out", "start_from", "trust_policy", "token"))):
         recording = partial(_recording, log.progress_file, curve)
         result, handover = _train(url, token, surrogate, out, settings, loop, recording, quiet=output.quiet)
@@ -368,20 +371,12 @@ def _waiting(update: Update) -> Callable[[SurrogateView], None]:
 
 
 def _write_card(
-    result: TrainResult,
-    handover: Handover | None = None,
-    *,
-    surrogate: str,
-    spec: EnvironmentSpec,
-    url: str,
-    seed: int,
-    curve: list[CurvePoint],
+    made: Callable[[TrainResult, Handover | None], PolicyCard], result: TrainResult, handover: Handover | None = None
 ) -> dict[str, Any]:
-    """Write the policy's card beside its file, and return the result as values that JSON can represent."""
+    """Write the card that ``made`` makes beside its policy, and return the result as values that JSON can represent."""
     from surrogym_trainer.policies.card import write_card
-    from surrogym_trainer.training.cards import card_of
 
-    card = card_of(result, handover, surrogate=surrogate, spec=spec, url=url, seed=seed, curve=curve)
+    card = made(result, handover)
     write_card(Path(result.path), card)
     return {
         "policy": str(result.path),
