@@ -91,7 +91,7 @@ def test_a_planner_says_what_it_computes_and_counts_no_virtual_steps(tmp_path):
     seen: list[TrainProgress] = []
     result = run(port, tmp_path / "p.zip", TrainSettings("PLANNER", hyperparameters={"horizon": 3}), seen.append)
     first, last = (words_of(vars(now)) for now in seen)
-    assert first == "computes values on a grid"
+    assert first == "computes values on a grid; the first process on a machine compiles for a minute"
     assert last == f"computed values on a grid, imagined return {result.imagined_return:.4g} (in the surrogate)"
     assert f"{tmp_path / 'p.zip'}: made without training in " in words_of_result(result)
 

@@ -48,7 +48,11 @@ class Planner(PolicySearch):
         file, noise = _file_of(task.port).to_bytes(), dict(settings.session.get("sensor_noise", {}))
         limits, own = tuple(self.limits), horizon_of(task.port.spec()) if self.horizon is None else self.horizon
         planner = PlannerFile(file, own, settings.seed, settings.set_points, limits, noise)
-        task.progress(TrainProgress(0, 0, None, 0.0, stage="computes values on a grid"))
+        task.progress(
+            TrainProgress(
+                0, 0, None, 0.0, stage="computes values on a grid; the first process on a machine compiles for a minute"
+            )
+        )
         try:
             predict = planner.acting()
         except UnusablePolicy as error:
