@@ -153,3 +153,11 @@ def test_sigterm_stops_a_training_like_ctrl_c(capsys, number: int):
         signal.raise_signal(number)
     assert "interrupted before there was a policy" in capsys.readouterr().err
     assert signal.getsignal(number) is before
+
+
+def test_sigterm_ends_a_training_that_waits_with_a_sentence(on_server, server_process, name, monkeypatch):
+    """It ended without a word."""
+    assert on_server("register", "Pendulum-v1", "--name", name).code == 0
+    monkeypatch.setattr("surrogym_client.surrogates.waiting.wait_for_start", lambda *_: signal.raise_signal(15))
+    ended = on_server("train", name)
+    assert (ended.code, ended.err) == (INTERRUPTED, "interrupted; the same command waits again\n")

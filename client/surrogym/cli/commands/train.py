@@ -86,7 +86,8 @@ def command(
     require_place(out)  # before the design is awaited, which may take hours
     settings, learned = _settings(search, session, start, log), start.learned()
     token = service.token_for(context)
-    spec, url = _trainable(surrogate, service.server, token, wait, settings, quiet=output.quiet)
+    with terminations_as_interrupts():
+        spec, url = _trainable(surrogate, service.server, token, wait, settings, quiet=output.quiet)
     if learned is not None:
         check_shape(learned, spec, "the surrogate")
     settings = with_algorithm(settings, spec)
