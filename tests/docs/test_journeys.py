@@ -150,7 +150,7 @@ def shortened(words: list[str]) -> list[str] | None:
     if words[0] == "python":
         return [*words[1:], *(["--steps", "4096"] if words[1].startswith("train") else [])]
     assert words[0] == "surrogym", f"a page has people type {words[0]!r}, which nothing runs"
-    more = SHORTER.get(words[1], []) if "--help" not in words else []
+    more = SHORTER.get(words[1], []) if not {"--help", "planner"} & {*words} else []  # a planner is not trained
     return ["-m", "surrogym", *words[1:], *more]
 
 
