@@ -158,13 +158,15 @@ def test_an_export_waits_for_the_first_fit(on_server, pendulum):
     assert on_server("export", pendulum, "--out", "early.surrogate").code == 0
 
 
-def test_training_without_a_model_recommends_sampling_or_waiting(on_server, pendulum):
+def test_training_without_a_model_recommends_sampling_or_waiting(on_server, server_process, pendulum):
     """A person who starts the training a second after the sampler is told nothing: the training waits."""
     missing = f"error: '{pendulum}' has no model yet, its phase is "
+    assert on_server("sample", pendulum, "--max-queries", "1", "--quiet").code == 0
     said = on_server("train", pendulum, "--quiet")
     assert said.err.startswith(missing)
-    assert said.err.endswith(f"run surrogym sample {pendulum}, or give --wait SECONDS\n")
-    assert on_server("sample", pendulum, "--max-queries", "1", "--quiet").code == 0
+    assert said.err.endswith(f"run surrogym sample {pendulum}, or give --wait SECONDS\n"), "a sampler that has ended"
+    with Api(server_process.url) as api:
+        api.claim(pendulum, "a sampler at work")
     said = on_server("train", pendulum, "--quiet", "--wait", "0")
     assert said.err.startswith(missing)
     assert said.err.endswith(": leave --wait out, and the training begins after the design\n")

@@ -178,14 +178,23 @@ class Sampler:
         self._check()
         leases = Leases(self._api, self._surrogate, self._settings.lease_seconds)
         saved = snapshots_of(self._api, self._surrogate, self._environment, self._own, self._settings)
-        with saved as self._returning, leases as self._leases, closing(self._pipeline):
-            self._report_gone()
-            try:
-                self._answer_all()
-            except BaseException:
-                self._broken_off = True  # the answer that is being sent is still finished, but with few retries
-                raise
+        try:
+            with saved as self._returning, leases as self._leases, closing(self._pipeline):
+                self._report_gone()
+                try:
+                    self._answer_all()
+                except BaseException:
+                    self._broken_off = True  # the answer that is being sent is still finished, but with few retries
+                    raise
+        finally:
+            self._say_farewell()
         return self.summary()
+
+    def _say_farewell(self) -> None:
+        """Tell the server that this sampler ends, which it would notice after a minute."""
+        said = beside(partial(self._claim, 0, 0.0, ONE_ATTEMPT))
+        if wait([said], END_SECONDS).not_done:  # the server hangs, and the owner may close the connection before
+            said.add_done_callback(lambda _: self._api.close())
 
     def _answer_all(self) -> None:
         while not self._stopped() and (limit := self._limit()) > 0:

@@ -46,6 +46,11 @@ class Alive(Generic[T]):
                 self._forget_silent(now)
         return now - before >= ALIVE_SECONDS
 
+    def forget(self, surrogate: str, name: str) -> None:
+        """Remove a client that ends."""
+        with self._lock:
+            self._heard[surrogate].pop(name, None)
+
     def alive(self) -> list[tuple[str, str, T]]:
         """Return (surrogate, name, status) of each active client, sorted by surrogate and name."""
         now = self._clock()

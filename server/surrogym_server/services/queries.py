@@ -3,6 +3,7 @@ people and audits add queries."""
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -50,7 +51,7 @@ class QueryService:
         Args:
             name: name of the surrogate.
             sampler: name of the sampler.
-            limit: largest number of queries.
+            limit: largest number of queries; 0 if the sampler ends.
             lease_seconds: duration of the leases.
             wait_seconds: longest wait.
             present: raises if the sampler has closed its connection, which then gets no lease.
@@ -64,9 +65,14 @@ class QueryService:
             standing = self._storage.surrogates.standing(name)
             return Claim(queries, standing.phase, standing.paused)
 
+        if not limit:
+            standing = await asyncio.to_thread(self._storage.surrogates.standing, name)
+            self._samplers.forget(name, sampler)
+            return Claim([], standing.phase, standing.paused)
         self._samplers.heard(name, sampler)
         leases = await self._queues.claim(name, None, claim, wait_seconds, present)
-        self._samplers.heard(name, sampler)
+        if leases.queries:  # else the sampler may have ended meanwhile
+            self._samplers.heard(name, sampler)
         return leases
 
     def renew(self, name: str, query_id: int, token: str, lease_seconds: float) -> None:

@@ -36,8 +36,8 @@ class ClaimQueries(Request):
     """Request of a sampler to lease pending queries."""
 
     sampler: Key = Field(description="name of the sampler, which people see with its queries and samples")
-    max_queries: Annotated[int, Field(ge=1, le=MAX_CLAIM)] = Field(
-        default=1, description="largest number of queries to lease"
+    max_queries: Annotated[int, Field(ge=0, le=MAX_CLAIM)] = Field(
+        default=1, description="largest number of queries to lease; 0: none, because the sampler ends"
     )
     wait_seconds: Annotated[float, Field(ge=0, le=60)] = Field(
         default=0.0, description="seconds that the reply may wait for a query; 0: reply at once"
