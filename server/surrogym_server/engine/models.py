@@ -86,7 +86,9 @@ class ModelCache:
             except Damaged:
                 if self._newest().get(surrogate) == version:
                     raise
-        raise NoModel("the surrogate has no model yet: start surrogym sample, or import a log")
+        raise NoModel(
+            "the surrogate has no model yet: start surrogym sample or import a log, and wait for the first fit"
+        )
 
     def look(self) -> list[int]:
         """For each surrogate in this cache, load its newest model if another server has stored a newer one.
