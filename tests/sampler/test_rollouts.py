@@ -360,7 +360,10 @@ def test_a_sampler_plans_each_action_of_a_trial_from_the_state_that_it_measured(
         return act
 
     monkeypatch.setattr("surrogym_sampler.queries.worker.replanning", watched)
-    Sampler(api, name, machine, SamplerSettings(until_done=True, time_limit=120.0)).run()
+    waited = []
+    Sampler(api, name, machine, SamplerSettings(until_done=True, time_limit=120.0), waits=waited.append).run()
+    (said,) = [sentence for sentence in waited if "planner" in sentence]  # it compiled in silence for a minute and more
+    assert "the first process on a machine compiles for a minute" in said
     query, samples = trial_of(api, name)
     assert len(samples) == len(query.actions)
     assert [(sample.coordinates, sample.action) for sample in samples] == planned

@@ -17,6 +17,7 @@ from surrogym_sampler.original.isolated import IsolatedEnvironment
 from surrogym_sampler.queries import Sampler, SamplerReport, SamplerSettings
 from surrogym_shared.codes import Code, Problem
 from surrogym_shared.spec import BoxAction
+from surrogym_shared.wire import ClaimedQueries
 
 ONE_ROUND = SamplerSettings(name="worker", max_queries=6, wait_seconds=5.0, time_limit=60.0)
 
@@ -32,6 +33,15 @@ def test_the_sampler_answers_every_query_and_stops_when_the_design_is_done(api, 
     assert view.phase in ("ready", "over_budget")
     assert [outcome for _, outcome, _ in told] == ["answered"] * 6
     assert ended == [view.phase]
+
+
+def test_a_sampler_says_once_that_it_waits_for_a_long_fit(api, line, monkeypatch):
+    said = []
+    sampler = Sampler(api, line, Line(), SamplerSettings(once=True, time_limit=60.0), waits=said.append)
+    claims = [ClaimedQueries(queries=[], phase="fitting", paused=False)] * 4
+    monkeypatch.setattr(sampler, "_awaited", lambda _: claims.pop() if claims else None)
+    sampler.run()
+    assert said == ["the server fits a model; this sampler waits for its next queries"]
 
 
 class StorageAway(Api):

@@ -51,6 +51,7 @@ from surrogym_shared.wrapping import undeclared_turns
 PATIENCE = Retries(seconds=900.0, first_delay=0.1, longest_delay=5.0)
 LOOK_SECONDS = 0.1  # seconds between two checks by a waiting sampler of whether it was stopped
 LAST_SECONDS = 5.0  # a stopped sampler tries for these seconds to send its last real step
+MANY_FRUITLESS = 2  # number of claims in a row that meet a fit, after which the sampler says that it waits
 END_SECONDS = 2.0  # if the sampler ends with the design, a claim for queries waits at most this many seconds
 AGAIN_SECONDS = 1.0  # seconds to wait after a claim that gave no query which the environment allows
 LATEST = 1_000  # number of latest steps of rollouts in which coordinates that wrap are looked for
@@ -114,6 +115,7 @@ class Sampler:
         report: called after every query with the query, its outcome, and the error if there was one.
         ended: called with the phase whenever a claim shows that the design has ended, once for each end.
         approve: called before each query; False refuses it. None takes every query.
+        waits: called with a sentence when the machine stands still for what may take a minute: a fit, a compilation.
 
     Examples:
         >>> with Api("http://127.0.0.1:8000") as api:
@@ -129,6 +131,7 @@ class Sampler:
         report: Callable[[Query, Outcome, str], None] | None = None,
         ended: Callable[[Phase], None] | None = None,
         approve: Callable[[Query], bool] | None = None,
+        waits: Callable[[str], None] = lambda _: None,
     ) -> None:
         self._api = api
         self._surrogate = surrogate
@@ -137,6 +140,9 @@ class Sampler:
         self._report = report
         self._ended = ended
         self._approve = approve
+        self._waits = waits
+        self._fruitless = 0  # number of claims in a row that waited for queries and met a fit
+        self._planned = False  # whether this process has made a planner
         self._counts: dict[Outcome, int] = dict.fromkeys(get_args(Outcome), 0)
         self._refused: set[int] = set()  # ids of refused queries, which the server may offer again
         self._failures = Failures()
@@ -206,7 +212,7 @@ class Sampler:
                 raise
             if claimed is None:
                 break
-            self._enter(claimed.phase)
+            self._enter(claimed)
             self._work(claimed.queries)
             if self._enough(claimed):
                 break
@@ -221,8 +227,12 @@ class Sampler:
             **self._counts, steps=self._steps, seconds=seconds, phase=self._phase, fallback_steps=fallback_steps
         )
 
-    def _enter(self, phase: Phase) -> None:
+    def _enter(self, claimed: ClaimedQueries) -> None:
+        phase = claimed.phase
         before, self._phase = self._phase, phase
+        self._fruitless = self._fruitless + 1 if phase == "fitting" and not claimed.queries else 0
+        if self._fruitless == MANY_FRUITLESS:
+            self._waits("the server fits a model; this sampler waits for its next queries")
         if self._ended is not None and phase in ENDED and phase != before:
             self._ended(phase)
 
@@ -426,6 +436,9 @@ class Sampler:
                 raise QueryRefused(f"the policy of the trial: {error}") from error
         if not query.replan:
             return None
+        if not self._planned:
+            self._waits("a planner is made for the next query; the first process on a machine compiles for a minute")
+        self._planned = True
         try:
             return replanning(self._api, self._surrogate, self._spec)
         except Exception as error:  # errors of the server's package, whose classes the client does not import

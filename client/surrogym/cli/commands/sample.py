@@ -229,7 +229,8 @@ def _sample_here(
             if not plan.settings.until_done:
                 say(_words_of_end(plan.surrogate, phase), quiet=output.quiet)
 
-        sampler = Sampler(api, plan.surrogate, environment, plan.settings, report, ended, approve)
+        waits = partial(say, quiet=output.quiet)
+        sampler = Sampler(api, plan.surrogate, environment, plan.settings, report, ended, approve, waits)
         for number in terminations():
             signal.signal(number, lambda *_: sampler.stop())
         with on_interrupt(lambda: _words_of_interruption(sampler.summary())), closing(environment):
