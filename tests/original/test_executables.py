@@ -20,6 +20,7 @@ from support.programs import FALLS_BACK, HANGS, KEEPS_LIMITS, NOTES_ITSELF, UNTE
 from surrogym_sampler import original
 from surrogym_sampler.original.classic import cartpole
 from surrogym_sampler.original.errors import EnvironmentDied, StepFailed, StepTimedOut, UnknownEnvironment
+from surrogym_sampler.original.executables import name_of
 from surrogym_sampler.original.executables.messages import CHECK, decode
 from surrogym_sampler.original.executables.program import Program
 from surrogym_sampler.original.loading import is_known
@@ -51,6 +52,10 @@ def moody(mood: str, version: int = 1, step_limit: float = 30.0, spec=None):
     """A program that does ``mood`` at action 1."""
     code = MOODY.replace("MOOD", f"if asked['action'] == [1]: {mood}").replace("VERSION", str(version))
     return original.make(f"exec:{shlex.join([sys.executable, '-c', code])}", step_limit=step_limit, spec=spec)
+
+
+def test_a_command_with_the_prefix_of_its_environment_name_names_the_same_program():
+    assert name_of("exec:sh rail.sh") == name_of("sh rail.sh") == "exec:sh rail.sh"
 
 
 def test_an_environment_program_written_in_shell_returns_the_exact_next_states():

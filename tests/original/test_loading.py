@@ -156,6 +156,7 @@ def test_a_user_defined_environment_class_is_loaded_by_module_and_name(own_modul
         ("own_cart:Missing", "expected package.module:factory, got 'own_cart:Missing'"),
         ("no_such_module:x", "No module named 'no_such_module'"),
         (":x", "expected package.module:factory, got ':x'"),
+        ("own_cart.py:Cart", "'own_cart' is not a package; did you mean own_cart:Cart?"),
         ("own_cart:a_number", "to be callable, got a int"),
         ("own_cart:NoEnvironment", "reset, step, coordinates and close, got a NoEnvironment"),
     ],
@@ -195,6 +196,10 @@ class Made(own_cart.Cart):
     def __init__(self): raise ValueError("no licence")
 class Specified(own_cart.Cart):
     def spec(self): raise Mute()
+class Misspelt(own_cart.Cart):
+    def spec(self):
+        from surrogym_shared.spec import Coordinate, Uniform
+        return Coordinate(nam="x", sampling=Uniform(low=-1, high=1))
 class Open:
     spec, step_from = own_cart.Cart.spec, own_cart.Cart.step_from
 """
@@ -205,6 +210,11 @@ class Open:
     [
         ("Made", r"broken:Made failed while it was made: ValueError: no licence \(broken.py:6\)"),
         ("Specified", r"spec\(\) of broken:Specified failed: Mute: its message can't be read"),
+        (
+            "Misspelt",
+            r"spec\(\) of broken:Misspelt failed: Coordinate: nam: unknown entry; expected some of name, .*"
+            r"did you mean 'name'\?; correct it",
+        ),
         ("Open", r"expected an object with spec, step_from and close, .* got a Open without close$"),
     ],
 )

@@ -22,7 +22,9 @@ def load_factory(name: str) -> Any:
     try:
         factory = getattr(importlib.import_module(module_name), attribute)
     except (ImportError, AttributeError, ValueError) as error:
-        raise UnknownEnvironment(f"expected package.module:factory, got {name!r}: {error}") from error
+        module = module_name.removesuffix(".py")
+        meant = f"; did you mean {module}:{attribute}?" if module != module_name else ""
+        raise UnknownEnvironment(f"expected package.module:factory, got {name!r}: {error}{meant}") from error
     except SyntaxError as error:
         raise UnknownEnvironment(
             f"{module_name} can't be imported: {type(error).__name__}: {error}; correct it"

@@ -11,6 +11,7 @@ from typing import Any
 import gymnasium
 from pydantic import ValidationError
 
+import surrogym_shared.spec
 from surrogym_sampler.original.actions import require_same_action
 from surrogym_sampler.original.adapters import adapter_of, is_trusted, open_simulator, with_colon
 from surrogym_sampler.original.classic import TASKS
@@ -25,6 +26,7 @@ from surrogym_sampler.original.protocol import LONGEST_EPISODE, Environment
 from surrogym_sampler.original.rollouts import answering, keeping_limits
 from surrogym_sampler.original.simulator import Simulated
 from surrogym_shared.environments import is_name, is_same
+from surrogym_shared.faults import first_fault
 from surrogym_shared.presets import PresetName
 from surrogym_shared.spec import Access, BoxAction, EnvironmentSpec
 
@@ -163,8 +165,8 @@ def specification(name: str) -> EnvironmentSpec:
     if adapter_of(name) is None:
         raise UnknownEnvironment(
             f"no adapter knows the environment {name!r}: expected one of {known}, another Gymnasium id, "
-            f"dm_control:DOMAIN-TASK, pcgym:MODEL, fmu:PLANT.fmu, mujoco:FILE.xml, or package.module:factory"
-            + with_colon(name)
+            "dm_control:DOMAIN-TASK, pcgym:MODEL, fmu:PLANT.fmu, mujoco:FILE.xml, package.module:factory, or "
+            "exec:COMMAND for a program" + with_colon(name)
         )
     open_simulator(name).close()
     raise UnknownEnvironment(
@@ -284,15 +286,18 @@ def _made(name: str) -> Any:
 
 def _called(what: str, function: Callable[[], Any]) -> Any:
     """Call a function of a user's environment, and return its result. An error whose own words say what to do, such as
-    that of a missing package or of an invalid specification, is raised unchanged.
+    that of a missing package, is raised unchanged. Of an invalid specification, the class with the fault is named.
 
     Raises:
         UnknownEnvironment: the function raised another error; ``what`` are the first words of the message.
     """
     try:
         return function()
-    except (OriginalError, ImportError, ValidationError):
+    except (OriginalError, ImportError):
         raise
+    except ValidationError as error:
+        fault = first_fault(error, of=getattr(surrogym_shared.spec, error.title, None))
+        raise UnknownEnvironment(f"{what}: {error.title}: {fault}; correct it and try again") from error
     except Exception as error:
         raise UnknownEnvironment(f"{what}: {sentence(error)}; correct it and try again") from error
 

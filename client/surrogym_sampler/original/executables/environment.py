@@ -172,8 +172,8 @@ def is_executable(name: str) -> bool:
 
 
 def name_of(command: str) -> str:
-    """Return the environment name ``exec:COMMAND`` of a command."""
-    return f"{PREFIX}{command}"
+    """Return the environment name ``exec:COMMAND`` of a command; a command that has this prefix already is one."""
+    return f"{PREFIX}{command.removeprefix(PREFIX)}"
 
 
 def open_executable(
