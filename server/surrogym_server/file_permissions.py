@@ -26,6 +26,7 @@ def keep_private(settings: Settings) -> None:
         with suppress(OSError):  # raised if the file exists; other errors come again when the database is opened
             database.parent.mkdir(parents=True, exist_ok=True)
             os.close(os.open(database, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600))
+            logger.info("%s is a new, empty database", database)
     for path in (database, settings.token_file, settings.tls_key):
         if path is not None and (warning := open_to_others(path)):
             logger.warning(warning)

@@ -378,6 +378,8 @@ def _look_at(on_server, pendulum, tmp_path):
     assert pushed.out.startswith(f"{pendulum}@1: known already")
     unknown = on_server("policy", f"{pendulum}@7")
     assert (unknown.code, "got 7, which does not exist" in unknown.err) == (1, True)
+    deleted = on_server("policy", "delete", f"{pendulum}@1").out
+    assert deleted == f"{pendulum}@1 is deleted, and nothing is left at {pendulum}@production\n"
 
 
 def _no(*_, **__):

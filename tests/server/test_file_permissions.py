@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import stat
 from pathlib import Path
@@ -69,6 +70,10 @@ def test_no_file_is_created_for_databases_other_than_sqlite_files(database: str,
     assert not caplog.records
 
 
-def test_a_database_in_a_new_folder_is_readable_by_its_owner_only(tmp_path: Path):
-    keep_private(read_settings({}, database=f"sqlite:///{tmp_path}/a/b/surrogym.db"))
-    assert mode(tmp_path / "a" / "b" / "surrogym.db") == 0o600
+def test_a_database_in_a_new_folder_is_announced_once_and_readable_by_its_owner_only(tmp_path: Path, caplog):
+    caplog.set_level(logging.INFO)
+    database = tmp_path / "a" / "b" / "surrogym.db"
+    for _ in range(2):
+        keep_private(read_settings({}, database=f"sqlite:///{database}"))
+    assert mode(database) == 0o600
+    assert [record.getMessage() for record in caplog.records] == [f"{database} is a new, empty database"]

@@ -172,9 +172,10 @@ def delete(context: typer.Context, policy: Named, *, service: Service, output: O
     """
     name, which = parsed(policy)
     with service.connect(context) as api:
-        version = api.policies.get(name, which).version
-        api.policies.delete(name, version)
-    output.give({"surrogate": name, "deleted": version}, lambda: f"{name}@{version} is deleted")
+        found = api.policies.get(name, which)
+        api.policies.delete(name, version := found.version)
+    led = f", and nothing is left at {', '.join(f'{name}@{alias}' for alias in found.aliases)}" if found.aliases else ""
+    output.give({"surrogate": name, "deleted": version}, lambda: f"{name}@{version} is deleted{led}")
 
 
 def parsed(policy: str) -> tuple[str, str]:
