@@ -67,9 +67,12 @@ class StorageAway(Api):
 
 
 def test_the_sampler_waits_for_an_unavailable_storage_without_repeating_steps(server_process, line):
+    said = []
     with StorageAway(server_process.url) as api:
-        report = Sampler(api, line, Line(), ONE_ROUND).run()
-        assert len(api.refused) == 7
+        report = Sampler(api, line, Line(), ONE_ROUND, waits=said.append).run()
+        assert len(api.refused) == len(said) == 7
+        assert said[0].startswith("the disk is full"), "it was silent for up to 15 minutes"
+        assert said[0].endswith("; this sampler tries again for 15 minutes")
         ledger = api.surrogate(line).ledger
     assert (report.answered, report.failed, ledger.total, ledger.unresolved) == (6, 0, 6, 0)
 

@@ -115,7 +115,8 @@ class Sampler:
         report: called after every query with the query, its outcome, and the error if there was one.
         ended: called with the phase whenever a claim shows that the design has ended, once for each end.
         approve: called before each query; False refuses it. None takes every query.
-        waits: called with a sentence when the machine stands still for what may take a minute: a fit, a compilation.
+        waits: called with a sentence when the machine stands still for what may take a minute: a fit, a compilation, a
+            server that does not answer.
 
     Examples:
         >>> with Api("http://127.0.0.1:8000") as api:
@@ -462,14 +463,17 @@ class Sampler:
             ServerUnreachable, Unavailable: no answer for longer than ``PATIENCE``, or than ``once_stopped`` seconds
                 after ``stop``.
         """
-        delays, stopped = PATIENCE.delays(), None
+        delays, stopped, silent = PATIENCE.delays(), None, True
         while True:
             try:
                 return request()
-            except AWAY:
+            except AWAY as error:
                 pause = next(delays, None)
                 if pause is None:
                     raise
+                if silent and not self._stopped():
+                    self._waits(f"{error}; this sampler tries again for {PATIENCE.seconds / 60:.0f} minutes")
+                silent = False
                 self._pause(pause)
                 if self._stopped():
                     stopped = stopped or time.monotonic()
