@@ -31,7 +31,7 @@ def test_the_access_mode_of_a_specification_follows_from_query_and_snapshots(
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"max_rollout": 5}, "max_rollout 5 needs query 'rollout', got 'step'"),
+        ({"max_rollout": 5}, r"max_rollout 5 needs query 'rollout' \(--access reset or snapshot\), got 'step'"),
         ({"query": "rollout", "design": {"preset": "paper"}}, "Latin hypercube of states: expected query 'step'"),
         ({"query": "rollout", "max_rollout": 0}, "greater than or equal to 1"),
         ({"query": "rollout", "max_rollout": 5000}, "less than or equal to 4096"),

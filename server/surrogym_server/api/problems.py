@@ -198,13 +198,15 @@ def _pieces(value: Any) -> Iterator[str]:
 
 
 def _located(found: Sequence[Any]) -> list[dict[str, str]]:
+    # a list counts as empty if its entries are wrong, which other errors say
+    wrong = {error["loc"][:depth] for error in found for depth in range(len(error["loc"]))}
     return [
         {
             "field": _field(error),
             "expected": in_words(error).removeprefix("expected ").removesuffix(", got nothing"),
             "got": "nothing" if error["type"] == "missing" else shown(error.get("input")),
         }
-        for error in found[:16]
+        for error in [error for error in found if error["type"] != "too_short" or error["loc"] not in wrong][:16]
     ]
 
 

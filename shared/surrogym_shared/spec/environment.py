@@ -257,7 +257,7 @@ class EnvironmentSpec(Frozen):
             require(low < high, f"limits of observation {entry.name!r}: expected low < high, got [{low}, {high}]")
         require(
             self.max_rollout is None or self.query == "rollout",
-            f"max_rollout {self.max_rollout} needs query 'rollout', got {self.query!r}",
+            f"max_rollout {self.max_rollout} needs query 'rollout' (--access reset or snapshot), got {self.query!r}",
         )
         require(
             not self.snapshots or self.query == "rollout",

@@ -128,6 +128,15 @@ def test_a_contradictory_specification_is_refused(client: httpx.Client, name: st
     refused(client.get(f"/v1/surrogates/{name}"), Code.UNKNOWN_SURROGATE)
 
 
+def test_a_list_whose_entries_are_invalid_is_not_also_called_empty(client: httpx.Client, name: str):
+    reply = post(client, "/v1/surrogates", {"name": name, "spec": crossed("coordinates", [{"nam": "x"}])})
+    problem = refused(reply, Code.INVALID_SPEC, "spec.coordinates.0")
+    assert problem.model_extra is not None
+    assert {error["field"].removeprefix("spec.coordinates.0.") for error in problem.model_extra["errors"]} == {
+        *("name", "sampling", "nam")
+    }
+
+
 def test_a_bound_that_stops_another_coordinate_outside_its_range_is_refused(client: httpx.Client, name: str):
     """The model would set a coordinate where the environment never lets it be."""
     spec = pendulum.spec()
