@@ -49,6 +49,16 @@ def test_the_doctor_command_reports_no_problem_if_everything_is_in_place(on_serv
     assert on_server("doctor", "--quiet").out == ""
 
 
+def test_the_doctor_command_says_after_how_many_checks_it_was_interrupted(on_server, monkeypatch):
+    def stopped(_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("surrogym_sampler.diagnosis.doctor.service", stopped)
+    ended = on_server("doctor")
+    assert ended.code == 130
+    assert ended.err == "interrupted after 2 checks; no command counts their real steps\n"
+
+
 def test_the_doctor_command_without_a_server_reports_it_and_recommends_serve(surrogym):
     said = surrogym("doctor", "--server", "http://127.0.0.1:9", "--json")
     assert said.code == 1

@@ -17,7 +17,8 @@ from surrogym.cli.options import (
     read_spec,
 )
 from surrogym.cli.printing import found_aside, prints_aside
-from surrogym_shared.terminal import give
+from surrogym_shared.terminal import give, on_interrupt
+from surrogym_shared.words import counted
 
 if TYPE_CHECKING:
     from surrogym_sampler.diagnosis.doctor import Finding
@@ -67,11 +68,12 @@ def command(
             yield from _of_environment(env, given, step_limit, history)
 
     found: list[Finding] = []
-    for finding in findings():
-        found.append(finding)
-        told = finding.notable or finding.way_out is not None
-        if not output.as_json and (told or not output.quiet):
-            typer.echo(_line(finding))
+    with on_interrupt(lambda: f"interrupted after {counted(len(found), 'check')}; no command counts their real steps"):
+        for finding in findings():
+            found.append(finding)
+            told = finding.notable or finding.way_out is not None
+            if not output.as_json and (told or not output.quiet):
+                typer.echo(_line(finding))
     problems = sum(finding.way_out is not None for finding in found)
     if output.as_json:
         give({"problems": problems, "findings": [asdict(finding) for finding in found]}, str, as_json=True)
