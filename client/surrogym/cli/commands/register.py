@@ -27,6 +27,7 @@ from surrogym_shared.environments import is_name
 from surrogym_shared.kinds import Access
 from surrogym_shared.presets import PresetName
 from surrogym_shared.terminal import say
+from surrogym_shared.words import counted
 
 if TYPE_CHECKING:
     from surrogym_client.transport.api import Api
@@ -288,7 +289,9 @@ def _words(view: SurrogateView, environment: str, file: Path | None) -> str:
     from surrogym_sampler.original.loading import is_known, sample_command
     from surrogym_shared.spec.safety import NamedFallback
 
-    registered = f"{view.name}: {view.environment or 'own environment'}, {len(view.spec.coordinates)} coordinates"
+    registered = (
+        f"{view.name}: {view.environment or 'own environment'}, {counted(len(view.spec.coordinates), 'coordinate')}"
+    )
     if awaits_log(view):
         return f"{registered}; {words_of_no_log(view.name)}"
     start = sample_command(view.name, view.environment)
