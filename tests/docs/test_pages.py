@@ -55,6 +55,13 @@ def test_every_documentation_link_has_an_existing_target(page: Path) -> None:
     assert broken == []
 
 
+def test_every_page_of_the_site_is_in_its_navigation() -> None:
+    listed = re.findall(
+        r"^ +- (?:[^:\n]+: )?(\S+\.md)$", (ROOT / "mkdocs.yml").read_text(encoding="utf-8"), re.MULTILINE
+    )
+    assert {str(page.relative_to(ROOT / "docs")) for page in (ROOT / "docs").rglob("*.md")} <= {*listed}
+
+
 @each_page
 def test_every_test_file_named_in_the_documentation_exists(page: Path) -> None:
     named = re.findall(
