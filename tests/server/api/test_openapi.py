@@ -49,6 +49,12 @@ def operations(openapi: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:
     ]
 
 
+def test_every_operation_has_an_id_of_its_own(openapi: dict[str, Any]):
+    """Generators of clients name functions by it."""
+    ids = [operation["operationId"] for _, operation in operations(openapi)]
+    assert sorted(ids) == sorted(set(ids))
+
+
 @pytest.mark.parametrize(("name", "model"), EXAMPLES.items())
 def test_every_openapi_example_passes_validation(name: str, model: type[wire.Request]):
     model.model_validate(getattr(examples, name))

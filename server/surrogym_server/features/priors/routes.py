@@ -25,7 +25,7 @@ THERE = (Code.UNKNOWN_SURROGATE, Code.INVALID_REQUEST)
 
 
 @router.get("", summary="Describe the prior", dependencies=[READ], responses=documented(*THERE))
-def get(name: str, priors: Priors) -> PriorView:
+def get_prior(name: str, priors: Priors) -> PriorView:
     """Return the description of a surrogate's prior: its source, and how well its parameters were calibrated."""
     return _view(priors.get(name))
 
@@ -37,7 +37,7 @@ def get(name: str, priors: Priors) -> PriorView:
     openapi_extra={"requestBody": {"required": True, "content": FILE}},
     responses=documented(*THERE, Code.TOO_LARGE, Code.NOT_INSTALLED),
 )
-async def put(name: str, request: Request, priors: Priors) -> PriorView:
+async def put_prior(name: str, request: Request, priors: Priors) -> PriorView:
     """Store the prior of a surrogate: the body is a file of ``surrogym export`` with the same coordinates and actions.
     In the next fit, each output of the model learns the difference between the samples and the prior, if this predicts
     left-out samples better than learning without the prior. Adaptive queries without a real step so far are withdrawn,
@@ -48,7 +48,7 @@ async def put(name: str, request: Request, priors: Priors) -> PriorView:
 
 
 @router.post(":await", summary="Wait for a prior", dependencies=[ADMIN], responses=documented(*THERE))
-def wait(name: str, priors: Priors) -> PriorView:
+def wait_for_prior(name: str, priors: Priors) -> PriorView:
     """Let the design of a surrogate wait after its initial queries until a prior is stored. Does nothing if the
     surrogate has a prior."""
     priors.wait(name)
@@ -56,7 +56,7 @@ def wait(name: str, priors: Priors) -> PriorView:
 
 
 @router.delete("", status_code=204, summary="Remove the prior", dependencies=[ADMIN], responses=documented(*THERE))
-def delete(name: str, priors: Priors) -> Response:
+def delete_prior(name: str, priors: Priors) -> Response:
     """Remove the prior of a surrogate, or stop waiting for one. The next fit uses no prior."""
     priors.drop(name)
     return Response(status_code=204)
