@@ -55,8 +55,7 @@ class Settings(BaseModel):
         Field(description="folder for the files of policies. None: beside a SQLite file, or in PostgreSQL"),
     ] = None
     public_url: Annotated[
-        str | None,
-        AfterValidator(_without_path),
+        Annotated[str, AfterValidator(_without_path)] | None,
         Field(description="address under which browsers reach this server behind a proxy"),
     ] = None
     tokens: dict[str, Role] = Field(default_factory=dict, description="role of each bearer token")
@@ -122,8 +121,7 @@ class Settings(BaseModel):
         int, Field(ge=1, description="largest size of all files of a surrogate's policies together, in MiB")
     ] = 1_024
     drift_webhook: Annotated[
-        str | None,
-        AfterValidator(_http),
+        Annotated[str, AfterValidator(_http)] | None,
         Field(description="address to which each report of drift is posted as JSON. None: to no address"),
     ] = None
     sweep_seconds: Annotated[

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from surrogym_server.errors import InvalidInput
-from surrogym_server.settings import read_settings
+from surrogym_server.settings import Settings, read_settings
 
 TOKEN = "a-long-token"
 
@@ -29,6 +29,10 @@ def test_listening_on_a_non_loopback_address_requires_a_token(host: str):
 @pytest.mark.parametrize("host", ["127.0.0.1", "127.0.0.2", "::1", "localhost"])
 def test_listening_on_loopback_requires_no_token(host: str):
     assert read_settings({}, host=host).loopback
+
+
+def test_settings_can_be_read_from_their_own_values():
+    assert Settings.model_validate(Settings().model_dump()) == Settings()
 
 
 def test_command_line_options_override_environment_variables():
