@@ -129,7 +129,7 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
     "too many steps": ({"steps": 100_001}, "steps: expected 1 to 100000, got 100001"),
     "negative seed of noise": ({"noise": NoiseKey(-1)}, "noise: expected a seed"),
     "noise held for no step": ({"noise": NoiseKey(0, 0, 0)}, "a hold of 1 or more"),
-    "short until": ({"until": np.ones(N + 1, dtype=bool)}, "until: expected 5 entries"),
+    "short until": ({"until": np.ones(N + 1, dtype=bool)}, "until: expected (5 entries|shape)"),
     "outputs beyond all bounds": ({"policy": replace(GOOD, layers=HUGE, activation="relu")}, "finite outputs"),
 }
 
