@@ -56,7 +56,7 @@ def sent(values: NDArray[Any], device: torch.device) -> Tensor:
     tensor = torch.from_numpy(values)
     if device == CPU:
         return tensor
-    # CUDA copies from pinned memory while the program goes on; it waits for a copy from other memory.
+    # While CUDA copies from pinned memory, the program goes on. For a copy from other memory, it would wait.
     return (tensor.pin_memory() if device.type == "cuda" else tensor).to(device, non_blocking=True)
 
 

@@ -121,8 +121,9 @@ class Subject:
         return promise_of(self.port, self.counting(PROMISING), self.seed, self.session, self.floor)
 
     def counting(self, words: str, episodes: int = 1) -> Predict:
-        """Say ``words``, and return the policy, which repeats them with each per cent of so many successive episodes. A
-        network acts at the server, where nothing is counted, and takes seconds; a planner takes minutes."""
+        """Say ``words``, and return a policy that counts its steps. With each per cent of so many episodes, one after
+        the other, it says ``words`` again with the share. A network acts at the server, where nothing is counted, and
+        takes seconds; a planner takes minutes."""
         self.saying(words)
         if isinstance(self.predict, Network):
             return self.predict

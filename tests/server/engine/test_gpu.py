@@ -1,6 +1,7 @@
 """A GPU that is too small for a session, or that fails while a session is stepped.
 
-The server has no GPU. It is told an amount of free memory, and steps of three environments raise the errors of torch.
+The server has no GPU. The tests tell it how much memory is free, and let steps of three environments raise errors of
+torch.
 """
 
 from __future__ import annotations
